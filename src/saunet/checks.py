@@ -1,0 +1,88 @@
+"""One voice for errors: what was wrong, what was given, what is allowed, how to fix it."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable
+
+
+class SaunetError(Exception):
+    """An error that a user can act on; command-line tools print it as one sentence, without a traceback."""
+
+
+class ConfigError(SaunetError, ValueError):
+    """A parameter, name or combination of parameters that cannot work."""
+
+
+class DataError(SaunetError, ValueError):
+    """A file or data set that is missing, broken or does not fit."""
+
+
+class CheckpointError(SaunetError, ValueError):
+    """A checkpoint that cannot be read or does not belong to the model at hand."""
+
+
+def suggest(name: str, allowed: Iterable[str]) -> str:
+    """Return ``"; did you mean 'x'?"`` for the nearest allowed name, or an empty string when nothing is near."""
+    near = difflib.get_close_matches(name, list(allowed), n=1, cutoff=0.6)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def one_of(name: str, value: str, allowed: Iterable[str]) -> str:
+    """Return ``value`` if it is one of the allowed words.
+
+    Raises:
+        ConfigError: if it is not; the message names the nearest word and lists all.
+    """
+    words = list(allowed)
+    if value not in words:
+        hint = suggest(str(value), words)
+        raise ConfigError(f"{name} is '{value}'{hint or ','} allowed: {', '.join(words)}")
+    return value
+
+
+def positive(name: str, value: float, *, allow_zero: bool = False) -> float:
+    """Return ``value`` if it is a finite number above zero (or zero, with ``allow_zero``).
+
+    Raises:
+        ConfigError: otherwise.
+    """
+    if not math.isfinite(value) or value < 0 or (value == 0 and not allow_zero):
+        raise ConfigError(f"{name} is {value}; it must be {'at least' if allow_zero else 'greater than'} 0")
+    return value
+
+
+def in_range(name: str, value: float, low: float, high: float) -> float:
+    """Return ``value`` if ``low <= value <= high``.
+
+    Raises:
+        ConfigError: otherwise.
+    """
+    if not low <= value <= high:
+        raise ConfigError(f"{name} is {value}; it must lie between {low} and {high}")
+    return value
+
+
+def divisible(
+    height: int, width: int, divisor: int, *, what: str = "image", by: str = "the encoder stride"
+) -> None:
+    """Check that an image size is a positive multiple of ``divisor`` in both directions.
+
+    Args:
+        height: Height in pixels.
+        width: Width in pixels.
+        divisor: The number that must divide both.
+        what: What has this size, for the message.
+        by: Where the divisor comes from, for the message.
+
+    Raises:
+        ConfigError: if it does not; the message names the nearest valid size.
+    """
+    if height > 0 and width > 0 and height % divisor == 0 and width % divisor == 0:
+        return
+    valid = [max(divisor, divisor * round(side / divisor)) for side in (height, width)]
+    raise ConfigError(
+        f"{what} {height}x{width} (height x width) is not divisible by {by} {divisor}; "
+        f"the nearest valid size is {valid[0]}x{valid[1]}"
+    )

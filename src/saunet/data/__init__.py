@@ -1,0 +1,1 @@
+"""Driving video as training samples."""

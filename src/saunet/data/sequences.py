@@ -1,0 +1,35 @@
+"""Driving video as sequences of frames, and the windows around each frame that training needs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Drive(Protocol):
+    """One continuous recording of one camera: what every data set is reduced to before training sees it.
+
+    Frames are addressed by their number in the recording; numbers may have gaps.
+    """
+
+    name: str
+    """Readable and unique in the data set, such as ``2011_09_26/2011_09_26_drive_0001_sync l``."""
+
+    @property
+    def indices(self) -> Sequence[int]:
+        """Numbers of the frames that exist, ascending."""
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """Return the frame, h x w x 3, RGB."""
+
+    def intrinsics(self, index: int) -> NDArray[np.float64]:
+        """Return K, 3 x 3, in pixels of `image` (integer coordinates are pixel centres)."""
+
+    def depth(self, index: int) -> NDArray[np.float32] | None:
+        """Return ground-truth depth, h x w, metres, 0 where unknown; None where there is none."""
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        """Return T_world_cam, 4 x 4, metres (x right, y down, z forward); None where unknown."""

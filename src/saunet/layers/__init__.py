@@ -1,0 +1,1 @@
+"""Network blocks that encoders and decoders are made of."""

@@ -1,0 +1,1 @@
+"""Training: the LightningModule, its optimiser recipe and callbacks."""

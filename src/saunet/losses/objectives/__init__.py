@@ -1,0 +1,1 @@
+"""Registered objectives: weighted compositions of terms."""

@@ -1,0 +1,1 @@
+"""Depth metrics and the protocols they are computed under."""

@@ -1,0 +1,1 @@
+"""Registered channel attention modules."""

@@ -1,0 +1,1 @@
+"""Registered decoders: feature maps -> disparity pyramid."""

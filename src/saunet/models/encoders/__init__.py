@@ -1,0 +1,1 @@
+"""Registered encoders: image -> feature maps."""

@@ -1,0 +1,1 @@
+"""Registered pose networks: frames -> relative camera motion."""

@@ -1,0 +1,205 @@
+"""Components declared once, reachable from Python and from Hydra.
+
+```python
+@encoders.register("stratified_tiny", dim=96)  # a preset: a name and only what differs
+class StratifiedTransformer(nn.Module): ...
+
+
+saunet.build("encoder", "stratified_tiny", drop_path=0.1)  # Python
+# saunet-train model/encoder=stratified_tiny model.encoder.drop_path=0.1   (command line)
+```
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from saunet import schema
+from saunet.checks import ConfigError, suggest
+
+C = TypeVar("C", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A registered name: what it builds and the defaults that make it this variant."""
+
+    name: str
+    target: Callable[..., Any]
+    preset: Mapping[str, Any]
+
+    @property
+    def path(self) -> str:
+        """Import path of the target, the ``_target_`` of its config node."""
+        return f"{self.target.__module__}.{self.target.__qualname__}"
+
+    @property
+    def summary(self) -> str:
+        """First line of the target's docstring."""
+        return (inspect.getdoc(self.target) or "").partition("\n")[0]
+
+
+class Registry:
+    """The components of one kind.
+
+    Args:
+        kind: What the components are, in the singular: ``"encoder"``.
+        group: Hydra config group their nodes are stored in: ``"model/encoder"``. None keeps them out of the config tree.
+        home: Package whose modules register the built-in components; imported on first use.
+        late: Parameters that the caller supplies when the rest of the system is known (a decoder's ``features``).
+    """
+
+    def __init__(self, kind: str, group: str | None, home: str, late: tuple[str, ...] = ()) -> None:
+        self.kind, self.group, self.late = kind, group, late
+        self._home: str | None = home
+        self._entries: dict[str, Entry] = {}
+
+    def register(self, name: str, **preset: Any) -> Callable[[C], C]:
+        """Declare a class or function as component ``name``, with defaults that differ from its signature.
+
+        Raises:
+            ValueError: if the name is taken.
+            TypeError: if the signature cannot become a config schema, or the preset names no parameter.
+        """
+
+        def declare(target: C) -> C:
+            if name in self._entries:
+                raise ValueError(f"{self.kind} '{name}' is already registered by {self._entries[name].path}")
+            known = schema.parameters(target)
+            for key in preset:
+                if key not in known:
+                    raise TypeError(
+                        f"{self.kind} '{name}': preset key '{key}' is not a parameter of {target.__qualname__}"
+                    )
+            self._entries[name] = Entry(name, target, preset)
+            return target
+
+        return declare
+
+    def build(self, name: str, **kwargs: Any) -> Any:
+        """Build component ``name``; keywords override its defaults.
+
+        Raises:
+            ConfigError: for an unknown name or parameter.
+        """
+        entry = self.entry(name)
+        self._check_keys(entry, kwargs)
+        return entry.target(**{**entry.preset, **kwargs})
+
+    def partial(self, name: str, **kwargs: Any) -> Callable[..., Any]:
+        """Return a callable that builds ``name`` once its late parameters are known."""
+        return functools.partial(self.build, name, **kwargs)
+
+    def entry(self, name: str) -> Entry:
+        """Return what is registered under ``name``.
+
+        Raises:
+            ConfigError: if nothing is; the message suggests the nearest name and lists the rest.
+        """
+        self._import_home()
+        if name not in self._entries:
+            hint = suggest(name, self._entries)
+            raise ConfigError(
+                f"unknown {self.kind} '{name}'{hint or ';'} available: {', '.join(self.names())}"
+            )
+        return self._entries[name]
+
+    def names(self) -> list[str]:
+        """Return the registered names, sorted."""
+        self._import_home()
+        return sorted(self._entries)
+
+    def __iter__(self) -> Iterator[Entry]:
+        return iter([self._entries[name] for name in self.names()])
+
+    def node(self, name: str) -> type:
+        """Return the typed config node of ``name``."""
+        entry = self.entry(name)
+        return schema.node(entry.target, entry.preset, self.late)
+
+    def _check_keys(self, entry: Entry, kwargs: Mapping[str, Any]) -> None:
+        known = schema.parameters(entry.target)
+        for key in kwargs:
+            if key not in known:
+                hint = suggest(key, known)
+                raise ConfigError(
+                    f"{self.kind} '{entry.name}' has no parameter '{key}'{hint or ';'} allowed: {', '.join(known)}"
+                )
+
+    def _import_home(self) -> None:
+        if self._home is None:
+            return
+        home, self._home = self._home, None
+        package = importlib.import_module(home)
+        for module in pkgutil.iter_modules(package.__path__, f"{home}."):
+            importlib.import_module(module.name)
+
+
+encoders = Registry("encoder", "model/encoder", "saunet.models.encoders")
+decoders = Registry("decoder", "model/decoder", "saunet.models.decoders", late=("features",))
+attentions = Registry("attention", None, "saunet.models.attention", late=("channels",))
+poses = Registry("pose", "model/pose", "saunet.models.poses")
+terms = Registry("term", "term", "saunet.losses.terms")
+objectives = Registry("objective", "objective", "saunet.losses.objectives")
+datamodules = Registry("data", "data", "saunet.data.modules")
+
+REGISTRIES: dict[str, Registry] = {
+    registry.kind: registry
+    for registry in (encoders, decoders, attentions, poses, terms, objectives, datamodules)
+}
+
+
+def registry(kind: str) -> Registry:
+    """Return the registry of a kind.
+
+    Raises:
+        ConfigError: for an unknown kind.
+    """
+    if kind not in REGISTRIES:
+        raise ConfigError(
+            f"unknown kind '{kind}'{suggest(kind, REGISTRIES) or ';'} kinds: {', '.join(REGISTRIES)}"
+        )
+    return REGISTRIES[kind]
+
+
+def instantiate(node: Any) -> Any:
+    """Build what a plain config describes: mappings with ``_target_`` become components, innermost first.
+
+    Only registered components are ever built, whatever a file says, so a config read from a checkpoint cannot run foreign code.
+
+    Args:
+        node: Plain containers (no DictConfig): the resolved config of a component.
+
+    Raises:
+        ConfigError: if a ``_target_`` is not registered or a key is not a parameter of it.
+    """
+    if isinstance(node, Mapping):
+        values = {
+            key: instantiate(value) for key, value in node.items() if key not in ("_convert_", "_partial_")
+        }
+        if "_target_" not in node:
+            return values
+        path = values.pop("_target_")
+        owner, entry = _by_path(path)
+        owner._check_keys(entry, values)
+        return functools.partial(entry.target, **values) if node.get("_partial_") else entry.target(**values)
+    if isinstance(node, list | tuple):
+        return [instantiate(item) for item in node]
+    return node
+
+
+def _by_path(path: str) -> tuple[Registry, Entry]:
+    for owner in REGISTRIES.values():
+        for entry in owner:
+            if entry.path == path:
+                return owner, entry
+    raise ConfigError(
+        f"'{path}' is not a registered component, so it is not built; "
+        "import the module that registers it first, or see `saunet-components` for what is available"
+    )

@@ -1,0 +1,109 @@
+"""What the parts of saunet hand to each other.
+
+Batches are ``TypedDict``: PyTorch's default collate and Lightning's device transfer work on them as they are.
+Results are frozen slotted dataclasses whose tuples are indexed by scale (0 = full resolution, s = 1/2**s).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+from typing_extensions import NotRequired, TypedDict
+
+
+class FrameBatch(TypedDict):
+    """What the data loader yields: decoded frames as bytes, before anything happened to them on the device."""
+
+    frames: UInt8[Tensor, "b 1+s 3 h w"]
+    """RGB frames; index 0 is the target, then the sources in the order of the data module's ``offsets``."""
+    K: Float[Tensor, "b 3 3"]
+    """Intrinsics in pixels of ``frames`` (integer coordinates are pixel centres)."""
+    name: list[str]
+    """One readable name a sample, such as ``2011_09_26/..._sync 0000000005 l``."""
+    target_depth: NotRequired[Float[Tensor, "b 1 h w"]]
+    """Depth of the target in metres at the size of ``frames``, 0 where unknown; for losses that use LiDAR."""
+    depth: NotRequired[Float[Tensor, "b 1 hg wg"]]
+    """Ground-truth depth in metres at its native size, 0 where unknown, padded to the largest in the batch."""
+    depth_size: NotRequired[Int[Tensor, "b 2"]]
+    """Native (height, width) of each ground truth inside the padding."""
+    T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
+    """True motion, where the data set knows it: a target point times it is a source point, in metres."""
+
+
+class TrainBatch(TypedDict):
+    """One training step's input, on the device, augmented. Images are RGB in [0, 1]."""
+
+    target: Float[Tensor, "b 3 h w"]
+    """The target image as the networks see it (colour-jittered)."""
+    sources: Float[Tensor, "b s 3 h w"]
+    """The source images as the networks see them (the same jitter)."""
+    loss_target: Float[Tensor, "b 3 h w"]
+    """The target image without colour jitter: what the loss compares."""
+    loss_sources: Float[Tensor, "b s 3 h w"]
+    """The source images without colour jitter."""
+    K: Float[Tensor, "b 3 3"]
+    """Intrinsics in pixels, after resize, crop and flip."""
+    name: list[str]
+    """One readable name a sample."""
+    target_depth: NotRequired[Float[Tensor, "b 1 h w"]]
+    """See `FrameBatch`; cropped and flipped with the images."""
+    T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
+    """See `FrameBatch`; follows flips."""
+
+
+class EvalBatch(TrainBatch):
+    """A batch without augmentation, with ground truth where the data set has it."""
+
+    depth: NotRequired[Float[Tensor, "b 1 hg wg"]]
+    """See `FrameBatch`."""
+    depth_size: NotRequired[Int[Tensor, "b 2"]]
+    """See `FrameBatch`."""
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureSpec:
+    """One feature map of an encoder, so that any decoder can follow any encoder."""
+
+    channels: int
+    stride: int
+    """Pixels of the input image per pixel of the feature map."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthPyramid:
+    """A depth network's output at several scales; tuple index = scale, sizes (h/2**s, w/2**s)."""
+
+    sigmoid: tuple[Float[Tensor, "b 1 _ _"], ...]
+    """The raw output in (0, 1): relative disparity."""
+    disparity: tuple[Float[Tensor, "b 1 _ _"], ...]
+    """Inverse depth in 1/metre (up to the scale ambiguity of monocular training)."""
+    depth: tuple[Float[Tensor, "b 1 _ _"], ...]
+    """Depth in metres (up to the same scale)."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """Source images resampled into the target camera, with where that is meaningful."""
+
+    image: Float[Tensor, "b s 3 h w"]
+    valid: Bool[Tensor, "b s 1 h w"]
+    """The point lies in front of the source camera and projects into its image."""
+
+
+@dataclass(frozen=True, slots=True)
+class LossTerms:
+    """An objective's result: what is optimised is what is logged."""
+
+    total: Float[Tensor, ""]
+    values: Mapping[str, Float[Tensor, ""]]
+    """The terms of ``total``, each before its weight, by name."""
+    maps: Mapping[str, Tensor] = field(default_factory=dict)
+    """Detached pictures for the log at full resolution, such as ``automask`` (b 1 h w)."""
+
+    def named(self, stage: str) -> dict[str, Tensor]:
+        """Return ``{"<stage>/loss": total, "<stage>/<term>": value, ...}``, detached, for logging."""
+        named = {f"{stage}/{name}": value.detach() for name, value in self.values.items()}
+        return {f"{stage}/loss": self.total.detach(), **named}
