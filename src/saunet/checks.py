@@ -64,9 +64,7 @@ def in_range(name: str, value: float, low: float, high: float) -> float:
     return value
 
 
-def divisible(
-    height: int, width: int, divisor: int, *, what: str = "image", by: str = "the encoder stride"
-) -> None:
+def divisible(height: int, width: int, divisor: int, *, what: str = "image", by: str = "the encoder stride") -> None:
     """Check that an image size is a positive multiple of ``divisor`` in both directions.
 
     Args:

@@ -105,9 +105,7 @@ class Registry:
         self._import_home()
         if name not in self._entries:
             hint = suggest(name, self._entries)
-            raise ConfigError(
-                f"unknown {self.kind} '{name}'{hint or ';'} available: {', '.join(self.names())}"
-            )
+            raise ConfigError(f"unknown {self.kind} '{name}'{hint or ';'} available: {', '.join(self.names())}")
         return self._entries[name]
 
     def names(self) -> list[str]:
@@ -150,8 +148,7 @@ objectives = Registry("objective", "objective", "saunet.losses.objectives")
 datamodules = Registry("data", "data", "saunet.data.modules")
 
 REGISTRIES: dict[str, Registry] = {
-    registry.kind: registry
-    for registry in (encoders, decoders, attentions, poses, terms, objectives, datamodules)
+    registry.kind: registry for registry in (encoders, decoders, attentions, poses, terms, objectives, datamodules)
 }
 
 
@@ -162,9 +159,7 @@ def registry(kind: str) -> Registry:
         ConfigError: for an unknown kind.
     """
     if kind not in REGISTRIES:
-        raise ConfigError(
-            f"unknown kind '{kind}'{suggest(kind, REGISTRIES) or ';'} kinds: {', '.join(REGISTRIES)}"
-        )
+        raise ConfigError(f"unknown kind '{kind}'{suggest(kind, REGISTRIES) or ';'} kinds: {', '.join(REGISTRIES)}")
     return REGISTRIES[kind]
 
 
@@ -180,9 +175,7 @@ def instantiate(node: Any) -> Any:
         ConfigError: if a ``_target_`` is not registered or a key is not a parameter of it.
     """
     if isinstance(node, Mapping):
-        values = {
-            key: instantiate(value) for key, value in node.items() if key not in ("_convert_", "_partial_")
-        }
+        values = {key: instantiate(value) for key, value in node.items() if key not in ("_convert_", "_partial_")}
         if "_target_" not in node:
             return values
         path = values.pop("_target_")

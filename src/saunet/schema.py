@@ -24,18 +24,14 @@ def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
         TypeError: if it takes ``*args``, ``**kwargs`` or an unannotated parameter: a config key needs a name and a type.
     """
     owner = target.__qualname__
-    function: Any = target.__init__ if inspect.isclass(target) else target  # type: ignore[misc]
+    function: Any = target.__init__ if inspect.isclass(target) else target
     hints = typing.get_type_hints(function)
     found = {}
     for name, parameter in inspect.signature(target).parameters.items():
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
-            raise TypeError(
-                f"{owner} takes '{parameter}'; a component names every parameter, each is a config key"
-            )
+            raise TypeError(f"{owner} takes '{parameter}'; a component names every parameter, each is a config key")
         if name not in hints:
-            raise TypeError(
-                f"{owner}: parameter '{name}' has no annotation; its type is needed for the config schema"
-            )
+            raise TypeError(f"{owner}: parameter '{name}' has no annotation; its type is needed for the config schema")
         found[name] = parameter.replace(annotation=hints[name])
     return found
 
@@ -80,11 +76,7 @@ def node(
 def _component(annotation: Any) -> type | None:
     """Return the class of a nested component (``Term`` or ``Term | None``), None for plain values."""
     plain = _strip_optional(annotation)
-    if (
-        not inspect.isclass(plain)
-        or plain in (*_PRIMITIVES, Path, Any, type(None))
-        or typing.get_origin(plain)
-    ):
+    if not inspect.isclass(plain) or plain in (*_PRIMITIVES, Path, Any, type(None)) or typing.get_origin(plain):
         return None
     if plain.__module__ in ("builtins", "collections.abc", "typing"):
         return None
@@ -118,7 +110,7 @@ def _config_type(annotation: Any) -> Any:
         item = items.pop() if len(items) == 1 else Any
         return list[item]  # type: ignore[valid-type]
     if origin in (dict, Mapping):
-        return dict[str, _config_type(arguments[1])]  # type: ignore[misc]
+        return dict[str, _config_type(arguments[1])]
     return Any
 
 

@@ -1,0 +1,46 @@
+"""Fixtures shared by all tests: where the reference data lie, and small inputs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+DATA_ROOT = Path(os.environ.get("SAUNET_TEST_DATA", Path(__file__).parents[1] / ".." / "shared")).resolve()
+
+
+@pytest.fixture(autouse=True)
+def _fixed_seed() -> None:
+    torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def test_data() -> Path:
+    """Root of the reference data; skips the test where they are absent."""
+    if not (DATA_ROOT / "reference").is_dir():
+        pytest.skip(f"no reference data at {DATA_ROOT}; set SAUNET_TEST_DATA to the folder that holds 'reference'")
+    return DATA_ROOT
+
+
+@pytest.fixture(scope="session")
+def reference(test_data: Path) -> Callable[[str], Mapping[str, Any]]:
+    """Load the expected numbers of an established implementation: ``reference("ssim")["target"]``."""
+
+    def load(name: str) -> Mapping[str, Any]:
+        with np.load(test_data / "reference" / f"{name}.npz") as arrays:
+            return {key: arrays[key] for key in arrays.files}
+
+    return load
+
+
+@pytest.fixture(scope="session")
+def kitti_mini(test_data: Path) -> Path:
+    """Folder with a few real KITTI recordings; skips the test where they are absent."""
+    if not (test_data / "kitti_mini" / "raw").is_dir():
+        pytest.skip(f"no KITTI frames at {test_data / 'kitti_mini'}")
+    return test_data / "kitti_mini"
