@@ -1,0 +1,84 @@
+"""Every job of the project, each in its own environment: ``nox -s demo``, ``nox -s tests``, ``nox -l`` lists all."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import nox
+
+nox.options.sessions = ["tests", "lint", "types"]
+nox.options.reuse_existing_virtualenvs = True
+nox.options.default_venv_backend = "venv"
+ROOT = Path(__file__).parent
+
+
+def install(session: nox.Session, *packages: str) -> None:
+    """Install with the tested pins; PyTorch first, so that nothing else chooses its build."""
+    constraints = ["-c", str(ROOT / "constraints.txt")]
+    pin = next(line for line in (ROOT / "constraints.txt").read_text().splitlines() if line.startswith("torch=="))
+    session.install(*constraints, pin)
+    session.install(*constraints, *packages)
+
+
+@nox.session
+def demo(session: nox.Session) -> None:
+    """Train, evaluate, and draw depth on the built-in synthetic drive (about five minutes on two cores)."""
+    install(session, "-e", ".")
+    session.run("python", "-m", "saunet.cli.demo", *session.posargs)
+
+
+@nox.session
+def tests(session: nox.Session) -> None:
+    """Run the test suite (without the slow and gpu tests)."""
+    install(session, "-e", ".[dev]")
+    session.run("pytest", *session.posargs)
+
+
+@nox.session
+def slow(session: nox.Session) -> None:
+    """Run the tests marked slow."""
+    install(session, "-e", ".[dev]")
+    session.run("pytest", "-m", "slow and not gpu", *session.posargs)
+
+
+@nox.session
+def ddp(session: nox.Session) -> None:
+    """Run the tests that start several processes."""
+    install(session, "-e", ".[dev]")
+    session.run("pytest", "-m", "ddp and not gpu", *session.posargs)
+
+
+@nox.session
+def lint(session: nox.Session) -> None:
+    """Check style and formatting."""
+    install(session, "ruff")
+    session.run("ruff", "check", ".")
+    session.run("ruff", "format", "--check", ".")
+
+
+@nox.session
+def types(session: nox.Session) -> None:
+    """Check types strictly."""
+    install(session, "-e", ".[dev]")
+    session.run("mypy", "src")
+
+
+@nox.session
+def wheel(session: nox.Session) -> None:
+    """Build the wheel, install it in a clean environment and train from another folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        session.run("python", "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ".")
+        built = next(Path(folder).glob("saunet-*.whl"))
+        install(session, "--force-reinstall", "--no-deps", str(built))
+        install(session, str(built))
+        session.chdir(folder)
+        session.run("saunet-train", "experiment=smoke")
+        session.run("saunet-components", "encoder")
+
+
+@nox.session
+def notebooks(session: nox.Session) -> None:
+    """Execute the notebooks on synthetic data."""
+    install(session, "-e", ".[dev]")
+    session.run("python", "notebooks/execute.py", *session.posargs)

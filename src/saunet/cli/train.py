@@ -1,0 +1,47 @@
+"""``saunet-train``: train a depth network on driving video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hydra.utils import instantiate as hydra_instantiate
+from omegaconf import DictConfig
+
+from saunet import config
+from saunet.cli._app import run
+
+
+def train(cfg: DictConfig) -> None:
+    """Build every part from the config, train, and print where the results are."""
+    from lightning import seed_everything
+
+    from saunet.checkpoint import read_checkpoint
+    from saunet.lit.assemble import assemble
+    from saunet.registry import instantiate
+
+    config.check(cfg)
+    resume = str(Path(cfg.resume).expanduser().resolve()) if cfg.resume else None
+    if resume:
+        read_checkpoint(resume)  # fail with one sentence now rather than deep inside the trainer
+    seed_everything(cfg.seed, workers=True, verbose=False)
+    data = instantiate(config.plain(cfg.data))
+    model = assemble(config.plain(cfg), data)
+    trainer = hydra_instantiate(
+        cfg.trainer,
+        callbacks=[hydra_instantiate(callback) for callback in cfg.callbacks.values() if callback],
+        logger=[hydra_instantiate(logger) for logger in cfg.logger.values() if logger] or False,
+        default_root_dir=cfg.output_dir,
+    )
+    trainer.fit(model, datamodule=data, ckpt_path=resume, weights_only=True)
+    if trainer.is_global_zero:
+        print(f"results: {cfg.output_dir}")
+
+
+def main() -> None:
+    """Entry point of ``saunet-train``."""
+    config.register_training_configs()
+    run("train", train)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,146 @@
+"""The command-line tools' configuration: where ``conf/`` lies, the typed root of each tool, and checks across parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+from saunet import schema
+from saunet.checks import ConfigError, divisible
+from saunet.registry import REGISTRIES
+
+
+def config_dir() -> Path:
+    """Return the folder of the YAML files: inside the installed package, or ``conf/`` of a source checkout.
+
+    Raises:
+        ConfigError: if neither exists (a broken installation).
+    """
+    package = Path(__file__).resolve().parent
+    for folder in (package / "conf", package.parents[1] / "conf"):
+        if (folder / "train.yaml").is_file():
+            return folder
+    raise ConfigError(f"no configuration files beside {package}; reinstall saunet")
+
+
+@dataclass
+class ModelConfig:
+    """Networks: depth (encoder + decoder) and pose."""
+
+    encoder: Any = MISSING
+    decoder: Any = MISSING
+    pose: Any = MISSING
+    min_depth: float = 0.1
+    max_depth: float = 100.0
+
+
+@dataclass
+class TrainConfig:
+    """Root of ``saunet-train``."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    objective: Any = MISSING
+    data: Any = MISSING
+    optim: Any = MISSING
+    trainer: Any = MISSING
+    callbacks: dict[str, Any] = field(default_factory=dict)
+    logger: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    name: str = MISSING
+    output_dir: str = MISSING
+    resume: str | None = None
+    monitor: str = MISSING
+    protocol: str | None = None
+
+
+@dataclass
+class EvaluateConfig:
+    """Root of ``saunet-evaluate``."""
+
+    checkpoint: str = MISSING
+    data: Any = MISSING
+    protocols: list[str] | None = None
+    split: str = "test"
+    flip: bool = False
+    baselines: bool = True
+    device: str = "auto"
+    output_dir: str = MISSING
+
+
+@dataclass
+class PredictConfig:
+    """Root of ``saunet-predict``."""
+
+    checkpoint: str = MISSING
+    input: str = MISSING
+    output: str = MISSING
+    outputs: list[str] = field(default_factory=lambda: ["colour"])
+    flip: bool = False
+    overwrite: bool = False
+    device: str = "auto"
+
+
+def register_configs() -> None:
+    """Put the root schemas and every registered component into Hydra's config store."""
+    store = ConfigStore.instance()
+    for name, root in (("train", TrainConfig), ("evaluate", EvaluateConfig), ("predict", PredictConfig)):
+        store.store(name=f"{name}_schema", node=root)
+    for registry in REGISTRIES.values():
+        if registry.group is None:
+            continue
+        for entry in registry:
+            store.store(group=registry.group, name=entry.name, node=registry.node(entry.name))
+
+
+def register_training_configs() -> None:
+    """Add the nodes that need Lightning to be imported: the trainer's own options and the optimisation recipe."""
+    from lightning import Trainer
+
+    from saunet.lit.optim import Recipe
+
+    store = ConfigStore.instance()
+    store.store(group="trainer", name="lightning", node=schema.node(Trainer, root="lightning.Trainer"))
+    store.store(group="optim", name="recipe", node=schema.node(Recipe))
+
+
+def plain(node: Any) -> Any:
+    """Return a config node as plain containers with all references resolved: what components and checkpoints see."""
+    return OmegaConf.to_container(node, resolve=True, throw_on_missing=True) if OmegaConf.is_config(node) else node
+
+
+def check(cfg: DictConfig) -> None:
+    """Check what no single part can know.
+
+    Raises:
+        ConfigError: if the parts of a training configuration do not fit together.
+    """
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    strategy = str(cfg.trainer.get("strategy", "auto"))
+    multirun = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+    if multirun and strategy.startswith("ddp") and "spawn" not in strategy and "fork" not in strategy:
+        raise ConfigError(
+            f"--multirun with trainer.strategy={strategy} would replay the whole sweep on every process; "
+            "use trainer=ddp_spawn, or one process per job through a Hydra launcher"
+        )
+    objective = plain(cfg.objective)
+    gradient = objective.get("gradient") or {}
+    if gradient.get("target") == "lidar" and not cfg.data.get("target_depth", False):
+        raise ConfigError(
+            "objective.gradient.target=lidar needs LiDAR depth in the training batches; "
+            "set data.target_depth=true, or use objective.gradient.target=image"
+        )
+
+
+def check_size(cfg: DictConfig, size_divisor: int) -> None:
+    """Check the training image size against what the encoder can take.
+
+    Raises:
+        ConfigError: if it does not fit; the message names the nearest valid size.
+    """
+    divisible(cfg.data.height, cfg.data.width, size_divisor, what="data.height x data.width", by="the encoder's stride")

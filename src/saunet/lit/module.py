@@ -1,0 +1,115 @@
+"""The training loop's body: four lines that read like the paper, and validation under a named protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from lightning import LightningModule
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from saunet.geometry import warp
+from saunet.geometry.depth import disparity_to_depth
+from saunet.lit.optim import Recipe
+from saunet.metrics.depth import DepthMetrics
+from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
+
+
+class SelfSupervisedDepth(LightningModule):
+    """Depth and pose networks trained together on video by view synthesis (SAU-Net section III).
+
+    Args:
+        depth: Image -> `DepthPyramid`.
+        pose: (target, sources) -> ``T_src_tgt``.
+        objective: (batch, pyramid, poses, views) -> `LossTerms`.
+        recipe: Optimiser and schedule.
+        metrics: Scores validation batches that have ground truth.
+        record: Plain data stored in every checkpoint under ``"saunet"``, from which `saunet.load` rebuilds the networks.
+    """
+
+    def __init__(
+        self,
+        depth: nn.Module,
+        pose: nn.Module,
+        objective: nn.Module,
+        recipe: Recipe | None = None,
+        metrics: DepthMetrics | None = None,
+        record: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.depth = depth
+        self.pose = pose
+        self.objective = objective
+        self.metrics = metrics if metrics is not None else DepthMetrics()
+        self.recipe = recipe if recipe is not None else Recipe()
+        self.record = dict(record or {})
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> DepthPyramid:
+        """Return the depth of images in [0, 1]."""
+        pyramid: DepthPyramid = self.depth(image)
+        return pyramid
+
+    def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
+        """Return the loss of one batch, eq. (14)."""
+        terms = self.step(batch)[-1]
+        self.log_dict(terms.named("train"), prog_bar=False, batch_size=len(batch["name"]))
+        self.log("loss", terms.total.detach(), prog_bar=True, logger=False, batch_size=len(batch["name"]))
+        return terms.total
+
+    def step(self, batch: TrainBatch) -> tuple[DepthPyramid, tuple[View, ...], LossTerms]:
+        """Predict depth and motion, synthesise the target from its neighbours, and compare."""
+        pyramid: DepthPyramid = self.depth(batch["target"])  # Z_t
+        poses = self.pose(batch["target"], batch["sources"])  # D_{t->t'}
+        views = self.synthesize(batch, pyramid, poses)  # H_{t'->t}, eq. (7)
+        terms: LossTerms = self.objective(batch, pyramid, poses, views)  # alpha L1 + beta L2, eq. (14)
+        return pyramid, views, terms
+
+    @staticmethod
+    def synthesize(batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"]) -> tuple[View, ...]:
+        """Resample the source images into the target camera, once per scale, eq. (7).
+
+        Coarse disparity is enlarged to full resolution first (Monodepth2): sampling small images would leave holes in the
+        gradient and copy texture into depth.
+        """
+        size = batch["loss_target"].shape[-2:]
+        views = []
+        for disparity in pyramid.disparity:
+            full = disparity
+            if disparity.shape[-2:] != size:
+                full = F.interpolate(disparity, size=size, mode="bilinear", align_corners=False)
+            views.append(warp.synthesize(batch["loss_sources"], disparity_to_depth(full), batch["K"], poses))
+        return tuple(views)
+
+    def validation_step(self, batch: EvalBatch, batch_idx: int) -> None:
+        """Score depth where there is ground truth, and the loss where the batch has neighbours."""
+        count = len(batch["name"])
+        if batch["sources"].shape[1] > 0:
+            pyramid, _, terms = self.step(batch)
+            self.log_dict(terms.named("val"), sync_dist=True, batch_size=count)
+        else:
+            pyramid = self(batch["target"])
+        if "depth" in batch:
+            self.metrics.update(pyramid.disparity[0], batch["depth"], batch["depth_size"])
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the metrics over the whole validation set, exact over any number of processes."""
+        result = self.metrics.compute()
+        if result["images"] > 0:
+            # Every process holds the same synchronised numbers, so nothing is left to reduce.
+            named = {f"val/{name}": value.to(torch.float32) for name, value in result.items()}
+            self.log_dict(named)
+            self.log("abs_rel", named["val/abs_rel"], prog_bar=True, logger=False)
+        self.metrics.reset()
+
+    def configure_optimizers(self) -> Any:
+        """Return Adam over both networks with the recipe's schedule."""
+        total = self.trainer.estimated_stepping_batches
+        trainable = (parameter for parameter in self.parameters() if parameter.requires_grad)
+        return self.recipe.configure(trainable, int(total))
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Store the plain record from which the networks are rebuilt."""
+        checkpoint["saunet"] = self.record
