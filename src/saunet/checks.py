@@ -42,7 +42,7 @@ def one_of(name: str, value: str, allowed: Iterable[str]) -> str:
     return value
 
 
-def positive(name: str, value: float, *, allow_zero: bool = False) -> float:
+def positive(name: str, value: float | int, *, allow_zero: bool = False) -> float | int:
     """Return ``value`` if it is a finite number above zero (or zero, with ``allow_zero``).
 
     Raises:
@@ -53,7 +53,7 @@ def positive(name: str, value: float, *, allow_zero: bool = False) -> float:
     return value
 
 
-def in_range(name: str, value: float, low: float, high: float) -> float:
+def in_range(name: str, value: float | int, low: float | int, high: float | int) -> float | int:
     """Return ``value`` if ``low <= value <= high``.
 
     Raises:

@@ -1,0 +1,162 @@
+"""ResNet encoders (He et al. 2016) with torchvision's parameter names, for one image or several stacked frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from saunet.checks import ConfigError, positive
+from saunet.registry import encoders
+from saunet.types import FeatureSpec
+
+_WIDTHS = (64, 128, 256, 512)
+
+
+class BasicBlock(nn.Module):
+    """Two 3×3 convolutions with a shortcut, the block of ResNet-18 and 34 (He et al. 2016, fig. 5 left)."""
+
+    expansion = 1
+
+    def __init__(self, inputs: int, width: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, width, 3, stride, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.downsample = _shortcut(inputs, width, stride)
+
+    def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co _ _"]:
+        """Return relu(F(x) + shortcut(x)), at 1/stride of the size."""
+        shortcut = x if self.downsample is None else self.downsample(x)
+        x = F.relu(self.bn1(self.conv1(x)), inplace=True)
+        x = self.bn2(self.conv2(x))
+        return F.relu(x.add_(shortcut), inplace=True)
+
+
+class Bottleneck(nn.Module):
+    """1×1, 3×3, 1×1 convolutions with a shortcut, the block of ResNet-50 and up; it strides in the 3×3."""
+
+    expansion = 4
+
+    def __init__(self, inputs: int, width: int, stride: int) -> None:
+        super().__init__()
+        outputs = width * self.expansion
+        self.conv1 = nn.Conv2d(inputs, width, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, stride, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.conv3 = nn.Conv2d(width, outputs, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(outputs)
+        self.downsample = _shortcut(inputs, outputs, stride)
+
+    def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co _ _"]:
+        """Return relu(F(x) + shortcut(x)), at 1/stride of the size."""
+        shortcut = x if self.downsample is None else self.downsample(x)
+        x = F.relu(self.bn1(self.conv1(x)), inplace=True)
+        x = F.relu(self.bn2(self.conv2(x)), inplace=True)
+        x = self.bn3(self.conv3(x))
+        return F.relu(x.add_(shortcut), inplace=True)
+
+
+@encoders.register("resnet18", blocks=(2, 2, 2, 2))
+@encoders.register("resnet34", blocks=(3, 4, 6, 3))
+@encoders.register("resnet50", blocks=(3, 4, 6, 3), bottleneck=True)
+@encoders.register("resnet101", blocks=(3, 4, 23, 3), bottleneck=True)
+class ResNet(nn.Module):
+    """ResNet features at 1/2, 1/4, 1/8, 1/16, 1/32, the encoder of Monodepth2 (SAU-Net Table 3, first row).
+
+    State-dict keys are torchvision's without ``fc``. Images come in [0, 1]; as in Monodepth2 every channel has 0.45
+    subtracted and is divided by 0.225. The first feature follows the first ReLU, before the max-pooling.
+
+    Args:
+        blocks: Residual blocks in each of the four stages.
+        bottleneck: Bottleneck blocks (ResNet-50 and up) instead of basic ones.
+        frames: RGB images stacked in the channels of the input: 1 for depth, 2 or 3 for pose.
+
+    Attributes:
+        features: Channels and stride of each feature map, finest first.
+        size_divisor: Input height and width must be multiples of it.
+        variant: The usual name: ``resnet`` and the number of weighted layers with the classifier, such as ``resnet18``.
+
+    Raises:
+        ConfigError: if there are not four stages of at least one block, or no frame.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        blocks: Sequence[int] = (2, 2, 2, 2),
+        bottleneck: bool = False,
+        frames: int = 1,
+    ) -> None:
+        super().__init__()
+        blocks = tuple(blocks)
+        if len(blocks) != 4 or min(blocks) < 1:
+            raise ConfigError(
+                f"blocks is {blocks}; a ResNet has four stages of at least one block, such as (2, 2, 2, 2)"
+            )
+        positive("frames", frames)
+        kind: type[BasicBlock] | type[Bottleneck] = Bottleneck if bottleneck else BasicBlock
+        self.frames = frames
+        self.variant = f"resnet{sum(blocks) * (3 if bottleneck else 2) + 2}"
+        self.register_buffer("mean", torch.tensor(0.45), persistent=False)
+        self.register_buffer("std", torch.tensor(0.225), persistent=False)
+
+        self.conv1 = nn.Conv2d(3 * frames, 64, 7, stride=2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
+        inputs, stages = 64, []
+        for stage, (width, depth) in enumerate(zip(_WIDTHS, blocks, strict=True)):
+            layers = []
+            for block in range(depth):
+                layers.append(kind(inputs, width, stride=2 if block == 0 and stage > 0 else 1))
+                inputs = width * kind.expansion
+            stages.append(nn.Sequential(*layers))
+        self.layer1, self.layer2, self.layer3, self.layer4 = stages
+
+        outputs = (64, *(width * kind.expansion for width in _WIDTHS))
+        self.features = tuple(FeatureSpec(channels, 2 ** (i + 1)) for i, channels in enumerate(outputs))
+        self.size_divisor = 32
+        _initialise(self)
+
+    def forward(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, ...]:
+        """Return the five feature maps, finest first.
+
+        Args:
+            image: RGB in [0, 1], 3 channels a frame; h and w multiples of 32.
+        """
+        x = F.relu(self.bn1(self.conv1((image - self.mean) / self.std)), inplace=True)
+        features = [x]
+        x = self.maxpool(x)
+        for stage in (self.layer1, self.layer2, self.layer3, self.layer4):
+            x = stage(x)
+            features.append(x)
+        return tuple(features)
+
+
+def tile_frames(weight: Float[Tensor, "o 3 kh kw"], frames: int) -> Float[Tensor, "o c kh kw"]:
+    """Return first-layer weights for ``frames`` stacked images from those for one.
+
+    The weights are repeated and divided by the number of frames, as Monodepth2 does, so that equal frames give the
+    response of one.
+    """
+    return weight.repeat(1, frames, 1, 1) / frames
+
+
+def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Sequential | None:
+    if stride == 1 and inputs == outputs:
+        return None
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+
+
+def _initialise(network: nn.Module) -> None:
+    """Draw convolutions from He et al.'s normal distribution (fan out), as torchvision does."""
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
