@@ -1,0 +1,115 @@
+"""Every YAML composes, names do not collide, and a typo fails while composing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from saunet.config import config_dir, plain, register_configs, register_training_configs
+from saunet.registry import REGISTRIES
+
+ROOTS = {"train", "evaluate", "predict"}
+GROUPS = ("model", "trainer", "callbacks", "logger")
+REGISTERED = [
+    (registry.group, name)
+    for registry in REGISTRIES.values()
+    if registry.group in ("model/encoder", "model/decoder", "model/pose", "objective", "data")
+    for name in registry.names()
+]
+
+
+def _yaml(group: str) -> list[str]:
+    folder = config_dir() / group
+    return sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.rglob("*.yaml"))
+
+
+@pytest.fixture(autouse=True)
+def _hydra() -> Iterator[None]:
+    register_configs()
+    register_training_configs()
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        yield
+
+
+def _compose(*overrides: str, root: str = "train") -> object:
+    return compose(root, overrides=["output_dir=/tmp/x", *overrides] if root != "predict" else list(overrides))
+
+
+def _resolved(*overrides: str) -> dict[str, object]:
+    cfg = _compose(*overrides, "data.root=/nowhere") if "data=kitti" in overrides else _compose(*overrides)
+    result = {key: plain(cfg[key]) for key in ("model", "objective", "data", "optim", "trainer")}  # type: ignore[index]
+    assert all(result.values())
+    return result
+
+
+@pytest.mark.parametrize("root", sorted(ROOTS))
+def test_every_root_composes(root: str) -> None:
+    assert _compose(root=root)
+
+
+@pytest.mark.parametrize(("group", "name"), [(group, name) for group in GROUPS for name in _yaml(group)])
+def test_every_yaml_composes(group: str, name: str) -> None:
+    assert _compose(f"{group}={name}")
+
+
+@pytest.mark.parametrize("name", _yaml("experiment"))
+def test_every_experiment_composes_and_lands_at_the_root(name: str) -> None:
+    assert (config_dir() / "experiment" / f"{name}.yaml").read_text().startswith("# @package _global_\n")
+    cfg = _compose(f"experiment={name}")
+    assert "experiment" not in OmegaConf.to_container(cfg)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("group", "name"), REGISTERED)
+def test_every_registered_name_composes_from_the_command_line(group: str, name: str) -> None:
+    cfg = _compose(f"{group}={name}")
+    node = OmegaConf.select(cfg, group.replace("/", "."))  # type: ignore[arg-type]
+    assert node._target_.startswith("saunet.")
+
+
+def test_no_yaml_is_named_like_a_registered_component() -> None:
+    for registry in REGISTRIES.values():
+        if registry.group is not None:
+            folder = config_dir() / registry.group
+            taken = {path.stem for path in folder.glob("*.yaml")}
+            assert taken.isdisjoint(registry.names()), f"conf/{registry.group} repeats a registered name"
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "sead=3",
+        "model.encoder.dephts=[2,2]",
+        "model.encoder.depths=[a]",
+        "model.max_dept=3",
+        "objective.alhpa=3",
+        "objective.alpha=much",
+        "data.heigth=64",
+        "optim.learning_rate=1",
+        "trainer.max_epoch=3",
+    ],
+)
+def test_a_typo_fails_while_composing(override: str) -> None:
+    with pytest.raises((HydraException, OmegaConfBaseException)):
+        _compose(override)
+
+
+@pytest.mark.parametrize("group", ["model/encoder", "model/decoder", "objective", "data", "experiment"])
+def test_an_unknown_choice_lists_the_known_ones(group: str) -> None:
+    with pytest.raises(HydraException, match=r"(?s)Available options|Could not find"):
+        _compose(f"{group}=nonsense")
+
+
+def test_pose_offsets_follow_the_data() -> None:
+    model = _resolved("data.offsets=[-2,2]")["model"]
+    assert model["pose"]["offsets"] == [-2, 2]  # type: ignore[index]
+
+
+def test_configs_ship_with_the_package() -> None:
+    assert (config_dir() / "train.yaml").is_file()
+    assert Path(config_dir()).is_absolute()
