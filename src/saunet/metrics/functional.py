@@ -1,0 +1,101 @@
+"""Numbers of one depth map against one ground truth: errors, the median, the Garg crop, flip post-processing."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+ABS_REL, SQ_REL, RMSE, RMSE_LOG, A1, A2, A3 = range(7)
+"""Positions in the vector that `depth_errors` returns."""
+ERROR_NAMES: tuple[str, ...] = ("abs_rel", "sq_rel", "rmse", "rmse_log", "a1", "a2", "a3")
+"""The seven depth errors in the field's column order."""
+HIGHER_IS_BETTER: tuple[bool, ...] = (False, False, False, False, True, True, True)
+"""Which of `ERROR_NAMES` grow with quality."""
+
+_GARG_ROWS = (0.40810811, 0.99189189)
+_GARG_COLUMNS = (0.03594771, 0.96405229)
+
+
+def depth_errors(
+    prediction: Float[Tensor, " b *shape"], target: Float[Tensor, " b *shape"], mask: Bool[Tensor, " b *shape"]
+) -> Float[Tensor, "b 7"]:
+    """Compute the seven Eigen errors of each image over its masked pixels; SAU-Net eqs. (15)-(19).
+
+    The standard definitions, for the equations are misprinted: with ``d`` the prediction and ``D*`` the truth, mean
+    |d-D*|/D*; mean (d-D*)²/D*; root of mean (d-D*)²; root of mean (ln d - ln D*)²; and the share of pixels with
+    max(d/D*, D*/d) below 1.25, 1.25², 1.25³. Computed in double precision, without waiting for the device.
+
+    Args:
+        prediction: Depth in metres, positive where ``mask`` is set.
+        target: True depth in metres, positive where ``mask`` is set.
+        mask: The pixels that count.
+
+    Returns:
+        float64, columns as in `ERROR_NAMES`; a row of NaN for an image without a masked pixel.
+    """
+    d = torch.where(mask, prediction, 1).double().flatten(1)
+    truth = torch.where(mask, target, 1).double().flatten(1)
+    weight = mask.double().flatten(1)
+    count = weight.sum(1)
+
+    def mean(value: Tensor) -> Tensor:
+        return (value * weight).sum(1) / count  # 0/0 = NaN: a mean over nothing has no value
+
+    squared = (d - truth).square()
+    ratio = torch.maximum(d / truth, truth / d)
+    errors = [
+        mean((d - truth).abs() / truth),
+        mean(squared / truth),
+        mean(squared).sqrt(),
+        mean((d.log() - truth.log()).square()).sqrt(),
+        *(mean((ratio < 1.25**power).double()) for power in (1, 2, 3)),
+    ]
+    return torch.stack(errors, 1)
+
+
+def median(values: Float[Tensor, " n"]) -> Float[Tensor, ""]:
+    """Return the true median (the mean of the two middle values for an even count), NaN for no values.
+
+    `torch.median` returns the lower of the two, which moves the published numbers.
+    """
+    count = values.numel()
+    if count == 0:
+        return values.new_full((), float("nan"))
+    ordered = values.sort().values
+    return (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
+
+
+def garg_crop(height: int, width: int) -> tuple[int, int, int, int]:
+    """Return the evaluated part of a KITTI image, (top, bottom, left, right), ends exclusive (Garg et al., 2016).
+
+    The products are taken in double precision and truncated, as published code does: at 370x1226 the last row is
+    366.9999993, hence 366; single precision would give 367.
+    """
+    top, bottom = (int(part * height) for part in _GARG_ROWS)
+    left, right = (int(part * width) for part in _GARG_COLUMNS)
+    return top, bottom, left, right
+
+
+def flip_blend(
+    disparity: Float[Tensor, "b 1 h w"], disparity_of_flipped: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b 1 h w"]:
+    """Blend the disparity of an image with that of its mirror image (Monodepth's post-processing).
+
+    The left 5 % takes the mirrored prediction alone and the right 5 % the direct one (where each saw more context), the
+    middle their average, with linear ramps between.
+
+    Args:
+        disparity: Prediction for the image.
+        disparity_of_flipped: Prediction for the mirrored image, still mirrored.
+
+    Returns:
+        The blended disparity, at the dtype of ``disparity``.
+    """
+    width = disparity.shape[-1]
+    other = disparity_of_flipped.flip(-1)
+    x = torch.linspace(0, 1, width, dtype=torch.float64, device=disparity.device)
+    left = 1 - (20 * (x - 0.05)).clamp(0, 1)
+    right = left.flip(0)
+    mean = (disparity + other) / 2
+    return (right * disparity + left * other + (1 - left - right) * mean).to(disparity.dtype)
