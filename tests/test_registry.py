@@ -58,7 +58,7 @@ def test_unknown_preset_key_is_an_error(widgets: Registry) -> None:
 
 
 def test_unknown_name_suggests_the_nearest(widgets: Registry) -> None:
-    with pytest.raises(ConfigError, match="unknown widget 'wid'; did you mean 'wide'"):
+    with pytest.raises(ConfigError, match=r"unknown widget 'wid'; did you mean 'wide'"):
         widgets.build("wid")
     with pytest.raises(ConfigError, match="unknown widget 'zzz'; available: plain, wide"):
         widgets.build("zzz")

@@ -10,7 +10,7 @@ __version__ = "0.1.0"
 __all__ = ["__version__", "available", "build", "load"]
 
 
-def build(kind: str, name: str, **kwargs: Any) -> Any:
+def build(kind: str, name: str, /, **kwargs: Any) -> Any:
     """Build a registered component.
 
     Args:

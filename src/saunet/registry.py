@@ -50,7 +50,7 @@ class Registry:
 
     Args:
         kind: What the components are, in the singular: ``"encoder"``.
-        group: Hydra config group their nodes are stored in: ``"model/encoder"``. None keeps them out of the config tree.
+        group: Hydra config group their nodes are stored in: ``"model/encoder"``; None keeps them out of the config.
         home: Package whose modules register the built-in components; imported on first use.
         late: Parameters that the caller supplies when the rest of the system is known (a decoder's ``features``).
     """
@@ -60,7 +60,7 @@ class Registry:
         self._home: str | None = home
         self._entries: dict[str, Entry] = {}
 
-    def register(self, name: str, **preset: Any) -> Callable[[C], C]:
+    def register(self, name: str, /, **preset: Any) -> Callable[[C], C]:
         """Declare a class or function as component ``name``, with defaults that differ from its signature.
 
         Raises:
@@ -82,7 +82,7 @@ class Registry:
 
         return declare
 
-    def build(self, name: str, **kwargs: Any) -> Any:
+    def build(self, name: str, /, **kwargs: Any) -> Any:
         """Build component ``name``; keywords override its defaults.
 
         Raises:
@@ -92,7 +92,7 @@ class Registry:
         self._check_keys(entry, kwargs)
         return entry.target(**{**entry.preset, **kwargs})
 
-    def partial(self, name: str, **kwargs: Any) -> Callable[..., Any]:
+    def partial(self, name: str, /, **kwargs: Any) -> Callable[..., Any]:
         """Return a callable that builds ``name`` once its late parameters are known."""
         return functools.partial(self.build, name, **kwargs)
 
@@ -166,7 +166,7 @@ def registry(kind: str) -> Registry:
 def instantiate(node: Any) -> Any:
     """Build what a plain config describes: mappings with ``_target_`` become components, innermost first.
 
-    Only registered components are ever built, whatever a file says, so a config read from a checkpoint cannot run foreign code.
+    Only registered components are ever built, whatever a file says, so a checkpoint's config cannot run foreign code.
 
     Args:
         node: Plain containers (no DictConfig): the resolved config of a component.

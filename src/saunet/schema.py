@@ -1,7 +1,8 @@
 """Constructor signature -> typed Hydra schema.
 
-The parameters of a component *are* its config keys: names, types and defaults are read from ``__init__`` and become a dataclass
-that OmegaConf validates, so a misspelt key or a word where a number belongs fails while the config is composed.
+The parameters of a component *are* its config keys: names, types and defaults are read from ``__init__`` and become
+a dataclass that OmegaConf validates, so a misspelt key or a word where a number belongs fails while the config is
+composed.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     """Return the named parameters of a class or function, in order, with annotations resolved.
 
     Raises:
-        TypeError: if it takes ``*args``, ``**kwargs`` or an unannotated parameter: a config key needs a name and a type.
+        TypeError: if it takes ``*args``, ``**kwargs`` or an unannotated parameter: a config key has a name and a type.
     """
     owner = target.__qualname__
     function: Any = target.__init__ if inspect.isclass(target) else target
@@ -47,7 +48,7 @@ def node(
     Args:
         target: A class or function with an annotated signature.
         preset: Defaults that differ from the signature's.
-        late: Parameters given by the caller at run time rather than by config; they leave the schema and the node is partial.
+        late: Parameters that the caller gives at run time; they leave the schema, and the node is partial.
         root: Import path to store as ``_target_``; the target's own by default.
 
     Returns:

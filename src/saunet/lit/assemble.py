@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from saunet import __version__
-from saunet.checks import divisible
-from saunet.checkpoint import FORMAT, ModelRecord, build_networks
+from saunet.checkpoint import ModelRecord, build_networks
+from saunet.checks import ConfigError, divisible
 from saunet.data.module import DepthDataModule
 from saunet.lit.module import SelfSupervisedDepth
 from saunet.metrics.depth import DepthMetrics
@@ -20,9 +19,30 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule) -> SelfSupervisedDep
 
     Args:
         cfg: Plain containers with the keys of `saunet.config.TrainConfig`.
-        data: The data module the model will be trained on; it names the protocol if the config does not.
+        data: What the model will be trained on; it names the validation protocol if the config does not.
 
     Raises:
-        ConfigError: if a part cannot be built or the image size does not fit the encoder.
+        ConfigError: if a part cannot be built, or the parts do not fit together.
     """
-    raise NotImplementedError((FORMAT, __version__, divisible, ModelRecord, build_networks, DepthMetrics, protocol, instantiate))
+    record = ModelRecord(
+        **cfg["model"],
+        height=data.height,
+        width=data.width,
+        offsets=tuple(data.offsets),
+        data={"name": cfg["name"], **cfg["data"]},
+    )
+    if list(record.pose["offsets"]) != list(data.offsets):
+        raise ConfigError(
+            f"model.pose.offsets is {list(record.pose['offsets'])} but the data gives frames at {list(data.offsets)}; "
+            "set data.offsets only, the pose network follows"
+        )
+    depth, pose = build_networks(record)
+    divisible(data.height, data.width, depth.size_divisor, what="data.height x data.width", by="the encoder's stride")
+    return SelfSupervisedDepth(
+        depth=depth,
+        pose=pose,
+        objective=instantiate(cfg["objective"]),
+        recipe=_recipe(cfg["optim"]),
+        metrics=DepthMetrics(protocol(cfg.get("protocol") or data.protocol)),
+        record=record.to_plain(),
+    )

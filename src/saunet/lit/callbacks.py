@@ -12,8 +12,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from saunet.checks import SaunetError
-from saunet.infer.panel import training_panel
 from saunet.infer.images import write_image
+from saunet.infer.panel import training_panel
 from saunet.types import EvalBatch
 
 

@@ -27,7 +27,7 @@ class SelfSupervisedDepth(LightningModule):
         objective: (batch, pyramid, poses, views) -> `LossTerms`.
         recipe: Optimiser and schedule.
         metrics: Scores validation batches that have ground truth.
-        record: Plain data stored in every checkpoint under ``"saunet"``, from which `saunet.load` rebuilds the networks.
+        record: Plain data stored in every checkpoint under ``"saunet"``; `saunet.load` rebuilds the networks from it.
     """
 
     def __init__(
@@ -71,8 +71,8 @@ class SelfSupervisedDepth(LightningModule):
     def synthesize(batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"]) -> tuple[View, ...]:
         """Resample the source images into the target camera, once per scale, eq. (7).
 
-        Coarse disparity is enlarged to full resolution first (Monodepth2): sampling small images would leave holes in the
-        gradient and copy texture into depth.
+        Coarse disparity is enlarged to full resolution first (Monodepth2): sampling small images would leave holes in
+        the gradient and copy texture into depth.
         """
         size = batch["loss_target"].shape[-2:]
         views = []

@@ -45,14 +45,18 @@ class Recipe:
         positive("optim.lr", self.lr)
         positive("optim.weight_decay", self.weight_decay, allow_zero=True)
         if len(self.betas) != 2 or not all(0 <= beta < 1 for beta in self.betas):
-            raise ConfigError(f"optim.betas is {list(self.betas)}; two numbers in [0, 1) are needed, such as [0.9, 0.999]")
+            raise ConfigError(
+                f"optim.betas is {list(self.betas)}; two numbers in [0, 1) are needed, such as [0.9, 0.999]"
+            )
         if not all(0 < milestone < 1 for milestone in self.milestones):
             raise ConfigError(
                 f"optim.milestones is {list(self.milestones)}; they are fractions of the training between 0 and 1, "
                 "such as 0.75 for epoch 60 of 80"
             )
         if not 0 <= self.warmup < 1:
-            raise ConfigError(f"optim.warmup is {self.warmup}; it is a fraction of the training, at least 0 and below 1")
+            raise ConfigError(
+                f"optim.warmup is {self.warmup}; it is a fraction of the training, at least 0 and below 1"
+            )
 
     def factor(self, progress: float) -> float:
         """Return the learning rate relative to ``lr`` when a fraction ``progress`` (0 to 1) of the training is done."""
