@@ -1,0 +1,92 @@
+"""Pinhole intrinsics that follow what happens to an image: resize, crop, flip.
+
+All functions take K as ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in pixels; integer coordinates are pixel centres.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from saunet.geometry.precision import full_precision
+
+Number = float | int | Float[Tensor, "*b"]
+
+
+@full_precision
+def scale_intrinsics(K: Float[Tensor, "*b 3 3"], scale_x: Number, scale_y: Number) -> Float[Tensor, "*b 3 3"]:
+    """Intrinsics of an image resized by ``(scale_x, scale_y)``: a pixel u moves to ``(u + 0.5) * scale - 0.5``.
+
+    Args:
+        K: Intrinsics in pixels of the original image.
+        scale_x: New width / old width; one number, or one per item of the batch.
+        scale_y: New height / old height.
+
+    Returns:
+        Intrinsics in pixels of the resized image.
+    """
+    x, y = _per_item(scale_x, K), _per_item(scale_y, K)
+    return torch.stack(
+        (
+            x * K[..., 0, :] + (0.5 * x - 0.5) * K[..., 2, :],
+            y * K[..., 1, :] + (0.5 * y - 0.5) * K[..., 2, :],
+            K[..., 2, :],
+        ),
+        dim=-2,
+    )
+
+
+@full_precision
+def crop_intrinsics(K: Float[Tensor, "*b 3 3"], left: Number, top: Number) -> Float[Tensor, "*b 3 3"]:
+    """Intrinsics of an image whose first ``left`` columns and ``top`` rows were cut off.
+
+    Args:
+        K: Intrinsics in pixels of the original image.
+        left: Columns removed on the left (negative where columns were added); one number, or one per item of the batch.
+        top: Rows removed at the top.
+
+    Returns:
+        Intrinsics in pixels of the crop.
+    """
+    x, y = _per_item(left, K), _per_item(top, K)
+    return torch.stack((K[..., 0, :] - x * K[..., 2, :], K[..., 1, :] - y * K[..., 2, :], K[..., 2, :]), dim=-2)
+
+
+@full_precision
+def flip_intrinsics(K: Float[Tensor, "*b 3 3"], width: Number) -> Float[Tensor, "*b 3 3"]:
+    """Intrinsics of a horizontally mirrored image: ``cx -> width - 1 - cx``.
+
+    The mirrored image is one of the mirrored world: a point (x, y, z) is seen as (-x, y, z).
+
+    Args:
+        K: Intrinsics in pixels of the original image.
+        width: Image width in pixels; one number, or one per item of the batch.
+
+    Returns:
+        Intrinsics in pixels of the mirrored image.
+    """
+    shift = (_per_item(width, K) - 1) * K[..., 2, :]
+    mirrored = torch.cat((K[..., 0, :1], -K[..., 0, 1:]), dim=-1)
+    return torch.stack((mirrored + shift, K[..., 1, :], K[..., 2, :]), dim=-2)
+
+
+@full_precision
+def invert_intrinsics(K: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Inverse of an upper triangular K in closed form: exact, and without the device synchronisation of a solver.
+
+    Args:
+        K: Intrinsics in pixels.
+
+    Returns:
+        K^-1, which maps homogeneous pixels to rays at depth 1.
+    """
+    fx, skew, cx, fy, cy = K[..., 0, 0], K[..., 0, 1], K[..., 0, 2], K[..., 1, 1], K[..., 1, 2]
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    entries = (1 / fx, -skew / (fx * fy), (skew * cy / fy - cx) / fx, zero, 1 / fy, -cy / fy, zero, zero, one)
+    return torch.stack(entries, dim=-1).reshape(K.shape)
+
+
+def _per_item(value: Number, K: Tensor) -> Tensor | float:
+    """Shape a number or a batch of numbers so that it multiplies rows of K."""
+    return value.to(K)[..., None] if isinstance(value, Tensor) else float(value)

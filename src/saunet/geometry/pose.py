@@ -1,0 +1,90 @@
+"""Rigid motions: 6-vector <-> SE(3).
+
+Plain multiplications instead of matrix products: on GPUs a float32 matrix product may run in TF32 (ten bits), which
+moves a warped pixel by a visible fraction of its width.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from saunet.geometry.precision import full_precision
+
+_SMALL_ANGLE_SQUARED = 1e-2
+
+
+@full_precision
+def axisangle_to_matrix(axisangle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation matrices of axis-angle vectors: the exact exponential map of so(3).
+
+    Values and gradients are exact at and around the angle 0, where the textbook formula divides zero by zero.
+
+    Args:
+        axisangle: Axis times angle, radians.
+
+    Returns:
+        Rotation matrices.
+    """
+    squared = axisangle.square().sum(-1)
+    small = squared < _SMALL_ANGLE_SQUARED
+    # The branch that is not taken must stay finite too: its gradient is multiplied by zero, and 0 * inf is NaN.
+    angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
+    series = torch.where(small, squared, torch.zeros_like(squared))
+    sin_over_angle = torch.where(
+        small, 1 - series / 6 * (1 - series / 20 * (1 - series / 42 * (1 - series / 72))), angle.sin() / angle
+    )
+    # (1 - cos a) / a^2 = 2 sin^2(a/2) / a^2, which does not cancel.
+    versine = torch.where(
+        small,
+        0.5 - series / 24 * (1 - series / 30 * (1 - series / 56 * (1 - series / 90))),
+        2 * (angle / 2).sin().square() / angle.square(),
+    )
+    x, y, z = axisangle.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).reshape(*x.shape, 3, 3)
+    outer = axisangle[..., :, None] * axisangle[..., None, :]
+    eye = torch.eye(3, dtype=axisangle.dtype, device=axisangle.device)
+    cosine = (1 - versine * squared)[..., None, None]
+    rotation: Tensor = cosine * eye + sin_over_angle[..., None, None] * cross + versine[..., None, None] * outer
+    return rotation
+
+
+@full_precision
+def pose_matrix(
+    axisangle: Float[Tensor, "*b 3"], translation: Float[Tensor, "*b 3"], invert: bool = False
+) -> Float[Tensor, "*b 4 4"]:
+    """Rigid motion that rotates, then translates.
+
+    Args:
+        axisangle: Axis times angle, radians.
+        translation: Metres (up to the scale ambiguity of monocular training).
+        invert: Return the inverse motion instead.
+
+    Returns:
+        4x4 matrices.
+    """
+    pose = _assemble(axisangle_to_matrix(axisangle), translation)
+    return invert_pose(pose) if invert else pose
+
+
+@full_precision
+def invert_pose(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """Inverse of rigid motions: ``T_src_tgt`` becomes ``T_tgt_src``.
+
+    Args:
+        T: 4x4 rigid motions (rotation and translation only).
+
+    Returns:
+        Their inverses.
+    """
+    rotation, translation = T[..., :3, :3], T[..., :3, 3]
+    return _assemble(rotation.transpose(-1, -2), -(rotation * translation[..., :, None]).sum(-2))
+
+
+def _assemble(rotation: Tensor, translation: Tensor) -> Tensor:
+    top = torch.cat((rotation, translation[..., None]), dim=-1)
+    zeros = torch.zeros_like(rotation[..., :1, :])  # built on the device: copying constants there would wait for it
+    last = torch.cat((zeros, torch.ones_like(zeros[..., :1])), dim=-1)
+    return torch.cat((top, last), dim=-2)
