@@ -1,0 +1,137 @@
+"""What an evaluation found: one row for each image, predictor and protocol, and their means."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from saunet.checks import ConfigError, DataError, one_of
+from saunet.metrics.protocols import Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class ImageRow:
+    """The errors of one predictor on one image under one protocol."""
+
+    predictor: str
+    protocol: str
+    name: str
+    """The image's name."""
+    pixels: int
+    """Pixels compared; 0 where the image has no ground truth, and then the numbers are NaN."""
+    scale: float
+    """median(truth)/median(prediction), whether or not it was applied."""
+    errors: tuple[float, ...]
+    """In the order of `saunet.metrics.functional.ERROR_NAMES`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Means of one predictor under one protocol over the images that have ground truth; NaN if none has."""
+
+    predictor: str
+    protocol: str
+    errors: tuple[float, ...]
+    """In the order of `saunet.metrics.functional.ERROR_NAMES`."""
+    scale: float
+    """Mean of median(truth)/median(prediction)."""
+    scale_std: float
+    """Its standard deviation over images."""
+    images: int
+    images_without_truth: int
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """All rows of an evaluation, with the protocols that they were computed under."""
+
+    protocols: tuple[Protocol, ...]
+    predictors: tuple[str, ...]
+    rows: tuple[ImageRow, ...]
+
+    def select(self, predictor: str, protocol: str) -> tuple[ImageRow, ...]:
+        """Return the rows of one predictor under one protocol, in the order they were computed.
+
+        Raises:
+            ConfigError: if the result holds no such predictor or protocol.
+        """
+        one_of("predictor", predictor, self.predictors)
+        one_of("protocol", protocol, [rules.name for rules in self.protocols])
+        return tuple(row for row in self.rows if row.predictor == predictor and row.protocol == protocol)
+
+    def errors(self, predictor: str, protocol: str) -> NDArray[np.float64]:
+        """Return the errors of the images that have ground truth, images x 7.
+
+        Raises:
+            ConfigError: if the result holds no such predictor or protocol.
+        """
+        rows = [row.errors for row in self.select(predictor, protocol) if row.pixels]
+        return np.array(rows, dtype=np.float64).reshape(-1, 7)
+
+    def summaries(self) -> tuple[Summary, ...]:
+        """Return one summary for each protocol and predictor that has rows, in the order they were asked for."""
+        groups: dict[tuple[str, str], list[ImageRow]] = {
+            (rules.name, predictor): [] for rules in self.protocols for predictor in self.predictors
+        }
+        for row in self.rows:
+            groups[row.protocol, row.predictor].append(row)
+        return tuple(summarise(rows) for rows in groups.values() if rows)
+
+    def joined(self, other: EvaluationResult) -> EvaluationResult:
+        """Return both results as one: other protocols (another ground truth) or other predictors of the same images.
+
+        Raises:
+            ConfigError: if both give rows for the same predictor and protocol, protocols of one name differ, or the
+                images do.
+        """
+        mine, theirs = ({(row.predictor, row.protocol) for row in result.rows} for result in (self, other))
+        if both := sorted(mine & theirs):
+            raise ConfigError(
+                f"both results hold predictor '{both[0][0]}' under protocol '{both[0][1]}'; "
+                "give one of them another name"
+            )
+        rules = {protocol.name: protocol for protocol in self.protocols}
+        for protocol in other.protocols:
+            if rules.setdefault(protocol.name, protocol) != protocol:
+                raise ConfigError(f"the results mean different rules by protocol '{protocol.name}'; rename one of them")
+            names = [{row.name for row in result.rows if row.protocol == protocol.name} for result in (self, other)]
+            if all(names) and names[0] != names[1]:
+                raise ConfigError(
+                    f"the results under '{protocol.name}' come from {len(names[0])} and {len(names[1])} images that "
+                    "are not the same; evaluate both on one split"
+                )
+        predictors = tuple(dict.fromkeys((*self.predictors, *other.predictors)))
+        return EvaluationResult(tuple(rules.values()), predictors, (*self.rows, *other.rows))
+
+
+def summarise(rows: Iterable[ImageRow]) -> Summary:
+    """Return the means of rows that share predictor and protocol.
+
+    Raises:
+        DataError: if there are no rows or they do not share both.
+    """
+    rows = list(rows)
+    keys = {(row.predictor, row.protocol) for row in rows}
+    if len(keys) != 1:
+        raise DataError(
+            f"{len(rows)} rows of {len(keys)} predictors and protocols; a summary needs rows of exactly one"
+        )
+    ((predictor, protocol),) = keys
+    scored = [row for row in rows if row.pixels]
+    if not scored:
+        return Summary(predictor, protocol, (math.nan,) * 7, math.nan, math.nan, 0, len(rows))
+    errors = np.array([row.errors for row in scored]).mean(0)
+    scales = np.array([row.scale for row in scored])
+    return Summary(
+        predictor,
+        protocol,
+        tuple(errors.tolist()),
+        float(scales.mean()),
+        float(scales.std()),
+        len(scored),
+        len(rows) - len(scored),
+    )

@@ -1,0 +1,168 @@
+"""Joining, summarising and writing results; files appear whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import math
+import os
+
+import pytest
+from rich.console import Console
+
+from saunet.checks import ConfigError, DataError
+from saunet.evaluation.files import atomic
+from saunet.evaluation.result import EvaluationResult, ImageRow, summarise
+from saunet.evaluation.writers import HEADINGS, as_json, markdown, print_table, read_rows, write_results
+from saunet.metrics.functional import ERROR_NAMES
+from saunet.metrics.protocols import protocol
+
+NAN = (math.nan,) * 7
+
+
+def result(predictors=("model", "constant"), protocols=("eigen_camera_z", "metric"), blank=True):
+    rows = []
+    for p, predictor in enumerate(predictors):
+        for name in protocols:
+            for i in range(3):
+                errors = tuple(0.1 * (i + 1) + 0.01 * p + 0.001 * k for k in range(7))
+                rows.append(ImageRow(predictor, name, f"drive, {i}", 50 + i, 2.0 + i, errors))
+            if blank:
+                rows.append(ImageRow(predictor, name, "drive, 3", 0, math.nan, NAN))
+    return EvaluationResult(tuple(map(protocol, protocols)), tuple(predictors), tuple(rows))
+
+
+def test_summary_is_the_mean_over_images():
+    summary = result().summaries()[0]
+    assert (summary.predictor, summary.protocol) == ("model", "eigen_camera_z")
+    assert summary.errors == pytest.approx([0.2 + 0.001 * k for k in range(7)])
+    assert (summary.scale, summary.scale_std) == pytest.approx((3.0, math.sqrt(2 / 3)))
+    assert (summary.images, summary.images_without_truth) == (3, 1)
+
+
+def test_summary_of_blank_images_only():
+    summary = summarise([ImageRow("m", "metric", "a", 0, math.nan, NAN)])
+    assert (summary.images, summary.images_without_truth) == (0, 1)
+    assert math.isnan(summary.errors[0])
+    with pytest.raises(DataError, match="0 rows"):
+        summarise([])
+
+
+def test_select_names_the_nearest():
+    with pytest.raises(ConfigError, match="did you mean 'model'"):
+        result().select("modell", "metric")
+
+
+def test_joined_protocols_and_predictors():
+    joined = result(protocols=("metric",)).joined(result(protocols=("eigen_lidar_x",)))
+    assert [rules.name for rules in joined.protocols] == ["metric", "eigen_lidar_x"]
+    joined = joined.joined(result(predictors=("other",), protocols=("metric",)))
+    assert joined.predictors == ("model", "constant", "other")
+    assert len(joined.summaries()) == 5
+
+
+def test_joined_refuses_what_does_not_belong_together():
+    with pytest.raises(ConfigError, match="both results hold predictor 'constant'"):
+        result().joined(result())
+    other = result(predictors=("other",))
+    changed = dataclasses.replace(
+        other, protocols=tuple(dataclasses.replace(rules, max_depth=50.0) for rules in other.protocols)
+    )
+    with pytest.raises(ConfigError, match="different rules by protocol 'eigen_camera_z'"):
+        result().joined(changed)
+    with pytest.raises(ConfigError, match="4 and 3 images that are not the same"):
+        result().joined(result(predictors=("other",), blank=False))
+
+
+def test_terminal_table():
+    stream = io.StringIO()
+    print_table(result(predictors=("model", "[odd] name")), Console(file=stream, width=140))
+    text = stream.getvalue()
+    for heading in HEADINGS:
+        assert heading in text
+    assert "[odd] name" in text
+    assert "0.200" in text
+    assert "3 images; 1 more without a ground-truth pixel" in text
+    positions = [text.index(heading) for heading in HEADINGS]
+    assert positions == sorted(positions)
+
+
+def test_best_value_is_bold():
+    stream = io.StringIO()
+    print_table(
+        result(protocols=("metric",)), Console(file=stream, width=140, force_terminal=True, color_system="standard")
+    )
+    model, constant = (line for line in stream.getvalue().splitlines() if line.startswith(("│ model", "│ constant")))
+    assert model.count("\x1b[1m") == 4
+    assert constant.count("\x1b[1m") == 3
+
+
+def test_markdown():
+    lines = markdown(result(protocols=("metric",))).splitlines()
+    assert lines[2] == f"| predictor | {' | '.join(HEADINGS)} |"
+    assert lines[4] == "| model | 0.200 | 0.201 | 0.202 | 0.203 | 0.204 | 0.205 | 0.206 |"
+
+
+def test_files(tmp_path):
+    found = result()
+    paths = write_results(found, tmp_path / "new" / "folder")
+    assert sorted(p.name for p in (tmp_path / "new" / "folder").iterdir()) == sorted(paths)
+    data = json.loads(paths["metrics.json"].read_text())
+    assert data == as_json(found)
+    assert data["protocols"][0]["max_depth"] == 80.0
+    assert data["results"][0]["abs_rel"] == pytest.approx(0.2)
+    with paths["metrics.csv"].open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [float(row["a3"]) for row in table] == pytest.approx([s.errors[6] for s in found.summaries()])
+    rows = read_rows(paths["per_image.csv"])
+    assert rows[:3] == found.rows[:3]
+    assert rows[3].pixels == 0
+    assert math.isnan(rows[3].errors[0])
+
+
+def test_json_has_no_nan():
+    blank = EvaluationResult((protocol("metric"),), ("m",), (ImageRow("m", "metric", "a", 0, math.nan, NAN),))
+    assert json.loads(json.dumps(as_json(blank), allow_nan=False))["results"][0]["abs_rel"] is None
+
+
+def test_nothing_is_left_behind_when_writing_fails(tmp_path):
+    target = tmp_path / "metrics.json"
+    target.write_text("old")
+
+    def interrupted():
+        with atomic(target) as file:
+            file.write("half")
+            raise RuntimeError("stopped")
+
+    with pytest.raises(RuntimeError, match="stopped"):
+        interrupted()
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
+    assert target.read_text() == "old"
+
+
+def test_unwritable_place(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(DataError, match=r"cannot write .*; choose a folder"):
+        write_results(result(), tmp_path / "file" / "below")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_no_permission(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(DataError, match="Permission denied"):
+        write_results(result(), tmp_path)
+
+
+def test_reading_rows_that_are_none(tmp_path):
+    with pytest.raises(DataError, match="cannot read"):
+        read_rows(tmp_path / "missing.csv")
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(DataError, match="has no column 'predictor'"):
+        read_rows(tmp_path / "other.csv")
+    path = write_results(result(), tmp_path)["per_image.csv"]
+    path.write_text(path.read_text().replace(",50,", ",many,"))
+    with pytest.raises(DataError, match="not a row of numbers"):
+        read_rows(path)
+    assert "abs_rel" in ERROR_NAMES

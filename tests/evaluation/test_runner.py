@@ -1,0 +1,150 @@
+"""Running predictors over batches: the same numbers as the metric, and clear refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from torch import nn
+
+from saunet.checks import ConfigError, DataError
+from saunet.evaluation import NetworkPredictor, evaluate
+from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
+from saunet.metrics.depth import DepthMetrics
+from saunet.metrics.functional import ERROR_NAMES, flip_blend
+from saunet.metrics.protocols import protocol
+from saunet.types import DepthPyramid
+
+PROTOCOLS = [protocol("eigen_camera_z"), protocol("metric")]
+
+
+def batches(count=3, images=2):
+    for b in range(count):
+        target = torch.rand(images, 3, 8, 16)
+        yield {
+            "target": target,
+            "name": [f"drive {b * images + i:03d}" for i in range(images)],
+            "depth": torch.rand(images, 1, 20, 30) * 40 + 2,
+            "depth_size": torch.tensor([[20, 30]] * (images - 1) + [[18, 29]]),
+        }
+
+
+class Pyramid(nn.Module):
+    def forward(self, image):
+        disparity = image[:, :1] + 0.1
+        return DepthPyramid(sigmoid=(disparity,), disparity=(disparity, disparity * 9), depth=(1 / disparity,))
+
+
+def test_agrees_with_the_metric_for_every_predictor_and_protocol():
+    data = list(batches())
+    mean_map = MeanDepthMap(4, 8)
+    for batch in data:
+        mean_map.update(batch["depth"], batch["depth_size"])
+    predictors = {
+        name: NetworkPredictor(network)
+        for name, network in {"model": Pyramid(), "constant": ConstantDepth(), "mean map": mean_map}.items()
+    }
+    result = evaluate(predictors, iter(data), PROTOCOLS, total=6, progress=False)
+    assert result.predictors == ("model", "constant", "mean map")
+    assert len(result.rows) == 6 * 3 * 2
+    for summary in result.summaries():
+        metric = DepthMetrics(summary.protocol)
+        for batch in data:
+            metric.update(predictors[summary.predictor](batch), batch["depth"], batch["depth_size"])
+        expected = metric.compute()
+        for name, value in zip(ERROR_NAMES, summary.errors, strict=True):
+            assert value == pytest.approx(expected[name].item(), rel=1e-12)
+        assert summary.scale == pytest.approx(expected["scale"].item(), rel=1e-12)
+        assert summary.scale_std == pytest.approx(expected["scale_std"].item(), rel=1e-6, abs=1e-9)
+        assert summary.images == 6
+
+
+def test_progress_goes_to_standard_error(capsys):
+    evaluate({"constant": NetworkPredictor(ConstantDepth())}, batches(), PROTOCOLS, total=6)
+    assert capsys.readouterr().out == ""
+
+
+def test_flip_is_the_blend_and_network_is_in_evaluation_mode():
+    network = Pyramid().train()
+    batch = next(batches())
+    blended = NetworkPredictor(network, flip=True)(batch)
+    assert not network.training
+    assert not blended.requires_grad
+    plain = batch["target"][:, :1] + 0.1
+    torch.testing.assert_close(blended, flip_blend(plain, plain.flip(-1)))
+
+
+def test_images_without_truth_are_kept_as_rows_and_left_out_of_means():
+    data = list(batches())
+    data[1]["depth"][0] = 0
+    result = evaluate({"m": NetworkPredictor(Pyramid())}, data, PROTOCOLS, progress=False)
+    summary = result.summaries()[0]
+    assert (summary.images, summary.images_without_truth) == (5, 1)
+    assert all(value == value for value in summary.errors)
+    assert result.errors("m", "metric").shape == (5, 7)
+    blank = [row for row in result.rows if row.pixels == 0]
+    assert {row.name for row in blank} == {"drive 002"}
+
+
+def test_only_one_batch_is_pulled_at_a_time():
+    alive = []
+
+    def watched():
+        for batch in batches():
+            alive.append(len(alive))
+            yield batch
+
+    seen = []
+
+    def predictor(batch):
+        seen.append(len(alive))
+        return batch["target"][:, :1] + 0.1
+
+    evaluate({"m": predictor}, watched(), PROTOCOLS, progress=False)
+    assert seen == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("predictors", "protocols", "ground_truth", "message"),
+    [
+        ({}, PROTOCOLS, "camera_z", "0 predictors under 2 protocols"),
+        ({"m": ConstantDepth()}, [], "camera_z", "1 predictors under 0 protocols"),
+        ({"m": ConstantDepth()}, PROTOCOLS * 2, "camera_z", "share a name"),
+        ({"m": ConstantDepth()}, PROTOCOLS, "lidar_x", "'eigen_camera_z' is defined on 'camera_z' .* give 'lidar_x'"),
+        ({"m": ConstantDepth()}, PROTOCOLS, "lidar", "did you mean 'lidar_x'"),
+    ],
+)
+def test_impossible_requests(predictors, protocols, ground_truth, message):
+    with pytest.raises(ConfigError, match=message):
+        evaluate(predictors, batches(), protocols, ground_truth=ground_truth, progress=False)
+
+
+def test_bad_data():
+    predictors = {"m": NetworkPredictor(ConstantDepth())}
+    with pytest.raises(DataError, match="no image to evaluate"):
+        evaluate(predictors, [], PROTOCOLS, progress=False)
+    batch = next(batches())
+    del batch["depth"]
+    with pytest.raises(DataError, match="'drive 000' comes without ground-truth depth"):
+        evaluate(predictors, [batch], PROTOCOLS, progress=False)
+
+
+def test_bad_predictions():
+    def nan(batch):
+        return torch.full((2, 1, 4, 4), float("nan"))
+
+    def short(batch):
+        return torch.ones(1, 1, 4, 4)
+
+    with pytest.raises(DataError, match="'m' gives values that are not finite for image 'drive 000'"):
+        evaluate({"m": nan}, batches(), PROTOCOLS, progress=False)
+    with pytest.raises(DataError, match=r"returned shape \(1, 1, 4, 4\) for 2 images"):
+        evaluate({"m": short}, batches(), PROTOCOLS, progress=False)
+
+
+def test_factor_protocol_runs_beside_the_named_one():
+    factor = dataclasses.replace(protocol("metric"), name="metric x2", factor=2.0)
+    result = evaluate({"m": NetworkPredictor(Pyramid())}, batches(), [protocol("metric"), factor], progress=False)
+    first, second = result.summaries()
+    assert first.scale == pytest.approx(2 * second.scale)
