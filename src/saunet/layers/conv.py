@@ -1,0 +1,60 @@
+"""Convolutions that depth decoders are made of: reflection-padded 3×3, bilinear upsampling, the disparity head."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+START = 0.3
+"""Sigmoid disparity that an untrained `DisparityHead` predicts on average."""
+
+
+class Conv3x3(nn.Conv2d):
+    """3×3 convolution with one pixel of reflection padding, as in Monodepth2's decoder: no frame along the border."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs, 3)
+
+    def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co h w"]:
+        """Return the convolution at the same size; a map one pixel wide has nothing to reflect and is repeated."""
+        mode = "reflect" if min(x.shape[-2:]) > 1 else "replicate"
+        return F.conv2d(F.pad(x, (1, 1, 1, 1), mode=mode), self.weight, self.bias)
+
+
+class ConvELU(nn.Sequential):
+    """Reflection-padded 3×3 convolution and ELU, Monodepth2's decoder block."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(Conv3x3(inputs, outputs), nn.ELU(inplace=True))
+
+
+class DisparityHead(nn.Module):
+    """Sigmoid disparity in (0, 1) from a feature map: a 3×3 convolution and the logistic function.
+
+    The bias starts at logit(0.3) instead of 0. With the usual limits of 0.1 and 100 an untrained network then predicts
+    a depth of a third of a unit, three times the nearest one: room on both sides, and about where networks trained from
+    video settle. Logit 0 is only twice the nearest depth, and most of a road scene lies further away than that.
+    """
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.conv = Conv3x3(inputs, 1)
+        nn.init.constant_(self.conv.bias, math.log(START / (1 - START)))  # type: ignore[arg-type]
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Return disparity in (0, 1) at the size of ``x``.
+
+        Outside autocast: a logit of bfloat16 near -4, which is a far pixel, would round depth to about two per cent.
+        """
+        with torch.autocast(device_type=x.device.type, enabled=False):
+            logits: Tensor = self.conv(x.to(self.conv.weight.dtype))
+            return logits.sigmoid()
+
+
+def upsample(x: Float[Tensor, "b c h w"], factor: int = 2) -> Float[Tensor, "b c _ _"]:
+    """Return ``x`` enlarged bilinearly; a pixel covers its area (``align_corners=False``), as in resizing images."""
+    return F.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)

@@ -1,0 +1,40 @@
+"""What every decoder asks of the encoder before it and of the scales after it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from saunet.checks import ConfigError
+from saunet.types import FeatureSpec
+
+
+def by_level(features: Sequence[FeatureSpec]) -> dict[int, int]:
+    """Return ``{level: channels}`` of an encoder's features, finest first; level l has stride 2**l.
+
+    Raises:
+        ConfigError: if there is no feature, or the strides are not ascending powers of two.
+    """
+    strides = [feature.stride for feature in features]
+    if not features or sorted(set(strides)) != strides or any(s < 1 or s & (s - 1) for s in strides) or strides[-1] < 2:
+        raise ConfigError(
+            f"the encoder's features have strides {strides}; a decoder needs ascending powers of two, such as [2, 4, 8]"
+        )
+    return {feature.stride.bit_length() - 1: feature.channels for feature in features}
+
+
+def check_scales(scales: Sequence[int], levels: int) -> tuple[int, ...]:
+    """Return ``scales`` as a tuple.
+
+    Args:
+        scales: Scales to predict disparity at; scale s has the size of the image divided by 2**s.
+        levels: How many scales the decoder can predict.
+
+    Raises:
+        ConfigError: if they are not 0, 1, ... in order (a pyramid is indexed by scale), or more than there are levels.
+    """
+    scales = tuple(scales)
+    if not scales or scales != tuple(range(len(scales))) or len(scales) > levels:
+        raise ConfigError(
+            f"scales is {list(scales)}; allowed: {list(range(levels))} or its first entries, without gaps"
+        )
+    return scales

@@ -1,0 +1,66 @@
+"""The depth network: any encoder, any decoder, and the step from sigmoid disparity to metres."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from saunet.checks import ConfigError, divisible
+from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
+from saunet.types import DepthPyramid
+
+
+class DepthNet(nn.Module):
+    """One image to depth at several scales (SAU-Net section III-A: Z_t from H_t).
+
+    Weights and the image are kept in channels-last memory order, in which convolutions run fastest on CPU and GPU and
+    a transformer's tokens become a feature map without a copy.
+
+    Args:
+        encoder: A network with ``features`` and ``size_divisor``, returning feature maps finest first.
+        decoder: Called with ``features=encoder.features``; the result maps feature maps to sigmoid disparities.
+        min_depth: Depth at sigmoid 1.
+        max_depth: Depth at sigmoid 0.
+
+    Attributes:
+        features: Channels and stride of each feature map of the encoder.
+        size_divisor: Image height and width must be multiples of it.
+
+    Raises:
+        ConfigError: if not 0 < min_depth < max_depth, or the decoder does not fit the encoder.
+    """
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        decoder: Callable[..., nn.Module],
+        min_depth: float = 0.1,
+        max_depth: float = 100.0,
+    ) -> None:
+        super().__init__()
+        if not 0 < min_depth < max_depth:
+            raise ConfigError(f"min_depth is {min_depth} and max_depth {max_depth}; needed: 0 < min_depth < max_depth")
+        self.encoder = encoder
+        self.decoder = decoder(features=encoder.features)
+        self.features = encoder.features
+        self.size_divisor = int(encoder.size_divisor)  # type: ignore[arg-type]
+        self.min_depth, self.max_depth = float(min_depth), float(max_depth)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> DepthPyramid:
+        """Return disparity and depth at each of the decoder's scales.
+
+        Args:
+            image: RGB in [0, 1].
+
+        Raises:
+            ConfigError: if height or width is not a multiple of the encoder's stride.
+        """
+        divisible(image.shape[-2], image.shape[-1], self.size_divisor)
+        features = self.encoder(image.contiguous(memory_format=torch.channels_last))
+        sigmoid = tuple(self.decoder(features))
+        disparity = tuple(sigmoid_to_disparity(x, self.min_depth, self.max_depth) for x in sigmoid)
+        return DepthPyramid(sigmoid, disparity, tuple(disparity_to_depth(x) for x in disparity))
