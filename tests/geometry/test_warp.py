@@ -169,7 +169,7 @@ def step(images, depth, K, axisangle, translation):
     return synthesize(images, depth, K, pose_matrix(axisangle, translation))
 
 K = torch.tensor([[[20.0, 0.0, 7.3], [0.0, 18.0, 5.1], [0.0, 0.0, 1.0]]])
-inputs = (torch.rand(1, 2, 3, 12, 16), torch.rand(1, 1, 12, 16) + 2, K, torch.randn(1, 2, 3) * 0.02, torch.rand(1, 2, 3))
+inputs = torch.rand(1, 2, 3, 12, 16), torch.rand(1, 1, 12, 16) + 2, K, torch.randn(1, 2, 3) * 0.02, torch.rand(1, 2, 3)
 found, expected = torch.compile(step, fullgraph=True, backend="aot_eager")(*inputs), step(*inputs)
 torch.testing.assert_close(found.image, expected.image, rtol=0, atol=1e-5)
 assert torch.equal(found.valid, expected.valid)

@@ -1,0 +1,208 @@
+"""The maths of the losses, as pure functions on tensors: float32 inside autocast, float64 where given, no host sync."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from saunet.checks import one_of
+from saunet.geometry.precision import full_precision
+
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+@full_precision
+def ssim_loss(prediction: Float[Tensor, "*b c h w"], target: Float[Tensor, "*#b c h w"]) -> Float[Tensor, "*b c h w"]:
+    """Structural dissimilarity (1 - SSIM) / 2 in [0, 1], the first part of SAU-Net eq. (8), per channel.
+
+    A 3x3 box window with reflection padding, as the field uses it; a Gaussian window is another function.
+
+    Args:
+        prediction: Images in [0, 1].
+        target: What they should look like; broadcast over the leading dimensions.
+
+    Returns:
+        One map a channel.
+    """
+    mean_p, mean_t = _box(prediction), _box(target)
+    var_p = _box(prediction.square()) - mean_p.square()
+    var_t = _box(target.square()) - mean_t.square()
+    covariance = _box(prediction * target) - mean_p * mean_t
+    similarity = (2 * mean_p * mean_t + _C1) * (2 * covariance + _C2)
+    largest = (mean_p.square() + mean_t.square() + _C1) * (var_p + var_t + _C2)
+    return ((1 - similarity / largest) / 2).clamp(0, 1)
+
+
+@full_precision
+def photometric_error(
+    prediction: Float[Tensor, "*b c h w"], target: Float[Tensor, "*#b c h w"], ssim_weight: float = 0.85
+) -> Float[Tensor, "*b 1 h w"]:
+    """Photometric error pe = w (1 - SSIM) / 2 + (1 - w) |difference|, SAU-Net eqs. (8) and (9), mean over channels.
+
+    Args:
+        prediction: Images in [0, 1].
+        target: What they should look like; broadcast over the leading dimensions.
+        ssim_weight: w, the weight of the structural part; 0 leaves it out.
+
+    Returns:
+        One map an image.
+    """
+    error = (1 - ssim_weight) * (prediction - target).abs().mean(-3, keepdim=True)
+    if ssim_weight == 0:
+        return error
+    return error + ssim_weight * ssim_loss(prediction, target).mean(-3, keepdim=True)
+
+
+@full_precision
+def combine_sources(
+    errors: Float[Tensor, "b s 1 h w"], valid: Bool[Tensor, "b s 1 h w"] | None = None, sources: str = "minimum"
+) -> tuple[Float[Tensor, "b 1 h w"], Bool[Tensor, "b 1 h w"]]:
+    """One error a pixel from one a source: the minimum of SAU-Net eq. (10), or the mean.
+
+    Args:
+        errors: Photometric error of each source.
+        valid: Where a source counts; everywhere if None. A source that does not count never wins the minimum.
+        sources: ``minimum`` or ``mean``.
+
+    Returns:
+        The error, 0 where no source counts, and where at least one does.
+
+    Raises:
+        ConfigError: for another word.
+    """
+    one_of("sources", sources, ("minimum", "mean"))
+    if valid is None:
+        valid = torch.ones_like(errors, dtype=torch.bool)
+    known = valid.any(1)
+    if sources == "mean":
+        return torch.where(valid, errors, 0.0).sum(1) / valid.sum(1).clamp(min=1), known
+    best = torch.where(valid, errors, torch.inf).min(1).values
+    return torch.where(known, best, 0.0), known
+
+
+@full_precision
+def automask(
+    error: Float[Tensor, "b 1 h w"], identity: Float[Tensor, "b 1 h w"], noise: float = 0.0
+) -> Bool[Tensor, "b 1 h w"]:
+    """Pixels that teach: warping explains them better than doing nothing, SAU-Net eq. (11) the right way round.
+
+    The paper prints the comparison reversed, which would keep static pixels; this is Monodepth2's.
+
+    Args:
+        error: Error of the warped sources.
+        identity: Error of the sources as they are.
+        noise: Standard deviation of the noise that decides ties; with 0 a tie is masked.
+
+    Returns:
+        The mask mu.
+    """
+    if noise > 0:
+        identity = identity + noise * torch.randn_like(identity)
+    return error < identity
+
+
+@full_precision
+def masked_mean(values: Float[Tensor, "*n"], mask: Bool[Tensor, "*#n"] | Float[Tensor, "*#n"]) -> Float[Tensor, ""]:
+    """Mean of values under a mask, or under weights; 0 with a graph where the mask is empty.
+
+    Args:
+        values: Anything, even NaN or infinite where the mask is 0.
+        mask: True, or a weight, where a value counts.
+
+    Returns:
+        ``sum(values * mask) / max(sum(mask), 1)``.
+    """
+    mask = mask.expand_as(values)
+    total = torch.where(mask != 0, values, 0.0).mul(mask).sum()
+    return total / mask.sum().clamp(min=1)
+
+
+@full_precision
+def smoothness_loss(disparity: Float[Tensor, "b 1 h w"], image: Float[Tensor, "b c h w"]) -> Float[Tensor, ""]:
+    """Edge-aware smoothness of the mean-normalised disparity (Monodepth2 eq. (3)).
+
+    Args:
+        disparity: Disparity at any scale of the values.
+        image: The image at the same size; where it has an edge, so may the disparity.
+
+    Returns:
+        Mean over horizontal plus mean over vertical neighbour pairs.
+    """
+    normalised = disparity / (disparity.mean((2, 3), keepdim=True) + 1e-7)
+    total = image.new_zeros(())
+    for step, edge in zip(forward_differences(normalised), forward_differences(image), strict=True):
+        total = total + (step.abs() * torch.exp(-edge.abs().mean(1, keepdim=True))).mean()
+    return total
+
+
+@full_precision
+def forward_differences(x: Float[Tensor, "b c h w"]) -> tuple[Float[Tensor, "b c h w-1"], Float[Tensor, "b c h-1 w"]]:
+    """Differences to the right and to the lower neighbour, the g of SAU-Net eq. (13); the border has no partner."""
+    return x[..., :, 1:] - x[..., :, :-1], x[..., 1:, :] - x[..., :-1, :]
+
+
+@full_precision
+def sobel(x: Float[Tensor, "b c h w"], padding: str = "replicate") -> tuple[Float[Tensor, "b c h w"], ...]:
+    """Un-normalised 3x3 Sobel gradients (x: left minus right, y: top minus bottom), as LapDepth uses them.
+
+    Args:
+        x: Maps.
+        padding: ``replicate``, or ``zero`` (LapDepth's), which makes border pixels compare values instead of gradients.
+
+    Returns:
+        Horizontal and vertical gradient.
+
+    Raises:
+        ConfigError: for another padding.
+    """
+    one_of("padding", padding, ("replicate", "zero"))
+    padded = F.pad(x, (1, 1, 1, 1), mode="replicate" if padding == "replicate" else "constant")
+    across = padded[..., :, :-2] - padded[..., :, 2:]
+    down = padded[..., :-2, :] - padded[..., 2:, :]
+    gx = across[..., :-2, :] + 2 * across[..., 1:-1, :] + across[..., 2:, :]
+    gy = down[..., :, :-2] + 2 * down[..., :, 1:-1] + down[..., :, 2:]
+    return gx, gy
+
+
+@full_precision
+def gradient_loss(
+    prediction: Float[Tensor, "b 1 h w"],
+    target: Float[Tensor, "b 1 h w"],
+    known: Bool[Tensor, "b 1 h w"] | None = None,
+    operator: str = "forward",
+    padding: str = "replicate",
+) -> Float[Tensor, ""]:
+    """Difference of two maps' gradients, SAU-Net eq. (13): mean over horizontal plus mean over vertical gradients.
+
+    Args:
+        prediction: The map to teach.
+        target: The map g* to follow.
+        known: Where the target has a value; everywhere if None. A gradient counts only if all its pixels are known.
+        operator: ``forward`` differences as printed, or ``sobel`` (LapDepth's).
+        padding: Of ``sobel``: ``replicate`` or ``zero``.
+
+    Returns:
+        The loss.
+
+    Raises:
+        ConfigError: for an unknown operator or padding.
+    """
+    one_of("operator", operator, ("forward", "sobel"))
+    if known is None:
+        known = torch.ones_like(target, dtype=torch.bool)
+    difference = torch.where(known, prediction - target, 0.0)  # gradients are linear: one pass instead of two
+    if operator == "forward":
+        gx, gy = forward_differences(difference)
+        pairs_x, pairs_y = known[..., :, 1:] & known[..., :, :-1], known[..., 1:, :] & known[..., :-1, :]
+        return masked_mean(gx.abs(), pairs_x) + masked_mean(gy.abs(), pairs_y)
+    gx, gy = sobel(difference, padding)
+    whole = F.max_pool2d((~known).to(difference), 3, stride=1, padding=1) == 0
+    return masked_mean(gx.abs(), whole) + masked_mean(gy.abs(), whole)
+
+
+def _box(x: Tensor) -> Tensor:
+    """3x3 mean with reflection padding over the last two dimensions."""
+    flat = F.pad(x.flatten(0, -4), (1, 1, 1, 1), mode="reflect")
+    return F.avg_pool2d(flat, 3, stride=1).reshape(x.shape)
