@@ -38,7 +38,9 @@ def run(name: str, task: Callable[[DictConfig], None]) -> None:
 def _require(cfg: DictConfig) -> None:
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
-        raise SaunetError(f"{missing[0]} is not set; add {' '.join(f'{key}=...' for key in missing)} to the command line")
+        raise SaunetError(
+            f"{missing[0]} is not set; add {' '.join(f'{key}=...' for key in missing)} to the command line"
+        )
 
 
 def _fail(name: str, message: str, code: int = 1) -> None:
