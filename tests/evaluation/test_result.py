@@ -13,7 +13,6 @@ import pytest
 from rich.console import Console
 
 from saunet.checks import ConfigError, DataError
-from saunet.evaluation.files import atomic
 from saunet.evaluation.result import EvaluationResult, ImageRow, summarise
 from saunet.evaluation.writers import HEADINGS, as_json, markdown, print_table, read_rows, write_results
 from saunet.metrics.functional import ERROR_NAMES
@@ -127,24 +126,22 @@ def test_json_has_no_nan():
     assert json.loads(json.dumps(as_json(blank), allow_nan=False))["results"][0]["abs_rel"] is None
 
 
-def test_nothing_is_left_behind_when_writing_fails(tmp_path):
-    target = tmp_path / "metrics.json"
-    target.write_text("old")
+def test_nothing_is_left_behind_when_writing_fails(tmp_path, monkeypatch):
+    (tmp_path / "metrics.json").write_text("old")
 
-    def interrupted():
-        with atomic(target) as file:
-            file.write("half")
-            raise RuntimeError("stopped")
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
 
-    with pytest.raises(RuntimeError, match="stopped"):
-        interrupted()
-    assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
-    assert target.read_text() == "old"
+    monkeypatch.setattr(json, "dump", full)
+    with pytest.raises(DataError, match=r"cannot write .*metrics.json: No space left"):
+        write_results(result(), tmp_path)
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+    assert (tmp_path / "metrics.json").read_text() == "old"
 
 
 def test_unwritable_place(tmp_path):
     (tmp_path / "file").write_text("not a folder")
-    with pytest.raises(DataError, match=r"cannot write .*; choose a folder"):
+    with pytest.raises(DataError, match="cannot write"):
         write_results(result(), tmp_path / "file" / "below")
 
 

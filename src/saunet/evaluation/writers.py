@@ -6,7 +6,8 @@ import csv
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
@@ -14,8 +15,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from saunet.atomic import replacing
 from saunet.checks import DataError
-from saunet.evaluation.files import atomic
 from saunet.evaluation.result import EvaluationResult, ImageRow, Summary
 from saunet.metrics.functional import ERROR_NAMES, HIGHER_IS_BETTER
 from saunet.metrics.protocols import Protocol
@@ -86,14 +87,14 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
         DataError: if the folder cannot be written to.
     """
     paths = {name: folder / name for name in ("metrics.json", "metrics.csv", "metrics.md", "per_image.csv")}
-    with atomic(paths["per_image.csv"]) as file:
+    with _whole(paths["per_image.csv"]) as file:
         _write_csv(file, _ROW_FIELDS, ((*_key(row), row.pixels, row.scale, *row.errors) for row in result.rows))
-    with atomic(paths["metrics.csv"]) as file:
+    with _whole(paths["metrics.csv"]) as file:
         table = ([_summary_dict(s)[field] for field in _SUMMARY_FIELDS] for s in result.summaries())
         _write_csv(file, _SUMMARY_FIELDS, table)
-    with atomic(paths["metrics.md"]) as file:
+    with _whole(paths["metrics.md"]) as file:
         file.write(markdown(result))
-    with atomic(paths["metrics.json"]) as file:
+    with _whole(paths["metrics.json"]) as file:
         json.dump(as_json(result), file, indent=2, ensure_ascii=False, allow_nan=False)
         file.write("\n")
     return paths
@@ -137,6 +138,12 @@ def read_rows(path: Path) -> tuple[ImageRow, ...]:
         if isinstance(error, DataError):
             raise
         raise DataError(f"'{path}' holds a line that is not a row of numbers ({error}); evaluate again") from error
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[TextIO]:
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        yield file
 
 
 def _best(summaries: Sequence[Summary]) -> list[float]:

@@ -150,7 +150,11 @@ def evaluate_image(
     disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "hg wg"], protocol: Protocol
 ) -> ImageErrors:
     """Compute the seven errors of one image under a protocol; arguments as in `sample_image`."""
-    sample = sample_image(disparity, ground_truth, protocol)
+    return sample_errors(sample_image(disparity, ground_truth, protocol))
+
+
+def sample_errors(sample: Sample) -> ImageErrors:
+    """Compute the seven errors over the pixels of a sample."""
     everywhere = torch.ones_like(sample.target, dtype=torch.bool)
     errors = depth_errors(sample.prediction[None], sample.target[None], everywhere[None])[0]
     return ImageErrors(errors, sample.ratio, sample.target.numel())
