@@ -10,7 +10,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from saunet import schema
-from saunet.checks import ConfigError, divisible
+from saunet.checks import ConfigError
 from saunet.registry import REGISTRIES
 
 
@@ -81,6 +81,7 @@ class PredictConfig:
     outputs: list[str] = field(default_factory=lambda: ["colour"])
     flip: bool = False
     overwrite: bool = False
+    batch_size: int = 1
     device: str = "auto"
 
 
@@ -130,17 +131,8 @@ def check(cfg: DictConfig) -> None:
         )
     objective = plain(cfg.objective)
     gradient = objective.get("gradient") or {}
-    if gradient.get("target") == "lidar" and not cfg.data.get("target_depth", False):
+    if gradient.get("target") == "lidar" and not cfg.data.get("with_target_depth", False):
         raise ConfigError(
             "objective.gradient.target=lidar needs LiDAR depth in the training batches; "
-            "set data.target_depth=true, or use objective.gradient.target=image"
+            "set data.with_target_depth=true, or use objective.gradient.target=image"
         )
-
-
-def check_size(cfg: DictConfig, size_divisor: int) -> None:
-    """Check the training image size against what the encoder can take.
-
-    Raises:
-        ConfigError: if it does not fit; the message names the nearest valid size.
-    """
-    divisible(cfg.data.height, cfg.data.width, size_divisor, what="data.height x data.width", by="the encoder's stride")

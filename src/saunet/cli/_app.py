@@ -35,6 +35,13 @@ def run(name: str, task: Callable[[DictConfig], None]) -> None:
     hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(guarded)()
 
 
+def pick_device(name: str) -> str:
+    """Return the device that ``auto`` stands for: a GPU where there is one; any other name as it is."""
+    import torch
+
+    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
+
+
 def _require(cfg: DictConfig) -> None:
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from hydra.utils import instantiate as hydra_instantiate
 from omegaconf import DictConfig
@@ -11,8 +12,8 @@ from saunet import config
 from saunet.cli._app import run
 
 
-def train(cfg: DictConfig) -> None:
-    """Build every part from the config, train, and print where the results are."""
+def train(cfg: DictConfig) -> Any:
+    """Build every part from the config, train, print where the results are, and return the data module."""
     from lightning import seed_everything
 
     from saunet.checkpoint import read_checkpoint
@@ -35,6 +36,7 @@ def train(cfg: DictConfig) -> None:
     trainer.fit(model, datamodule=data, ckpt_path=resume, weights_only=True)
     if trainer.is_global_zero:
         print(f"results: {cfg.output_dir}")
+    return data
 
 
 def main() -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from saunet.checkpoint import ModelRecord, build_networks
+from saunet.checkpoint import build_networks
 from saunet.checks import ConfigError, divisible
 from saunet.data.module import DepthDataModule
 from saunet.lit.module import SelfSupervisedDepth
+from saunet.lit.optim import Recipe
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.protocols import protocol
+from saunet.record import ModelRecord
 from saunet.registry import instantiate
 
 
@@ -42,7 +44,7 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule) -> SelfSupervisedDep
         depth=depth,
         pose=pose,
         objective=instantiate(cfg["objective"]),
-        recipe=_recipe(cfg["optim"]),
+        recipe=Recipe(**{key: value for key, value in cfg["optim"].items() if not key.startswith("_")}),
         metrics=DepthMetrics(protocol(cfg.get("protocol") or data.protocol)),
         record=record.to_plain(),
     )

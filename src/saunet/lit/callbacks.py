@@ -13,7 +13,7 @@ from torch import Tensor
 
 from saunet.checks import SaunetError
 from saunet.infer.images import write_image
-from saunet.infer.panel import training_panel
+from saunet.lit.pictures import training_panel
 from saunet.types import EvalBatch
 
 
