@@ -1,0 +1,56 @@
+"""Files that are written whole or not at all: a temporary neighbour takes the name only once it is complete."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from saunet.checks import DataError, SaunetError
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path, error: type[SaunetError] = DataError) -> Iterator[Path]:
+    """Yield a temporary path beside ``path`` that replaces it when the block ends well and vanishes when it does not.
+
+    The temporary name keeps the suffix, for writers that choose a format by it. Missing parent folders are made. Nobody
+    ever reads half a file, even after Ctrl-C, a full disk or a power cut (data reach the disk before the name does).
+
+    Args:
+        path: The file to write.
+        error: What to raise when the system refuses.
+
+    Yields:
+        The path to write to, in the same folder.
+
+    Raises:
+        SaunetError: of class ``error``, naming the file and the system's reason, if it cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem[:100]}.{os.getpid()}.partial{path.suffix}")
+    try:
+        if path.is_dir():
+            raise error(f"cannot write {path}: a folder has this name; choose another name")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        with temporary.open("rb") as stream:
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except OSError as reason:
+        raise error(
+            f"cannot write {path}: {reason.strerror or reason}; check the folder, its rights and its space"
+        ) from reason
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | Path, data: bytes, error: type[SaunetError] = DataError) -> None:
+    """Write ``data`` to ``path``, whole or not at all.
+
+    Raises:
+        SaunetError: of class ``error``, if the system refuses.
+    """
+    with replacing(path, error) as temporary:
+        temporary.write_bytes(data)

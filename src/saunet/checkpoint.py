@@ -1,0 +1,181 @@
+"""What a trained model is on disk: weights beside a plain record of the architecture; reading runs nothing of it.
+
+A checkpoint is a dictionary with ``state_dict`` (keys ``depth.*`` and ``pose.*``) and ``saunet``, the `ModelRecord` as
+plain containers. It is read with ``weights_only=True``, and only registered components are ever built from it.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from saunet.atomic import replacing
+from saunet.checks import CheckpointError, ConfigError
+from saunet.models.depth import DepthNet
+from saunet.record import ModelRecord, Scale
+from saunet.registry import instantiate
+
+__all__ = [
+    "Checkpoint",
+    "ModelRecord",
+    "Scale",
+    "atomic_save",
+    "build_networks",
+    "load_weights",
+    "read_checkpoint",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """A checkpoint's content as read from disk, nothing built yet."""
+
+    path: Path
+    record: ModelRecord
+    state: Mapping[str, Tensor]
+    """All weights, with their prefixes."""
+    epoch: int | None
+    global_step: int | None
+
+    def weights(self, part: str) -> dict[str, Tensor]:
+        """Return the weights of ``"depth"`` or ``"pose"``, without prefix and without what ``torch.compile`` adds."""
+        named = {key.replace("_orig_mod.", ""): value for key, value in self.state.items()}
+        return {key[len(part) + 1 :]: value for key, value in named.items() if key.startswith(f"{part}.")}
+
+    def networks(self) -> tuple[DepthNet, nn.Module | None]:
+        """Build the recorded networks and give them the file's weights.
+
+        Raises:
+            CheckpointError: if the architecture cannot be built or the weights do not fit it.
+        """
+        try:
+            depth, pose = build_networks(self.record)
+            load_weights(depth, self.weights("depth"), "depth network")
+            if pose is not None:
+                load_weights(pose, self.weights("pose"), "pose network")
+        except (CheckpointError, ConfigError) as error:
+            raise CheckpointError(f"{self.path}: {error}") from error
+        return depth, pose
+
+
+def build_networks(record: ModelRecord) -> tuple[DepthNet, nn.Module | None]:
+    """Build the networks that a record describes, with fresh weights; the global random state is left as it was.
+
+    Returns:
+        The depth network, and the pose network where the record has one.
+
+    Raises:
+        CheckpointError: if a component is not registered.
+        ConfigError: if a component refuses its recorded parameters.
+    """
+    record.check_registered()
+    with torch.random.fork_rng(devices=[]):
+        try:
+            encoder = instantiate(record.encoder)
+            decoder = instantiate({**record.decoder, "_partial_": True})
+            depth = DepthNet(encoder, decoder, record.min_depth, record.max_depth)
+            pose = instantiate(record.pose) if record.pose is not None else None
+        except ConfigError:
+            raise
+        except (TypeError, ValueError, RuntimeError) as reason:
+            raise ConfigError(f"the architecture cannot be built from its record: {reason}") from reason
+    return depth, pose
+
+
+def load_weights(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
+    """Give ``module`` the weights ``state``, all of them, or change nothing.
+
+    Args:
+        module: The network.
+        state: Weights by name.
+        what: What the module is, for the message.
+
+    Raises:
+        CheckpointError: if names or shapes differ; the message names the first of each.
+    """
+    expected = module.state_dict()
+    differences = []
+    missing, extra = sorted(expected.keys() - state.keys()), sorted(state.keys() - expected.keys())
+    if missing:
+        differences.append(f"it lacks '{missing[0]}'{_more(missing)}")
+    if extra:
+        differences.append(f"it has '{extra[0]}'{_more(extra)}, which the model has not")
+    shapes = [key for key in expected if key in state and expected[key].shape != state[key].shape]
+    if shapes:
+        got, wanted = (tuple(tensors[shapes[0]].shape) for tensors in (state, expected))
+        differences.append(f"'{shapes[0]}' is {got} where the model has {wanted}{_more(shapes)}")
+    if differences:
+        raise CheckpointError(f"checkpoint of another model, the {what} does not fit: {'; '.join(differences)}")
+    module.load_state_dict(state, strict=True)
+
+
+def read_checkpoint(path: str | Path) -> Checkpoint:
+    """Read a checkpoint into memory, on the CPU, without running anything from it.
+
+    Raises:
+        CheckpointError: if the file is missing, is a folder, is broken, holds pickled objects, is no saunet checkpoint,
+            was written by a newer saunet, or names a component that is not registered.
+    """
+    path = Path(path)
+    content = _load_plain(path)
+    if (
+        not isinstance(content, Mapping)
+        or "saunet" not in content
+        or not isinstance(content.get("state_dict"), Mapping)
+    ):
+        raise CheckpointError(
+            f"{path} is not a saunet checkpoint (no model record and weights); give a file written by saunet-train"
+        )
+    try:
+        record = ModelRecord.from_plain(content["saunet"])
+        record.check_registered()
+    except CheckpointError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    state = {str(key): value for key, value in content["state_dict"].items() if isinstance(value, Tensor)}
+    return Checkpoint(path, record, state, content.get("epoch"), content.get("global_step"))
+
+
+def atomic_save(obj: Any, path: str | Path) -> None:
+    """Save plain data and tensors to ``path``, whole or not at all.
+
+    Raises:
+        CheckpointError: if the system refuses; nothing is left behind and an older file stays as it was.
+    """
+    with replacing(path, CheckpointError) as temporary:
+        try:
+            with temporary.open("wb") as stream:
+                torch.save(obj, stream)
+        except RuntimeError as error:
+            if isinstance(error.__context__, OSError):  # torch's writer hides the system's reason, such as a full disk
+                raise error.__context__ from error
+            raise
+
+
+def _load_plain(path: Path) -> Any:
+    if path.is_dir():
+        raise CheckpointError(f"{path} is a folder; give the checkpoint file in it, such as {path / 'last.ckpt'}")
+    if not path.exists():
+        raise CheckpointError(f"no checkpoint at {path}; check the path")
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as reason:
+        if any(mark in str(reason) for mark in ("GLOBAL", "Unsupported class", "Trying to")):
+            raise CheckpointError(
+                f"{path} holds pickled objects, which could run code when read, so it is refused; "
+                "save plain containers and tensors only, as saunet-train does"
+            ) from reason
+        raise CheckpointError(f"{path} is not a checkpoint, or is damaged; copy it again") from reason
+    except OSError as reason:
+        raise CheckpointError(f"cannot read {path}: {reason.strerror or reason}") from reason
+    except (RuntimeError, EOFError, ValueError, KeyError, TypeError, AttributeError, IndexError) as reason:
+        raise CheckpointError(f"{path} is damaged or truncated and cannot be read; copy it again") from reason
+
+
+def _more(names: Sequence[str]) -> str:
+    return f" (and {len(names) - 1} more)" if len(names) > 1 else ""
