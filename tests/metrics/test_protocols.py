@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -157,3 +158,19 @@ def test_bad_values(change, message):
     with pytest.raises(ConfigError, match=message):
         dataclasses.replace(EIGEN, **change)
     assert Protocol("mine").name == "mine"
+
+
+@pytest.mark.parametrize(
+    ("field", "word", "message"),
+    [
+        ("crop", "gargs", "crop is 'gargs'; did you mean 'garg'"),
+        ("scaling", "medain", "scaling is 'medain'; did you mean 'median'"),
+        ("ground_truth", "velodyne", "ground_truth is 'velodyne', allowed: lidar_x"),
+    ],
+)
+def test_unknown_words(field, word, message):
+    """The type checker of the test run refuses such words first, so the check is called by itself."""
+    rules = copy.copy(EIGEN)
+    object.__setattr__(rules, field, word)
+    with pytest.raises(ConfigError, match=message):
+        rules.__post_init__()
