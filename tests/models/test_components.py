@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import pickle
+import subprocess
+import sys
 from functools import cache
 
 import pytest
@@ -180,6 +182,36 @@ def test_half_precision_keeps_disparity_fine():
             half = net(image)
     assert half.depth[0].dtype == torch.float32
     assert (half.sigmoid[0] - full.sigmoid[0]).abs().max() < 0.02
+
+
+@pytest.mark.parametrize("name", saunet.available("decoder"))
+def test_exports(name):
+    net = _small(name).eval()
+    image = torch.rand(1, 3, HEIGHT, WIDTH)
+    with torch.no_grad():
+        program = torch.export.export(net, (image,))
+        torch.testing.assert_close(program.module()(image).depth, net(image).depth)
+
+
+_COMPILE = """
+import sys, torch, saunet
+from saunet.models.depth import DepthNet
+from saunet.registry import decoders, encoders
+
+for name in saunet.available("decoder"):
+    net = DepthNet(encoders.build("resnet18", blocks=(1, 1, 1, 1)), decoders.partial(name)).eval()
+    image = torch.rand(1, 3, 64, 96)
+    with torch.no_grad():
+        compiled = torch.compile(net, fullgraph=True, backend=sys.argv[1])(image)
+        torch.testing.assert_close(compiled.disparity, net(image).disparity, rtol=1e-4, atol=1e-5)
+"""
+
+
+@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.slow)])
+def test_compiles_to_one_graph(backend):
+    """In a process of its own: the compiler cannot look into the tests' type checker."""
+    done = subprocess.run([sys.executable, "-c", _COMPILE, backend], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
 
 
 def test_too_few_channels():

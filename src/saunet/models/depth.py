@@ -12,6 +12,8 @@ from saunet.checks import ConfigError, divisible
 from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
 from saunet.types import DepthPyramid
 
+torch.export.register_dataclass(DepthPyramid)  # so that a depth network can be exported with its result as it is
+
 
 class DepthNet(nn.Module):
     """One image to depth at several scales (SAU-Net section III-A: Z_t from H_t).
