@@ -1,0 +1,168 @@
+"""Reading what cameras and users produce, refusing what is broken, writing whole files."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from saunet.checks import ConfigError, DataError
+from saunet.infer.images import as_rgb_bytes, network_input, read_image, resize, write_image
+
+needs_rights = pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+
+
+@pytest.mark.parametrize("name", ["x.png", "straße 東京 🚗.png", "x.bmp", "x.tiff", "X.PNG"])
+def test_lossless_formats_round_trip(tmp_path: Path, picture: NDArray[np.uint8], name: str) -> None:
+    write_image(tmp_path / name, picture)
+    assert np.array_equal(read_image(tmp_path / name), picture)
+
+
+def test_grey_is_repeated(tmp_path: Path, picture: NDArray[np.uint8]) -> None:
+    write_image(tmp_path / "x.png", picture[:, :, 0])
+    assert np.array_equal(read_image(tmp_path / "x.png"), np.repeat(picture[:, :, :1], 3, axis=2))
+
+
+def test_sixteen_bits_keep_black_and_white(tmp_path: Path) -> None:
+    write_image(tmp_path / "x.png", np.array([[0, 257, 32896, 65535]], np.uint16))
+    assert read_image(tmp_path / "x.png")[0, :, 0].tolist() == [0, 1, 128, 255]
+
+
+def test_transparency_is_dropped(tmp_path: Path, picture: NDArray[np.uint8]) -> None:
+    Image.fromarray(np.dstack([picture, np.full(picture.shape[:2], 9, np.uint8)])).save(tmp_path / "x.png")
+    assert np.array_equal(read_image(tmp_path / "x.png"), picture)
+
+
+def test_palette_image(tmp_path: Path, picture: NDArray[np.uint8]) -> None:
+    few = picture // 128 * 128
+    Image.fromarray(few).convert("P", palette=Image.Palette.ADAPTIVE).save(tmp_path / "x.png")
+    assert np.abs(read_image(tmp_path / "x.png").astype(int) - few).max() <= 2
+
+
+@pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, -1), (8, 1)])
+def test_exif_rotation_is_applied(tmp_path: Path, picture: NDArray[np.uint8], orientation: int, turns: int) -> None:
+    image = Image.fromarray(picture)
+    exif = image.getexif()
+    exif[0x112] = orientation
+    image.save(tmp_path / "x.jpg", exif=exif, quality=95)
+    expected = np.rot90(picture, turns)
+    got = read_image(tmp_path / "x.jpg")
+    assert got.shape == expected.shape
+    assert np.abs(got.astype(int) - expected).mean() < 4
+
+
+def test_one_pixel(tmp_path: Path) -> None:
+    write_image(tmp_path / "x.png", np.array([[[1, 2, 3]]], np.uint8))
+    assert read_image(tmp_path / "x.png").tolist() == [[[1, 2, 3]]]
+
+
+class TestBroken:
+    @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".webp", ".tiff"])
+    @pytest.mark.parametrize("keep", [0.3, 0.9])
+    def test_truncated(self, tmp_path: Path, suffix: str, keep: float) -> None:
+        noise = np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8)
+        path = tmp_path / f"x{suffix}"
+        write_image(path, noise)
+        path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
+        with pytest.raises(DataError, match=r"x\.\w+ (is truncated|is not an image|cannot be decoded)") as error:
+            read_image(path)
+        assert "\n" not in str(error.value)
+
+    def test_empty(self, tmp_path: Path) -> None:
+        (tmp_path / "x.png").touch()
+        with pytest.raises(DataError, match=r"x\.png is empty \(0 bytes\)"):
+            read_image(tmp_path / "x.png")
+
+    def test_text(self, tmp_path: Path) -> None:
+        (tmp_path / "x.png").write_text("not a picture")
+        with pytest.raises(DataError, match=r"x\.png is not an image"):
+            read_image(tmp_path / "x.png")
+
+    def test_missing_and_folder(self, tmp_path: Path) -> None:
+        with pytest.raises(DataError, match="no image at"):
+            read_image(tmp_path / "x.png")
+        with pytest.raises(DataError, match="is a folder"):
+            read_image(tmp_path)
+
+    def test_floating_point_image(self, tmp_path: Path) -> None:
+        cv2.imwrite(str(tmp_path / "x.tiff"), np.ones((4, 4, 3), np.float32))
+        with pytest.raises(DataError, match="type float32"):
+            read_image(tmp_path / "x.tiff")
+
+    @pytest.mark.parametrize("shape", [(3,), (4, 5, 2), (2, 4, 5, 3), (0, 5, 3)])
+    def test_array_shapes(self, shape: tuple[int, ...]) -> None:
+        with pytest.raises(DataError, match="has shape"):
+            as_rgb_bytes(np.zeros(shape, np.uint8))
+
+
+class TestWrite:
+    def test_unknown_suffix(self, tmp_path: Path, picture: NDArray[np.uint8]) -> None:
+        with pytest.raises(ConfigError, match=r"the suffix of x\.pgn is '\.pgn'; did you mean '\.png'"):
+            write_image(tmp_path / "x.pgn", picture)
+
+    def test_format_that_cannot_hold_it(self, tmp_path: Path) -> None:
+        with pytest.raises(DataError, match="cannot encode"):
+            write_image(tmp_path / "x.png", np.zeros((0, 0), np.uint8))
+        assert list(tmp_path.iterdir()) == []
+
+    def test_parent_is_a_file(self, tmp_path: Path, picture: NDArray[np.uint8]) -> None:
+        (tmp_path / "f").touch()
+        with pytest.raises(DataError, match=r"cannot write .*x\.png"):
+            write_image(tmp_path / "f" / "x.png", picture)
+
+    @needs_rights
+    def test_no_permission(self, tmp_path: Path, picture: NDArray[np.uint8]) -> None:
+        tmp_path.chmod(0o500)
+        with pytest.raises(DataError, match="Permission denied"):
+            write_image(tmp_path / "x.png", picture)
+
+    def test_refused_by_the_system(
+        self, tmp_path: Path, picture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        write_image(tmp_path / "x.png", picture)
+
+        def refuse(*_: object) -> None:
+            raise PermissionError(13, "Permission denied")
+
+        monkeypatch.setattr(os, "replace", refuse)
+        with pytest.raises(DataError, match=r"cannot write .*x\.png: Permission denied"):
+            write_image(tmp_path / "x.png", picture[:, ::-1])
+        assert [path.name for path in tmp_path.iterdir()] == ["x.png"]
+        assert np.array_equal(read_image(tmp_path / "x.png"), picture)
+
+
+def test_resize_follows_the_pixel_convention() -> None:
+    """A ramp keeps its slope: pixel u of the result lies at (u + 0.5) * s - 0.5 of the source."""
+    ramp = np.tile(np.arange(64, dtype=np.float32), (16, 1))
+    half = resize(ramp, 8, 32)
+    assert np.allclose(half[4], (np.arange(32) + 0.5) * 2 - 0.5)
+    double = resize(half, 16, 64)
+    assert np.allclose(double[8, 2:-2], ramp[8, 2:-2], atol=1e-4)
+
+
+def test_network_input() -> None:
+    image = np.zeros((4, 6, 3), np.uint8)
+    image[:, :, 0] = 255
+    values = network_input(image, 8, 12)
+    assert values.shape == (3, 8, 12)
+    assert values[0].min() == 1.0
+    assert values[1:].max() == 0.0
+
+
+def test_jpeg_with_a_thumbnail_is_still_found_truncated(tmp_path: Path, picture: NDArray[np.uint8]) -> None:
+    """A preview inside the header has an end of its own, which must not pass for the picture's."""
+    thumbnail = io.BytesIO()
+    Image.fromarray(picture).save(thumbnail, "JPEG")
+    whole = io.BytesIO()
+    Image.fromarray(np.tile(picture, (4, 4, 1))).save(whole, "JPEG", comment=thumbnail.getvalue())
+    (tmp_path / "whole.jpg").write_bytes(whole.getvalue())
+    assert read_image(tmp_path / "whole.jpg").shape == (160, 360, 3)
+    (tmp_path / "part.jpg").write_bytes(whole.getvalue()[:-200])
+    with pytest.raises(DataError, match=r"part\.jpg is truncated"):
+        read_image(tmp_path / "part.jpg")
