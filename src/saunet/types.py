@@ -31,6 +31,8 @@ class FrameBatch(TypedDict):
     """Native (height, width) of each ground truth inside the padding."""
     T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
     """True motion, where the data set knows it: a target point times it is a source point, in metres."""
+    draws: NotRequired[Float[Tensor, "b n"]]
+    """Uniform random numbers in [0, 1) that augmentation uses; training samples only."""
 
 
 class TrainBatch(TypedDict):
@@ -50,6 +52,8 @@ class TrainBatch(TypedDict):
     """One readable name a sample."""
     target_depth: NotRequired[Float[Tensor, "b 1 h w"]]
     """See `FrameBatch`; cropped and flipped with the images."""
+    target_teacher: NotRequired[Float[Tensor, "b 1 h w"]]
+    """Depth of the target as another model predicts it, up to scale, 0 where unknown."""
     T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
     """See `FrameBatch`; follows flips."""
 

@@ -1,0 +1,176 @@
+"""The base of all data modules: selections of frames in, batches on the device out.
+
+A data set subclasses `DepthDataModule`, names its own parameters beside the shared ones, and implements `select`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import torch
+from lightning.pytorch import LightningDataModule
+from lightning.pytorch.utilities import rank_zero_info
+from torch.utils.data import DataLoader
+
+from saunet.checks import ConfigError, DataError, in_range, positive
+from saunet.data.sampling import EvalBatches, ResumableLoader, TrainBatches, share
+from saunet.data.transforms import Augment, Prepare
+from saunet.data.windows import Selection, Usage, WindowDataset, check_offsets, collate, find_windows
+from saunet.types import EvalBatch, FrameBatch, TrainBatch
+
+STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("predict",)}
+
+
+class DepthDataModule(LightningDataModule):
+    """Loaders of frame windows, and the transforms that run on the device.
+
+    Args:
+        height: Image height in pixels.
+        width: Image width in pixels.
+        offsets: Time offsets of the source frames.
+        batch_size: Samples a step over all devices together.
+        workers: Loader processes a device.
+        translate: Frames are loaded this much larger (0.1 = 10 %) and a random window is cut in training; K follows.
+        flip: Probability of mirroring in training.
+        colour: Probability of colour jitter in training.
+        seed: Decides order and augmentation.
+        target_depth: Training batches carry the depth of the target, for losses that use it.
+        with_pose: Batches carry the true motion.
+
+    Raises:
+        ConfigError: if a parameter is out of range.
+    """
+
+    protocol: str = "eigen_camera_z"
+    """Name of the evaluation protocol that fits this data set's ground truth."""
+
+    def __init__(
+        self,
+        *,
+        height: int = 192,
+        width: int = 640,
+        offsets: Sequence[int] = (-1, 1),
+        batch_size: int = 12,
+        workers: int = 4,
+        translate: float = 0.05,
+        flip: float = 0.5,
+        colour: float = 0.5,
+        seed: int = 0,
+        target_depth: bool = False,
+        with_pose: bool = False,
+    ) -> None:
+        super().__init__()
+        check_offsets(offsets)
+        self.height, self.width = int(positive("height", height)), int(positive("width", width))
+        self.offsets = tuple(offsets)
+        self.batch_size = int(positive("batch_size", batch_size))
+        self.workers = int(positive("workers", workers, allow_zero=True))
+        self.translate = in_range("translate", translate, 0, 1)
+        self.seed = int(positive("seed", seed, allow_zero=True))
+        self.target_depth, self.with_pose = target_depth, with_pose
+        self.augment = Augment(self.height, self.width, flip, colour)
+        self.prepare = Prepare(self.height, self.width)
+        self.usage: dict[str, list[Usage]] = {}
+        self.datasets: dict[str, WindowDataset] = {}
+
+    def select(self, split: str) -> Sequence[Selection]:
+        """Return the frames of ``train``, ``val``, ``test`` or ``predict``; the one thing a data set must say."""
+        raise NotImplementedError(f"{type(self).__name__} does not say which frames belong to '{split}'")
+
+    def setup(self, stage: str | None = None) -> None:
+        """Find the windows of the splits that a stage needs, and report what is used and what is left out.
+
+        Raises:
+            DataError: if a split has no usable frame.
+        """
+        for split in STAGES[str(getattr(stage, "value", stage))] if stage else ("train", "val", "test", "predict"):
+            if split not in self.datasets:
+                self.datasets[split] = self._dataset(split)
+                rank_zero_info(self.summary(split))
+
+    def summary(self, split: str) -> str:
+        """Return what a split uses and leaves out, readable, with the fingerprint of its frames."""
+        dataset, usage = self.datasets[split], self.usage[split]
+        lines = [str(drive) for drive in usage if drive.left_out or len(usage) <= 8]
+        total = f"{split}: {len(dataset)} samples from {len(usage)} drives, sha256 {dataset.fingerprint()[:16]}"
+        return "\n  ".join([total, *lines])
+
+    def fingerprints(self) -> dict[str, str]:
+        """Return the SHA-256 of the sample names of each split that is set up."""
+        return {split: dataset.fingerprint() for split, dataset in self.datasets.items()}
+
+    def _dataset(self, split: str) -> WindowDataset:
+        selections = [Selection(*selection) for selection in self.select(split)]
+        offsets = self.offsets if split in ("train", "val") else ()
+        windows, usage = find_windows(selections, offsets)
+        if not windows:
+            found = "; ".join(str(drive) for drive in usage[:3]) or "no drives"
+            raise DataError(
+                f"split '{split}' has no usable frame ({found}); "
+                f"frames need neighbours at {list(offsets)}: check the data root, the split and the offsets"
+            )
+        self.usage[split] = usage
+        margin = (round(self.height * self.translate), round(self.width * self.translate))
+        return WindowDataset(
+            [selection.drive for selection in selections],
+            windows,
+            offsets=offsets,
+            height=self.height,
+            width=self.width,
+            margin=margin if split == "train" else (0, 0),
+            with_depth=split in ("val", "test"),
+            with_target_depth=self.target_depth and split in ("train", "val"),
+            with_pose=self.with_pose and split in ("train", "val"),
+        )
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Return shuffled training batches, the same for any number of devices."""
+        sampler = TrainBatches(self._set_up("train"), self.batch_size, self.seed, *self._place())
+        return ResumableLoader(self.datasets["train"], sampler=sampler, **self._loading())
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        """Return validation batches, each sample once."""
+        return self._eval_loader("val")
+
+    def test_dataloader(self) -> DataLoader[Any]:
+        """Return test batches, each sample once."""
+        return self._eval_loader("test")
+
+    def predict_dataloader(self) -> DataLoader[Any]:
+        """Return the frames to predict, each once."""
+        return self._eval_loader("predict")
+
+    def on_after_batch_transfer(self, batch: FrameBatch, dataloader_idx: int) -> TrainBatch | EvalBatch:
+        """Turn bytes into images on the device; samples that carry random numbers are augmented."""
+        return self.augment(batch) if "draws" in batch else self.prepare(batch)  # type: ignore[no-any-return]
+
+    def _eval_loader(self, split: str) -> DataLoader[Any]:
+        rank, world_size = self._place()
+        sampler = EvalBatches(self._set_up(split), share(self.batch_size, world_size), rank, world_size)
+        return DataLoader(self.datasets[split], sampler=sampler, **self._loading())
+
+    def _set_up(self, split: str) -> WindowDataset:
+        if split not in self.datasets:
+            raise ConfigError(f"the '{split}' split is not set up; call setup() first")
+        return self.datasets[split]
+
+    def _place(self) -> tuple[int, int]:
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    def _loading(self) -> Mapping[str, Any]:
+        return {
+            "batch_size": None,  # the samplers yield whole batches
+            "collate_fn": collate,
+            "num_workers": self.workers,
+            "pin_memory": torch.cuda.is_available(),
+            "persistent_workers": self.workers > 0,
+            "worker_init_fn": single_threaded,
+        }
+
+
+def single_threaded(worker: int) -> None:
+    """Keep a loader process to one thread: the processes are the parallelism."""
+    cv2.setNumThreads(0)
+    torch.set_num_threads(1)
