@@ -1,0 +1,59 @@
+"""The stratified transformer, SAU-Net's encoder (section III.B, fig. 2): Swin stages at 1/2, 1/4, 1/8 and 1/16."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from saunet.models.window_encoder import WindowEncoder
+from saunet.registry import encoders
+
+
+@encoders.register("stratified_nano", dim=32, depths=(2, 2, 2, 2), heads=(2, 4, 8, 16), drop_path=0.0)
+@encoders.register("stratified_tiny")
+@encoders.register("stratified_small", depths=(2, 2, 18, 2), drop_path=0.2)
+class StratifiedTransformer(WindowEncoder):
+    """SAU-Net's stratified transformer, section III.B: a convolution, then four stages of eqs. (1)-(4) at 1/2 ... 1/16.
+
+    The stem is a 3x3 convolution with stride 2 and a LayerNorm; each pixel of its output is a token. Between stages the
+    2x2 neighbours are concatenated (4C) and projected to 2C, as in Swin, whose public weights fit all but the stem.
+
+    Args:
+        dim: Channels of the first stage; they double from stage to stage.
+        depths: Blocks per stage.
+        heads: Attention heads per stage.
+        window: Side of a window in tokens, per stage; any will do, one that divides the map is fastest.
+        mlp_ratio: Hidden channels of the MLPs per channel.
+        drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
+        mask_padding: Windows over the border attend to real tokens only; False pads with zeros that take part.
+        checkpointing: Recompute blocks in the backward pass: less memory, more time.
+
+    Attributes:
+        features: Channels and stride of each feature map, finest first.
+        size_divisor: Input height and width must be multiples of it.
+
+    Raises:
+        ConfigError: for sequences of different lengths, values below 1, or heads that do not divide the channels.
+    """
+
+    def __init__(
+        self,
+        dim: int = 96,
+        depths: Sequence[int] = (2, 2, 6, 2),
+        heads: Sequence[int] = (3, 6, 12, 24),
+        window: Sequence[int] = (8, 8, 8, 4),
+        mlp_ratio: float = 4.0,
+        drop_path: float = 0.1,
+        mask_padding: bool = True,
+        checkpointing: bool = False,
+    ) -> None:
+        super().__init__(2, dim, depths, heads, window, mlp_ratio, drop_path, mask_padding, checkpointing)
+        self.size_divisor = 2 * self.features[-1].stride  # decoders may halve the deepest map once more
+        self.stem = nn.ModuleDict({"conv": nn.Conv2d(3, dim, 3, stride=2, padding=1), "norm": nn.LayerNorm(dim)})
+        self._init_weights()
+
+    def tokens(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h2 w2 c"]:
+        """Turn a normalised image into tokens at half its size."""
+        return self.stem["norm"](self.stem["conv"](image).permute(0, 2, 3, 1))  # type: ignore[no-any-return]

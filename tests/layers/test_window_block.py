@@ -1,0 +1,69 @@
+"""Swin blocks, merging, stochastic depth and recomputation."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from saunet.checks import ConfigError
+from saunet.layers.window_block import DropPath, Mlp, PatchMerging, SwinBlock, SwinStage
+from saunet.layers.window_stream import rows_per_piece, stream
+
+
+def test_block_is_eqs_1_to_4() -> None:
+    block = SwinBlock(8, 2, 4, shift=2).double().eval()
+    x = torch.randn(2, 8, 12, 8, dtype=torch.double)
+    middle = block.attn(F.layer_norm(x, (8,), block.norm1.weight, block.norm1.bias)) + x
+    hidden = block.mlp.fc1(F.layer_norm(middle, (8,), block.norm2.weight, block.norm2.bias))
+    gelu = hidden * 0.5 * (1 + torch.erf(hidden / 2**0.5))
+    torch.testing.assert_close(block(x), block.mlp.fc2(gelu) + middle)
+
+
+def test_stage_alternates_plain_and_shifted_windows() -> None:
+    stage = SwinStage(8, 3, 2, 5, 4.0, (0.0, 0.1, 0.2))
+    assert [block.attn.shift for block in stage.blocks] == [0, 2, 0]
+    assert [block.drop_path.rate for block in stage.blocks] == [0.0, 0.1, 0.2]
+
+
+def test_merging_order_is_swins() -> None:
+    merge = PatchMerging(1)
+    with torch.no_grad():
+        merge.reduction.weight.copy_(torch.eye(4)[[1, 2]])
+    merge.norm = torch.nn.Identity()  # type: ignore[assignment]
+    x = torch.arange(8.0).view(1, 2, 4, 1)  # rows 0 1 2 3 / 4 5 6 7
+    assert merge(x)[0, 0].tolist() == [[4.0, 1.0], [6.0, 3.0]]  # (row 1, column 0), (row 0, column 1)
+
+
+def test_drop_path_keeps_the_mean_and_whole_samples() -> None:
+    drop = DropPath(0.25).train()
+    out = drop(torch.ones(4000, 2, 3))
+    per_sample = out.flatten(1)
+    assert ((per_sample == 0).all(1) | (per_sample == 1 / 0.75).all(1)).all()
+    assert abs(out.mean().item() - 1) < 0.05
+    assert torch.equal(drop.eval()(torch.ones(2, 3)), torch.ones(2, 3))
+
+
+@pytest.mark.parametrize("rate", [-0.1, 1.0])
+def test_drop_path_refuses_impossible_rates(rate: float) -> None:
+    with pytest.raises(ConfigError, match="drop_path is"):
+        DropPath(rate)
+
+
+def test_recomputation_gives_the_same_gradients() -> None:
+    gradients = []
+    for checkpointing in (False, True):
+        torch.manual_seed(3)
+        stage = SwinStage(8, 2, 2, 4, 2.0, (0.0, 0.5), checkpointing=checkpointing).train()
+        x = torch.randn(3, 6, 8, 8, requires_grad=True)
+        stage(x)[1].square().sum().backward()
+        gradients.append([x.grad, *(parameter.grad for parameter in stage.parameters())])
+    for plain, recomputed in zip(*gradients, strict=True):
+        torch.testing.assert_close(plain, recomputed)
+
+
+def test_pieces_change_nothing() -> None:
+    mlp = Mlp(6, 4000).double()
+    x = torch.randn(3 * rows_per_piece(4000) + 5, 6, dtype=torch.double)
+    with torch.no_grad():
+        torch.testing.assert_close(stream(mlp._rows, x, 4000), mlp._rows(x))
