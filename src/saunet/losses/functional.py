@@ -202,6 +202,26 @@ def gradient_loss(
     return masked_mean(gx.abs(), whole) + masked_mean(gy.abs(), whole)
 
 
+@full_precision
+def pool_known(depth: Float[Tensor, "b 1 _ _"], height: int, width: int) -> Float[Tensor, "b 1 {height} {width}"]:
+    """Reduce a depth map with holes: each pixel is the mean of the known pixels it covers.
+
+    Args:
+        depth: Depth; 0, NaN or infinite where unknown.
+        height: Height to reduce to.
+        width: Width to reduce to.
+
+    Returns:
+        The smaller map, 0 where a pixel covers nothing known.
+    """
+    known = (depth > 0) & depth.isfinite()
+    filled = torch.where(known, depth, 0.0)
+    if filled.shape[-2:] == (height, width):
+        return filled
+    share = F.adaptive_avg_pool2d(known.to(filled), (height, width))
+    return F.adaptive_avg_pool2d(filled, (height, width)) / torch.where(share > 0, share, 1.0)
+
+
 def _box(x: Tensor) -> Tensor:
     """3x3 mean with reflection padding over the last two dimensions."""
     flat = F.pad(x.flatten(0, -4), (1, 1, 1, 1), mode="reflect")

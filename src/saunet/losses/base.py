@@ -1,0 +1,135 @@
+"""What a loss term is, and how objectives add terms up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from saunet.checks import ConfigError, positive
+from saunet.registry import terms as registered_terms
+from saunet.types import DepthPyramid, LossTerms, TrainBatch, View
+
+
+@dataclass(frozen=True, slots=True)
+class TermResult:
+    """One term's contribution, before its weight."""
+
+    value: Float[Tensor, ""]
+    maps: Mapping[str, Tensor] = field(default_factory=dict)
+    """Detached pictures for the log at full resolution (b 1 h w)."""
+
+
+class Term(nn.Module):
+    """A part of the objective: register a subclass with ``@terms.register("name")`` and name it in the config.
+
+    The parameters of ``__init__`` are its config keys. `forward` averages over scales itself, never waits for the
+    device, and returns 0 with a graph where nothing can be compared.
+    """
+
+    def forward(
+        self,
+        batch: TrainBatch,
+        pyramid: DepthPyramid,
+        poses: Float[Tensor, "b s 4 4"],
+        views: Sequence[View],
+    ) -> TermResult:
+        """Return the term's value for one batch.
+
+        Args:
+            batch: Images and intrinsics; ``loss_target`` and ``loss_sources`` are what to compare.
+            pyramid: The predicted depth of the target, one map a scale.
+            poses: The predicted motion T_src_tgt.
+            views: The sources resampled into the target camera, one view a scale, all at full resolution.
+
+        Raises:
+            ConfigError: if the batch lacks what the term needs.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no forward")
+
+
+class Objective(nn.Module):
+    """A weighted sum of terms: sum(weight * value).
+
+    Args:
+        terms: Name -> term; the names appear in the log.
+        weights: Name -> weight, at least 0. A term of weight 0 is left out and costs nothing.
+        extra: Name -> mapping of ``weight``, optionally ``term`` (a registered name, by default the name itself, or a
+            `Term`), and the parameters of that term: ``{"smoothness": {"weight": 0.001}}``.
+
+    Raises:
+        ConfigError: for a negative weight, no positive weight, a name given twice, or an unknown extra term.
+    """
+
+    def __init__(self, terms: Mapping[str, Term], weights: Mapping[str, float], extra: Mapping[str, Any]) -> None:
+        super().__init__()
+        terms, weights = dict(terms), dict(weights)
+        for name, settings in extra.items():
+            if name in terms:
+                raise ConfigError(
+                    f"extra term '{name}' has the name of one of the objective's own terms ({', '.join(terms)}); "
+                    f"give it another name and set term: {name}"
+                )
+            terms[name], weights[name] = _extra_term(name, settings)
+        for name, weight in weights.items():
+            positive(f"the weight of loss term '{name}'", float(weight), allow_zero=True)
+        self.weights = {name: float(weight) for name, weight in weights.items() if weight > 0}
+        if not self.weights:
+            raise ConfigError(f"all loss weights are 0 ({', '.join(weights)}); set at least one above 0")
+        self.terms = nn.ModuleDict({name: terms[name] for name in self.weights})
+
+    def forward(
+        self,
+        batch: TrainBatch,
+        pyramid: DepthPyramid,
+        poses: Float[Tensor, "b s 4 4"],
+        views: Sequence[View],
+    ) -> LossTerms:
+        """Return the weighted sum, each term before its weight, and the terms' maps; arguments as for `Term`."""
+        results: dict[str, TermResult] = {name: term(batch, pyramid, poses, views) for name, term in self.terms.items()}
+        weighted = [self.weights[name] * result.value for name, result in results.items()]
+        return LossTerms(
+            total=sum(weighted[1:], start=weighted[0]),
+            values={name: result.value for name, result in results.items()},
+            maps={key: value for result in results.values() for key, value in result.maps.items()},
+        )
+
+
+def require(batch: TrainBatch, key: str, term: str, fix: str) -> Tensor:
+    """Return ``batch[key]``.
+
+    Args:
+        batch: The batch.
+        key: An optional key of it.
+        term: Who asks, for the message.
+        fix: What to do, for the message.
+
+    Raises:
+        ConfigError: if the data give no such key.
+    """
+    if key not in batch:
+        raise ConfigError(f"{term} needs '{key}' in the batch, which the data does not give; {fix}")
+    value: Tensor = batch[key]  # type: ignore[literal-required]
+    return value
+
+
+def _extra_term(name: str, settings: Any) -> tuple[Term, float]:
+    example = f"for instance {name}: {{weight: 0.1}}"
+    if not isinstance(settings, Mapping):
+        raise ConfigError(f"extra term '{name}' is {settings!r}; it must be a mapping with a weight, {example}")
+    options = dict(settings)
+    if "weight" not in options:
+        raise ConfigError(f"extra term '{name}' has no weight; give it one, {example}")
+    weight, term = options.pop("weight"), options.pop("term", name)
+    if isinstance(weight, bool) or not isinstance(weight, int | float):
+        raise ConfigError(f"extra term '{name}' has the weight {weight!r}; it must be a number, {example}")
+    if not isinstance(term, nn.Module):
+        return registered_terms.build(str(term), **options), float(weight)
+    if options:
+        raise ConfigError(
+            f"extra term '{name}' is built already, so {', '.join(options)} cannot be set; allowed: weight"
+        )
+    return term, float(weight)  # type: ignore[return-value]
