@@ -72,7 +72,7 @@ def test_contract(name: str, make_inputs: Make) -> None:
     weighted = sum(objective.weights[key] * value for key, value in result.values.items())
     torch.testing.assert_close(result.total, weighted)
     result.total.backward()
-    for leaf in (*inputs.sigmoid, inputs.axisangle, inputs.translation):
+    for leaf in inputs.leaves:
         assert leaf.grad is not None
         assert leaf.grad.isfinite().all()
         assert leaf.grad.abs().sum() > 0
@@ -221,11 +221,14 @@ for one, other in zip(torch.autograd.grad(found, leaves), torch.autograd.grad(ex
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options"),
-    [("saunet", {}), ("monodepth2", {}), ("saunet", {"gradient": {"weight": 0.2, "target": "lidar"}})],
+    [
+        ("saunet", {}),
+        ("monodepth2", {}),
+        ("saunet", {"extra": {"lidar": {"term": "gradient", "weight": 0.2, "target": "lidar"}}}),
+    ],
 )
 def test_compiles_as_one_graph(name: str, options: dict[str, Any]) -> None:
     # In a process of its own: the shape checks that pytest installs cannot be compiled.
-    options = {"extra": {"lidar": {"term": "gradient", **options["gradient"]}}} if options else {}
     code = COMPILE.replace("NAME", repr(name)).replace("OPTIONS", repr(options))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
