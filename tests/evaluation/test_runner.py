@@ -10,6 +10,7 @@ from torch import nn
 
 from saunet.checks import ConfigError, DataError
 from saunet.evaluation import NetworkPredictor, evaluate
+from saunet.evaluation.breakdown import Buckets
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.functional import ERROR_NAMES, flip_blend
@@ -78,13 +79,14 @@ def test_flip_is_the_blend_and_network_is_in_evaluation_mode():
 def test_images_without_truth_are_kept_as_rows_and_left_out_of_means():
     data = list(batches())
     data[1]["depth"][0] = 0
-    result = evaluate({"m": NetworkPredictor(Pyramid())}, data, PROTOCOLS, progress=False)
+    data[2]["depth_size"][1] = 0
+    result = evaluate({"m": NetworkPredictor(Pyramid())}, data, PROTOCOLS, buckets=Buckets(), progress=False)
     summary = result.summaries()[0]
-    assert (summary.images, summary.images_without_truth) == (5, 1)
+    assert (summary.images, summary.images_without_truth) == (4, 2)
     assert all(value == value for value in summary.errors)
-    assert result.errors("m", "metric").shape == (5, 7)
+    assert result.errors("m", "metric").shape == (4, 7)
     blank = [row for row in result.rows if row.pixels == 0]
-    assert {row.name for row in blank} == {"drive 002"}
+    assert {row.name for row in blank} == {"drive 002", "drive 005"}
 
 
 def test_only_one_batch_is_pulled_at_a_time():

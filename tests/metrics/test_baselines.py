@@ -53,6 +53,13 @@ def test_mean_map_collects_native_sizes_in_the_right_cells():
     assert model.count.tolist() == [[7, 7], [7, 7]]
 
 
+def test_mean_map_skips_images_without_truth():
+    model = MeanDepthMap(2, 2)
+    depth = torch.full((2, 1, 4, 4), 3.0)
+    model.update(depth, torch.tensor([[0, 0], [4, 4]]))
+    assert model.count.sum() == 16
+
+
 def test_mean_map_fills_unseen_cells_from_their_row_and_rows_from_the_nearest():
     model = MeanDepthMap(5, 4, max_depth=80.0)
     depth = torch.zeros(1, 1, 5, 4)

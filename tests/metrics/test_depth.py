@@ -91,6 +91,23 @@ def test_image_without_truth_is_counted_not_nan():
         assert values[name] == without[name]
 
 
+def test_image_without_even_a_size():
+    disparity, depth, size = samples()
+    size[2] = 0
+    values = one_pass(disparity, depth, size).compute()
+    assert (values["images"], values["images_without_truth"]) == (6, 1)
+    assert values["abs_rel"].isfinite()
+
+
+def test_states_made_under_inference_mode_can_be_used_in_training_afterwards():
+    disparity, depth, size = samples()
+    metric = DepthMetrics()
+    with torch.inference_mode():
+        metric.update(disparity, depth, size)
+    metric.update(disparity, depth, size)
+    assert metric.compute()["images"] == 14
+
+
 @pytest.mark.filterwarnings("ignore:The ``compute`` method")
 def test_no_image_at_all_is_nan_with_a_count_of_zero():
     values = DepthMetrics().compute()

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saunet.checks import ConfigError, DataError, one_of
+from saunet.evaluation.breakdown import BucketRow
 from saunet.metrics.protocols import Protocol
 
 
@@ -52,6 +53,8 @@ class EvaluationResult:
     protocols: tuple[Protocol, ...]
     predictors: tuple[str, ...]
     rows: tuple[ImageRow, ...]
+    buckets: tuple[BucketRow, ...] = ()
+    """Errors by distance, region and edges, where they were asked for."""
 
     def select(self, predictor: str, protocol: str) -> tuple[ImageRow, ...]:
         """Return the rows of one predictor under one protocol, in the order they were computed.
@@ -105,7 +108,9 @@ class EvaluationResult:
                     "are not the same; evaluate both on one split"
                 )
         predictors = tuple(dict.fromkeys((*self.predictors, *other.predictors)))
-        return EvaluationResult(tuple(rules.values()), predictors, (*self.rows, *other.rows))
+        return EvaluationResult(
+            tuple(rules.values()), predictors, (*self.rows, *other.rows), (*self.buckets, *other.buckets)
+        )
 
 
 def summarise(rows: Iterable[ImageRow]) -> Summary:

@@ -10,10 +10,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import Tensor, nn
 
 from saunet.checks import ConfigError, DataError, one_of
+from saunet.evaluation.breakdown import Buckets, BucketSums
 from saunet.evaluation.result import EvaluationResult, ImageRow
 from saunet.metrics.depth import native_depths
 from saunet.metrics.functional import flip_blend
-from saunet.metrics.protocols import GROUND_TRUTHS, Protocol, evaluate_image
+from saunet.metrics.protocols import GROUND_TRUTHS, Protocol, sample_errors, sample_image
 from saunet.types import DepthPyramid, EvalBatch
 
 Predictor = Callable[[EvalBatch], Tensor]
@@ -50,6 +51,7 @@ def evaluate(
     protocols: Sequence[Protocol],
     *,
     ground_truth: str = "camera_z",
+    buckets: Buckets | None = None,
     total: int | None = None,
     progress: bool = True,
 ) -> EvaluationResult:
@@ -63,6 +65,7 @@ def evaluate(
         batches: Images with ``depth`` and ``depth_size``.
         protocols: Rules to score under, all of which must accept ``ground_truth``.
         ground_truth: What the batches' depth is, one of `GROUND_TRUTHS`.
+        buckets: Also sum the errors by these buckets of pixels.
         total: Number of images, for the progress bar.
         progress: Show a progress bar on standard error.
 
@@ -75,6 +78,7 @@ def evaluate(
     """
     _check_request(predictors, protocols, ground_truth)
     rows: list[ImageRow] = []
+    sums = {(p, q.name): BucketSums(buckets) for p in predictors for q in protocols} if buckets else {}
     columns = (
         TextColumn("evaluate"),
         BarColumn(),
@@ -86,11 +90,12 @@ def evaluate(
     with Progress(*columns, console=Console(stderr=True), disable=not progress, transient=True) as bar:
         task = bar.add_task("evaluate", total=total)
         for batch in batches:
-            rows += _score_batch(predictors, batch, protocols)
+            rows += _score_batch(predictors, batch, protocols, sums, buckets)
             bar.advance(task, len(batch["name"]))
     if not rows:
         raise DataError("there is no image to evaluate; check the split and the data root")
-    return EvaluationResult(tuple(protocols), tuple(predictors), tuple(rows))
+    found = tuple(row for (predictor, name), bucket in sums.items() for row in bucket.rows(predictor, name))
+    return EvaluationResult(tuple(protocols), tuple(predictors), tuple(rows), found)
 
 
 def _check_request(predictors: Mapping[str, Predictor], protocols: Sequence[Protocol], ground_truth: str) -> None:
@@ -109,12 +114,17 @@ def _check_request(predictors: Mapping[str, Predictor], protocols: Sequence[Prot
 
 
 def _score_batch(
-    predictors: Mapping[str, Predictor], batch: EvalBatch, protocols: Sequence[Protocol]
+    predictors: Mapping[str, Predictor],
+    batch: EvalBatch,
+    protocols: Sequence[Protocol],
+    sums: Mapping[tuple[str, str], BucketSums],
+    buckets: Buckets | None,
 ) -> list[ImageRow]:
     names = batch["name"]
     if "depth" not in batch or "depth_size" not in batch:
         raise DataError(f"image '{names[0]}' comes without ground-truth depth; evaluate on data that have it")
     truths = native_depths(batch["depth"], batch["depth_size"], len(names))
+    maps = [buckets.maps(truth) if buckets else None for truth in truths]
     rows = []
     for predictor, predict in predictors.items():
         disparity = predict(batch).to(batch["depth"].device)
@@ -124,11 +134,14 @@ def _score_batch(
                 f"it must be ({len(names)}, 1, height, width)"
             )
         finite = disparity.isfinite().flatten(1).all(1).tolist()
-        for name, image, truth, good in zip(names, disparity[:, 0], truths, finite, strict=True):
+        for name, image, truth, inside, good in zip(names, disparity[:, 0], truths, maps, finite, strict=True):
             if not good:
                 raise DataError(f"predictor '{predictor}' gives values that are not finite for image '{name}'")
             for protocol in protocols:
-                found = evaluate_image(image, truth, protocol)
+                sample = sample_image(image, truth, protocol)
+                found = sample_errors(sample)
+                if inside is not None:
+                    sums[predictor, protocol.name].add(sample, inside)
                 errors = tuple(found.errors.tolist())
                 rows.append(ImageRow(predictor, protocol.name, name, found.pixels, found.ratio.item(), errors))
     return rows

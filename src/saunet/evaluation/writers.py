@@ -17,6 +17,7 @@ from rich.table import Table
 
 from saunet.atomic import replacing
 from saunet.checks import DataError
+from saunet.evaluation.breakdown import BucketRow
 from saunet.evaluation.result import EvaluationResult, ImageRow, Summary
 from saunet.metrics.functional import ERROR_NAMES, HIGHER_IS_BETTER
 from saunet.metrics.protocols import Protocol
@@ -33,6 +34,9 @@ def print_table(result: EvaluationResult, console: Console | None = None) -> Non
     console = console or Console()
     for protocol in result.protocols:
         console.print(protocol_table(protocol, [s for s in result.summaries() if s.protocol == protocol.name]))
+    for protocol in result.protocols:
+        if rows := [row for row in result.buckets if row.protocol == protocol.name]:
+            console.print(bucket_table(protocol, rows))
 
 
 def protocol_table(protocol: Protocol, summaries: Sequence[Summary]) -> Table:
@@ -50,6 +54,22 @@ def protocol_table(protocol: Protocol, summaries: Sequence[Summary]) -> Table:
         table.add_row(escape(summary.predictor), *cells, f"{summary.scale:.3g} ± {summary.scale_std:.2g}")
     if summaries:
         table.caption = images_note(summaries[0])
+    return table
+
+
+def bucket_table(protocol: Protocol, rows: Sequence[BucketRow]) -> Table:
+    """Return the table of errors by distance, region and edges under one protocol."""
+    table = Table(
+        title=f"{protocol.name}: where the errors are", title_justify="left", caption="over pixels, not images"
+    )
+    for heading in ("predictor", "where"):
+        table.add_column(heading)
+    for heading in (*HEADINGS, "pixels"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row, following in zip(rows, (*rows[1:], None), strict=True):
+        ends = following is None or (following.predictor, following.group) != (row.predictor, row.group)
+        cells = [f"{value:.3f}" for value in row.errors]
+        table.add_row(escape(row.predictor), row.bucket, *cells, f"{row.pixels:,}", end_section=ends)
     return table
 
 
@@ -80,6 +100,8 @@ def markdown(result: EvaluationResult) -> str:
 def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
     """Write ``metrics.json``, ``metrics.csv``, ``metrics.md`` and ``per_image.csv``, each whole or not at all.
 
+    Errors by bucket go to ``buckets.csv``, if there are any.
+
     Returns:
         The files by those names.
 
@@ -92,6 +114,11 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
     with _whole(paths["metrics.csv"]) as file:
         table = ([_summary_dict(s)[field] for field in _SUMMARY_FIELDS] for s in result.summaries())
         _write_csv(file, _SUMMARY_FIELDS, table)
+    if result.buckets:
+        paths["buckets.csv"] = folder / "buckets.csv"
+        with _whole(paths["buckets.csv"]) as file:
+            places = ((r.predictor, r.protocol, r.group, r.bucket, r.pixels, *r.errors) for r in result.buckets)
+            _write_csv(file, ("predictor", "protocol", "group", "bucket", "pixels", *ERROR_NAMES), places)
     with _whole(paths["metrics.md"]) as file:
         file.write(markdown(result))
     with _whole(paths["metrics.json"]) as file:

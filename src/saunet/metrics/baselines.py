@@ -60,7 +60,7 @@ class MeanDepthMap(nn.Module):
 
         Args:
             depth: Metres, 0 where unknown, padded to a common size.
-            depth_size: Native (height, width) of each inside the padding.
+            depth_size: Native (height, width) of each inside the padding; (0, 0) for an image without any.
         """
         height, width = self.depth_sum.shape
         depth = depth.to(self.depth_sum)

@@ -55,20 +55,21 @@ class DepthMetrics(Metric):
         Args:
             disparity: Predicted inverse depth at network size.
             depth: Ground truth in metres, 0 where unknown, padded to a common size.
-            depth_size: Native (height, width) of each ground truth inside the padding.
+            depth_size: Native (height, width) of each ground truth inside the padding; (0, 0) for an image without any.
 
         Raises:
             DataError: if the ground truth belongs to another number of images, or a native size exceeds the padded one.
         """
         for prediction, truth in zip(disparity, native_depths(depth, depth_size, len(disparity)), strict=True):
             image = evaluate_image(prediction[0], truth, self.protocol)
+            # Not in place: states made under inference mode (trainer.validate) must be usable in training afterwards.
             if image.pixels == 0:
-                self.images_without_truth += 1
+                self.images_without_truth = self.images_without_truth + 1
                 continue
-            self.images += 1
-            self.error_sum += image.errors
-            self.ratio_sum += image.ratio
-            self.ratio_square_sum += image.ratio.square()
+            self.images = self.images + 1
+            self.error_sum = self.error_sum + image.errors
+            self.ratio_sum = self.ratio_sum + image.ratio
+            self.ratio_square_sum = self.ratio_square_sum + image.ratio.square()
 
     def compute(self) -> dict[str, Float[Tensor, ""]]:
         """Return the mean of each error, float64, and what else was seen.
@@ -105,7 +106,7 @@ def native_depths(
         )
     cut = []
     for padded, (height, width) in zip(depth[:, 0], depth_size.tolist(), strict=True):
-        if not (0 < height <= padded.shape[0] and 0 < width <= padded.shape[1]):
+        if not (0 <= height <= padded.shape[0] and 0 <= width <= padded.shape[1]):
             raise DataError(
                 f"ground truth size {height}x{width} (height x width) does not fit into its padded map "
                 f"{padded.shape[0]}x{padded.shape[1]}; give depth_size as (height, width)"

@@ -127,7 +127,7 @@ def sample_image(disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "h
 
     Args:
         disparity: Inverse depth at any size; resized bilinearly with half-pixel centres; 0 and below is far away.
-        ground_truth: Depth in metres at its native size, 0 where unknown.
+        ground_truth: Depth in metres at its native size, 0 where unknown; 0 x 0 for an image without any.
         protocol: The rules.
 
     Returns:
@@ -135,6 +135,8 @@ def sample_image(disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "h
     """
     mask = protocol.mask(ground_truth)
     target = ground_truth[mask].double()
+    if target.numel() == 0:  # nothing to compare, perhaps not even a size to resize to
+        return Sample(target, target, mask, median(target))
     single = disparity.to(torch.promote_types(disparity.dtype, torch.float32))[None, None]
     size = (ground_truth.shape[0], ground_truth.shape[1])
     resized = interpolate(single, size=size, mode="bilinear", align_corners=False)[0, 0]

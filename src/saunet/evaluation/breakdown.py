@@ -1,0 +1,128 @@
+"""Where the errors are: by distance, by image region, and at depth edges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from saunet.checks import ConfigError, positive
+from saunet.metrics.functional import error_terms, root_terms
+from saunet.metrics.protocols import Sample
+
+
+@dataclass(frozen=True, slots=True)
+class BucketRow:
+    """Errors over all pixels of all images that fall into one bucket (not a mean over images: some have few there)."""
+
+    predictor: str
+    protocol: str
+    group: str
+    """``distance``, ``row``, ``column`` or ``edge``."""
+    bucket: str
+    """Such as ``10-20 m``, ``bottom third`` or ``near an edge``."""
+    pixels: int
+    errors: tuple[float, ...]
+    """In the order of `saunet.metrics.functional.ERROR_NAMES`."""
+
+
+@dataclass(frozen=True)
+class Buckets:
+    """How pixels are sorted.
+
+    Args:
+        distances: Limits of the distance ranges in metres, ascending.
+        edge_radius: Pixels of the ground truth to the left and right that are looked at for a depth edge.
+        edge_ratio: Depths that differ by more than this factor make an edge.
+
+    Raises:
+        ConfigError: if the limits do not ascend, the radius is below 1 or the ratio not above 1.
+    """
+
+    distances: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0, 50.0, 80.0)
+    edge_radius: int = 4
+    edge_ratio: float = 1.25
+
+    def __post_init__(self) -> None:
+        positive("edge_radius", self.edge_radius)
+        if not self.edge_ratio > 1:
+            raise ConfigError(f"edge_ratio is {self.edge_ratio}; it must be greater than 1")
+        if len(self.distances) < 2 or list(self.distances) != sorted(set(self.distances)):
+            raise ConfigError(f"distances are {list(self.distances)}; give at least two limits in ascending order")
+
+    @property
+    def names(self) -> tuple[tuple[str, str], ...]:
+        """(group, bucket) of each map that `maps` returns."""
+        ranges = [f"{low:g}-{high:g} m" for low, high in zip(self.distances, self.distances[1:], strict=False)]
+        return (
+            *(("distance", name) for name in ranges),
+            *(("row", f"{name} third") for name in ("top", "middle", "bottom")),
+            *(("column", f"{name} third") for name in ("left", "centre", "right")),
+            ("edge", "near an edge"),
+            ("edge", "elsewhere"),
+        )
+
+    def maps(self, truth: Float[Tensor, "h w"]) -> Bool[Tensor, "k h w"]:
+        """Return which pixels of a ground truth fall into each bucket, in the order of `names`."""
+        height, width = truth.shape
+        row = torch.arange(height, device=truth.device)[:, None].expand(height, width) * 3 // height
+        column = torch.arange(width, device=truth.device)[None].expand(height, width) * 3 // width
+        edge = near_edge(truth, self.edge_radius, self.edge_ratio)
+        limits = zip(self.distances, self.distances[1:], strict=False)
+        distances = [(truth >= low) & (truth < high) for low, high in limits]
+        thirds = [part == third for part in (row, column) for third in range(3)]
+        return torch.stack((*distances, *thirds, edge, ~edge))
+
+
+def near_edge(truth: Float[Tensor, "h w"], radius: int, ratio: float) -> Bool[Tensor, "h w"]:
+    """Find pixels whose measured neighbours in the same row differ in depth by more than a factor.
+
+    Only the row is looked at: along it a flat road keeps its depth, while upwards it recedes without any edge. Works
+    for dense depth and for scan lines.
+
+    Args:
+        truth: Depth in metres, 0 where unknown.
+        radius: Neighbours within this many pixels to the left and right.
+        ratio: Farthest over nearest of them that makes an edge.
+    """
+    if truth.numel() == 0:
+        return truth > 0
+    known = truth > 0
+    window, padding = (1, 2 * radius + 1), (0, radius)
+    far = max_pool2d(truth[None, None], window, 1, padding)
+    closeness = torch.where(known, 1 / truth.clamp(min=1e-6), 0.0)
+    near = max_pool2d(closeness[None, None], window, 1, padding)  # inverse of the nearest depth; 0 where none is known
+    return (far * near)[0, 0] > ratio
+
+
+class BucketSums:
+    """The errors of one predictor under one protocol, summed by bucket.
+
+    Args:
+        buckets: How pixels are sorted.
+    """
+
+    def __init__(self, buckets: Buckets) -> None:
+        self.buckets = buckets
+        self._sums = torch.zeros(len(buckets.names), 7, dtype=torch.float64)
+        self._counts = torch.zeros(len(buckets.names), dtype=torch.float64)
+
+    def add(self, sample: Sample, maps: Bool[Tensor, "k h w"]) -> None:
+        """Add an image; ``maps`` are `Buckets.maps` of its ground truth."""
+        inside = maps[:, sample.mask].double()
+        self._sums += (inside @ error_terms(sample.prediction, sample.target)).cpu()
+        self._counts += inside.sum(1).cpu()
+
+    def rows(self, predictor: str, protocol: str) -> tuple[BucketRow, ...]:
+        """Return the buckets that hold pixels."""
+        errors = root_terms(self._sums / self._counts[:, None]).tolist()
+        counted: Sequence[int] = self._counts.long().tolist()
+        return tuple(
+            BucketRow(predictor, protocol, group, bucket, count, tuple(row))
+            for (group, bucket), count, row in zip(self.buckets.names, counted, errors, strict=True)
+            if count
+        )

@@ -1,0 +1,156 @@
+"""Predictions of other systems, read from files, so that the same code scores them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from saunet.checks import DataError, one_of
+from saunet.types import EvalBatch
+
+SUFFIXES: tuple[str, ...] = (".npy", ".png")
+"""Files of a folder that are read: arrays, and 16-bit PNG with depth x 256 (KITTI's format)."""
+
+
+class ForeignArray:
+    """One array of predictions in the order of evaluation, such as Monodepth2's ``disps_eigen_split.npy``.
+
+    Args:
+        path: A ``.npy`` file, images x height x width (a channel of 1 is accepted); it is read as needed, never whole.
+        values: ``disparity`` (up to scale), or ``depth``.
+        images: Number of images that will be evaluated, checked at once; not checked if None.
+
+    Raises:
+        ConfigError: for other ``values``.
+        DataError: if the file cannot be read, has another shape, or another number of images.
+    """
+
+    def __init__(
+        self, path: Path, values: Literal["disparity", "depth"] = "disparity", images: int | None = None
+    ) -> None:
+        self.path, self.values = path, one_of("values", values, ("disparity", "depth"))
+        array = _load_array(path)
+        if array.ndim == 4 and array.shape[1] == 1:
+            array = array[:, 0]
+        if array.ndim != 3:
+            raise DataError(f"'{path}' holds shape {array.shape}; predictions are images x height x width")
+        _check_count(path, len(array), images)
+        self._array, self._next = array, 0
+
+    def __call__(self, batch: EvalBatch) -> Float[Tensor, "b 1 h w"]:
+        """Return the disparity of the next images.
+
+        Raises:
+            DataError: if there are not enough predictions, or a depth is not positive.
+        """
+        first, self._next = self._next, self._next + len(batch["name"])
+        if self._next > len(self._array):
+            raise DataError(f"'{self.path}' holds {len(self._array)} predictions and more images are evaluated")
+        maps = [np.array(one, dtype=np.float32) for one in self._array[first : self._next]]
+        return torch.stack([_disparity(one, self.values, self.path) for one in maps])
+
+
+class ForeignFolder:
+    """A folder with one file an image: ``.npy`` (height x width) or 16-bit ``.png`` (depth x 256).
+
+    Args:
+        folder: The folder.
+        values: What ``.npy`` files hold; ``.png`` always holds depth.
+        match: ``order`` takes the files sorted by name in the order of evaluation; ``name`` looks for the `file_stem`
+            of each image's name.
+        images: Number of images that will be evaluated, checked at once; not checked if None.
+
+    Raises:
+        ConfigError: for another word.
+        DataError: if the folder is missing, holds no such file, or another number of them.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        values: Literal["disparity", "depth"] = "depth",
+        match: Literal["order", "name"] = "order",
+        images: int | None = None,
+    ) -> None:
+        self.folder, self.values = folder, one_of("values", values, ("disparity", "depth"))
+        self.match = one_of("match", match, ("order", "name"))
+        if not folder.is_dir():
+            raise DataError(f"there is no folder '{folder}'; give the folder that holds the predictions")
+        self._files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+        if not self._files:
+            raise DataError(f"'{folder}' holds no prediction; its files must end in {' or '.join(SUFFIXES)}")
+        if match == "order":
+            _check_count(folder, len(self._files), images)
+        self._stems = {file.stem: file for file in self._files}
+        self._next = 0
+
+    def __call__(self, batch: EvalBatch) -> Float[Tensor, "b 1 h w"]:
+        """Return the disparity of the batch's images; they must be of one size.
+
+        Raises:
+            DataError: if a prediction is missing, cannot be read, or differs in size from others of the batch.
+        """
+        maps = [self._read(file) for file in self._choose(batch["name"])]
+        if len({one.shape for one in maps}) > 1:
+            raise DataError(f"predictions of one batch in '{self.folder}' differ in size; evaluate with batch size 1")
+        return torch.stack(maps)
+
+    def _choose(self, names: Sequence[str]) -> list[Path]:
+        if self.match == "order":
+            first, self._next = self._next, self._next + len(names)
+            if self._next > len(self._files):
+                raise DataError(f"'{self.folder}' holds {len(self._files)} predictions and more images are evaluated")
+            return self._files[first : self._next]
+        for name in names:
+            if file_stem(name) not in self._stems:
+                raise DataError(f"'{self.folder}' has no file '{file_stem(name)}.npy' or '.png' for image '{name}'")
+        return [self._stems[file_stem(name)] for name in names]
+
+    def _read(self, file: Path) -> Float[Tensor, "1 h w"]:
+        if file.suffix.lower() == ".png":
+            data = np.fromfile(file, dtype=np.uint8)
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+            if image is None or image.dtype != np.uint16 or image.ndim != 2:
+                raise DataError(f"'{file}' is not a 16-bit grey PNG; it must hold depth x 256")
+            return _disparity(image.astype(np.float32) / 256, "depth", file)
+        array = np.squeeze(np.array(_load_array(file), dtype=np.float32))
+        if array.ndim != 2:
+            raise DataError(f"'{file}' holds shape {array.shape}; a prediction is height x width")
+        return _disparity(array, self.values, file)
+
+
+def file_stem(name: str) -> str:
+    """Return the file name, without ending, that stands for an image: all but letters, digits, - and . become ``_``."""
+    return re.sub(r"[^A-Za-z0-9.-]+", "_", name)
+
+
+def _load_array(path: Path) -> ndarray:
+    try:
+        array: ndarray = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DataError(f"cannot read '{path}' as a numpy array ({error}); give a .npy file of numbers") from error
+    if not isinstance(array, ndarray) or array.dtype.kind != "f":
+        raise DataError(f"'{path}' does not hold floating-point numbers; give a .npy file of disparity or depth")
+    return array
+
+
+def _disparity(values: ndarray, kind: str, path: Path) -> Float[Tensor, "1 h w"]:
+    if kind == "disparity":
+        return torch.from_numpy(values)[None]
+    if not (values > 0).all():
+        raise DataError(f"'{path}' has pixels without depth (0, negative or NaN); predictions must be dense")
+    return torch.from_numpy(1 / values)[None]
+
+
+def _check_count(path: Path, found: int, images: int | None) -> None:
+    if images is not None and found != images:
+        raise DataError(f"'{path}' holds {found} predictions for {images} images; give one for each, in the same order")

@@ -1,0 +1,166 @@
+"""Other systems' files give the numbers that the same predictions give in memory."""
+
+from __future__ import annotations
+
+import inspect
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from saunet.checks import ConfigError, DataError
+from saunet.evaluation import evaluate
+from saunet.evaluation.foreign import ForeignArray, ForeignFolder, file_stem
+from saunet.metrics.functional import ERROR_NAMES
+from saunet.metrics.protocols import protocol
+
+DISPARITY = np.random.default_rng(0).random((5, 6, 10)).astype(np.float32) * 0.2 + 0.02
+NAMES = [f"day/drive_{i % 2} {i:010d} l" for i in range(5)]
+
+
+def batches(sizes=(2, 2, 1)):
+    generator = torch.Generator().manual_seed(1)
+    start = 0
+    for size in sizes:
+        yield {
+            "target": torch.zeros(size, 3, 6, 10),
+            "name": NAMES[start : start + size],
+            "depth": torch.rand(size, 1, 12, 20, generator=generator) * 60 + 1,
+            "depth_size": torch.tensor([[12, 20]] * size),
+        }
+        start += size
+
+
+def score(predictor):
+    return evaluate({"m": predictor}, batches(), [protocol("metric")], progress=False).errors("m", "metric")
+
+
+def in_memory():
+    start = 0
+
+    def predictor(batch):
+        nonlocal start
+        start += len(batch["name"])
+        return torch.from_numpy(DISPARITY[start - len(batch["name"]) : start])[:, None]
+
+    return score(predictor)
+
+
+@pytest.mark.parametrize("shape", [(5, 6, 10), (5, 1, 6, 10)])
+def test_array_of_disparities(tmp_path, shape):
+    np.save(tmp_path / "disps.npy", DISPARITY.reshape(shape))
+    np.testing.assert_array_equal(score(ForeignArray(tmp_path / "disps.npy", images=5)), in_memory())
+
+
+def test_array_of_depths(tmp_path):
+    np.save(tmp_path / "depth.npy", 1 / DISPARITY.astype(np.float64))
+    np.testing.assert_allclose(score(ForeignArray(tmp_path / "depth.npy", "depth")), in_memory(), rtol=1e-5)
+
+
+def test_reference_array_gives_the_published_loop(tmp_path, reference):
+    data = reference("metrics")
+    np.save(tmp_path / "disps.npy", data["eigen_disparity"])
+    truth = torch.from_numpy(data["eigen_gt"])[:, None]
+    batch = {"name": ["a", "b"], "target": None, "depth": truth, "depth_size": torch.tensor([[375, 1242]] * 2)}
+    result = evaluate(
+        {"m": ForeignArray(tmp_path / "disps.npy")}, [batch], [protocol("eigen_camera_z")], progress=False
+    )
+    expected = data["eigen_metrics_median_scaled"].mean(0)
+    np.testing.assert_allclose(result.summaries()[0].errors[:4], expected[:4], rtol=1e-5)
+    assert len(ERROR_NAMES) == 7
+
+
+@pytest.mark.parametrize("match", ["order", "name"])
+@pytest.mark.parametrize("kind", ["npy", "png"])
+def test_folder(tmp_path, match, kind):
+    for i, disparity in enumerate(DISPARITY):
+        stem = f"{i:04d}" if match == "order" else file_stem(NAMES[i])
+        if kind == "npy":
+            np.save(tmp_path / f"{stem}.npy", disparity)
+        else:
+            cv2.imwrite(str(tmp_path / f"{stem}.png"), np.round(256 / disparity).astype(np.uint16))
+    (tmp_path / "notes.txt").write_text("not a prediction")
+    found = score(ForeignFolder(tmp_path, "disparity", match, images=5))
+    np.testing.assert_allclose(
+        found, in_memory(), **({"atol": 0.0} if kind == "npy" else {"rtol": 0.01, "atol": 0.005})
+    )
+
+
+def test_file_stem():
+    assert file_stem("2011_09_26/drive_0001_sync 0000000005 l") == "2011_09_26_drive_0001_sync_0000000005_l"
+
+
+def test_wrong_count(tmp_path):
+    np.save(tmp_path / "disps.npy", DISPARITY)
+    with pytest.raises(DataError, match="holds 5 predictions for 697 images"):
+        ForeignArray(tmp_path / "disps.npy", images=697)
+    np.save(tmp_path / "disps.npy", DISPARITY[:4])
+    with pytest.raises(DataError, match="holds 4 predictions and more images are evaluated"):
+        score(ForeignArray(tmp_path / "disps.npy"))
+    (tmp_path / "folder").mkdir()
+    np.save(tmp_path / "folder" / "0.npy", DISPARITY[0])
+    with pytest.raises(DataError, match="holds 1 predictions for 2 images"):
+        ForeignFolder(tmp_path / "folder", images=2)
+    with pytest.raises(DataError, match="holds 1 predictions and more images"):
+        score(ForeignFolder(tmp_path / "folder"))
+    with pytest.raises(DataError, match=r"has no file 'day_drive_0_0000000000_l\.npy'"):
+        score(ForeignFolder(tmp_path / "folder", match="name"))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"not numpy", "as a numpy array"),
+        (np.zeros((5, 6), np.float32), r"holds shape \(5, 6\)"),
+        (np.zeros((5, 6, 10), np.uint8), "does not hold floating-point numbers"),
+    ],
+)
+def test_broken_arrays(tmp_path, content, message):
+    path = tmp_path / "disps.npy"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.save(path, content)
+    with pytest.raises(DataError, match=message):
+        ForeignArray(path)
+
+
+def read_all(folder):
+    predictor = ForeignFolder(folder)
+    return predictor({"name": NAMES[: len(list(folder.iterdir()))]})
+
+
+def test_broken_files_of_a_folder(tmp_path):
+    with pytest.raises(DataError, match="there is no folder"):
+        ForeignFolder(tmp_path / "missing")
+    with pytest.raises(DataError, match="holds no prediction"):
+        ForeignFolder(tmp_path)
+    path = tmp_path / "0000.png"
+    for data in (b"", b"junk"):
+        path.write_bytes(data)
+        with pytest.raises(DataError, match="not a 16-bit grey PNG"):
+            read_all(tmp_path)
+    cv2.imwrite(str(path), np.full((6, 10), 200, np.uint8))
+    with pytest.raises(DataError, match="not a 16-bit grey PNG"):
+        read_all(tmp_path)
+    cv2.imwrite(str(path), np.zeros((6, 10), np.uint16))
+    with pytest.raises(DataError, match="pixels without depth"):
+        read_all(tmp_path)
+    cv2.imwrite(str(path), np.full((6, 10), 2560, np.uint16))
+    cv2.imwrite(str(tmp_path / "0001.png"), np.full((6, 9), 2560, np.uint16))
+    with pytest.raises(DataError, match="differ in size"):
+        read_all(tmp_path)
+    path.unlink()
+    (tmp_path / "0001.png").unlink()
+    np.save(tmp_path / "a.npy", np.ones((2, 3, 4), np.float32))
+    with pytest.raises(DataError, match=r"holds shape \(2, 3, 4\)"):
+        read_all(tmp_path)
+
+
+def test_unknown_words(tmp_path):
+    np.save(tmp_path / "a.npy", DISPARITY)
+    with pytest.raises(ConfigError, match="did you mean 'depth'"):
+        inspect.unwrap(ForeignArray.__init__)(ForeignArray.__new__(ForeignArray), tmp_path / "a.npy", "depths")
+    with pytest.raises(ConfigError, match="match is 'names'"):
+        inspect.unwrap(ForeignFolder.__init__)(ForeignFolder.__new__(ForeignFolder), tmp_path, "depth", "names")
