@@ -33,12 +33,14 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule) -> SelfSupervisedDep
         offsets=tuple(data.offsets),
         data={"name": cfg["name"], **cfg["data"]},
     )
-    if list(record.pose["offsets"]) != list(data.offsets):
+    offsets = cfg["model"]["pose"]["offsets"]
+    if list(offsets) != list(data.offsets):
         raise ConfigError(
-            f"model.pose.offsets is {list(record.pose['offsets'])} but the data gives frames at {list(data.offsets)}; "
+            f"model.pose.offsets is {list(offsets)} but the data give frames at {list(data.offsets)}; "
             "set data.offsets only, the pose network follows"
         )
     depth, pose = build_networks(record)
+    assert pose is not None, "the record has a pose node, see above"
     divisible(data.height, data.width, depth.size_divisor, what="data.height x data.width", by="the encoder's stride")
     return SelfSupervisedDepth(
         depth=depth,

@@ -20,10 +20,14 @@ from saunet.types import EvalBatch
 class StopOnNonFinite(Callback):
     """End the run with one sentence when the loss is NaN or infinite, instead of training on garbage for hours.
 
-    The flag stays on the device and is read only every ``log_every_n_steps`` steps, so the step never waits for it.
+    The flag stays on the device and is read only now and then, so the step never waits for it.
+
+    Args:
+        every_n_steps: How often the flag is read.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, every_n_steps: int = 10) -> None:
+        self.every_n_steps = every_n_steps
         self._bad: Tensor | None = None
 
     def on_train_batch_end(
@@ -33,7 +37,7 @@ class StopOnNonFinite(Callback):
         loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
         bad = ~torch.isfinite(loss.detach())
         self._bad = bad if self._bad is None else self._bad | bad
-        if trainer.global_step % trainer.log_every_n_steps == 0 and bool(self._bad):
+        if trainer.global_step % self.every_n_steps == 0 and bool(self._bad):
             raise SaunetError(
                 f"the loss became NaN or infinite at or before step {trainer.global_step} "
                 f"(last batch: {', '.join(batch['name'][:4])}); lower optim.lr, or train with trainer.precision=32"

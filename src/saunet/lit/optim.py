@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import torch
 from torch.nn import Parameter
+from torch.optim.lr_scheduler import LRScheduler
 
 from saunet.checks import ConfigError, one_of, positive
 
@@ -80,19 +81,30 @@ class Recipe:
         optimizer = kind(
             list(parameters), lr=self.lr, betas=(self.betas[0], self.betas[1]), weight_decay=self.weight_decay
         )
-        schedule = _Schedule(self, max(total_steps, 1))
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, schedule)
+        scheduler = RecipeSchedule(optimizer, self, max(total_steps, 1))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
 
-@dataclass(frozen=True)
-class _Schedule:
-    """Learning-rate factor by step; a class because a lambda would not pickle under ``ddp_spawn``."""
+class RecipeSchedule(LRScheduler):
+    """A recipe's learning rate, step by step; its saved state is plain numbers, so checkpoints stay safe to read.
 
-    recipe: Recipe
-    total_steps: int
+    Args:
+        optimizer: Whose rates it sets.
+        recipe: The rates.
+        total_steps: Steps in the whole training.
+    """
 
-    def __call__(self, step: int) -> float:
+    def __init__(self, optimizer: torch.optim.Optimizer, recipe: Recipe, total_steps: int) -> None:
+        self.recipe, self.total_steps = recipe, total_steps
+        super().__init__(optimizer)
+
+    def get_lr(self) -> list[float]:  # type: ignore[override]
+        """Return the rate of each parameter group at the present step."""
         # The first step of a warm-up must not be lost to a rate of exactly zero.
         ahead = 1 if self.recipe.warmup else 0
-        return self.recipe.factor(min((step + ahead) / self.total_steps, 1.0))
+        factor = self.recipe.factor(min((self.last_epoch + ahead) / self.total_steps, 1.0))
+        return [float(rate) * factor for rate in self.base_lrs]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the position in the schedule; what the schedule is comes from the config."""
+        return {key: value for key, value in super().state_dict().items() if key not in ("recipe", "total_steps")}

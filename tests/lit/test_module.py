@@ -1,0 +1,134 @@
+"""The training step, validation and resume, on a training small enough to run to the end."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+from torch import Tensor, nn
+
+import saunet
+from saunet.checks import ConfigError, SaunetError
+from saunet.data.module import DepthDataModule
+from saunet.infer.images import read_image
+from saunet.lit.assemble import assemble
+from saunet.lit.callbacks import PicturePanel, StopOnNonFinite
+from saunet.lit.module import SelfSupervisedDepth
+from saunet.types import EvalBatch
+
+
+@pytest.fixture
+def batch(walls: DepthDataModule) -> EvalBatch:
+    walls.setup("fit")
+    return walls.on_after_batch_transfer(next(iter(walls.val_dataloader())), 0)  # type: ignore[return-value]
+
+
+def test_a_step_trains_every_parameter(model: SelfSupervisedDepth, batch: EvalBatch) -> None:
+    _, views, terms = model.step(batch)
+    terms.total.backward()
+    assert len(views) == 4
+    assert all(view.image.shape == batch["loss_sources"].shape for view in views)
+    missing = [name for name, parameter in model.named_parameters() if parameter.grad is None]
+    assert missing == []
+
+
+def test_what_is_logged_is_what_is_optimised(model: SelfSupervisedDepth, batch: EvalBatch) -> None:
+    terms = model.step(batch)[-1]
+    named = terms.named("train")
+    torch.testing.assert_close(named["train/loss"], terms.total.detach())
+    assert set(named) == {"train/loss", "train/photometric", "train/gradient"}
+    weighted = 10 * named["train/photometric"] + 0.1 * named["train/gradient"]
+    torch.testing.assert_close(named["train/loss"], weighted)
+
+
+def test_training_brings_the_loss_down(
+    model: SelfSupervisedDepth, walls: DepthDataModule, make_trainer: Callable[..., Trainer]
+) -> None:
+    trainer = make_trainer(max_epochs=1, limit_val_batches=1)
+    trainer.validate(model, walls, verbose=False)
+    before = float(trainer.callback_metrics["val/loss"])
+    trainer = make_trainer(max_epochs=8)
+    trainer.fit(model, walls)
+    assert float(trainer.callback_metrics["val/loss"]) < 0.8 * before
+    assert float(trainer.callback_metrics["val/images"]) == 6
+
+
+def test_a_checkpoint_predicts_what_the_model_predicted(
+    model: SelfSupervisedDepth, walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    trainer = make_trainer(max_epochs=1, limit_train_batches=1, limit_val_batches=0)
+    trainer.fit(model, walls)
+    trainer.save_checkpoint(tmp_path / "a.ckpt")
+    image = walls.datasets["val"].drives[0].image(3)
+    predicted = saunet.load(tmp_path / "a.ckpt").predict(image)
+    model.eval()
+    with torch.inference_mode():
+        expected = model(torch.from_numpy(image).permute(2, 0, 1)[None] / 255).depth[0][0, 0]
+    torch.testing.assert_close(torch.from_numpy(predicted.depth), expected, rtol=1e-4, atol=1e-5)
+
+
+class StopAfterTwoEpochs(Callback):
+    """What an interruption leaves: a checkpoint of the second epoch and nothing after it."""
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        trainer.should_stop = trainer.current_epoch == 1
+
+
+def _weights(model: nn.Module) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in model.state_dict().items()}
+
+
+def test_a_resumed_training_equals_the_uninterrupted_one_bit_for_bit(
+    config: dict[str, Any], walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    torch.manual_seed(0)
+    model = assemble(config, walls)
+    twin = copy.deepcopy(model)
+    straight = make_trainer(max_epochs=3)
+    straight.fit(model, walls)
+
+    stop = [ModelCheckpoint(tmp_path, save_last=True), StopAfterTwoEpochs()]
+    make_trainer(max_epochs=3, callbacks=stop, enable_checkpointing=True).fit(twin, copy.deepcopy(walls))
+    torch.manual_seed(99)  # what happened in between must not matter
+    resumed = assemble(config, walls)
+    make_trainer(max_epochs=3).fit(resumed, copy.deepcopy(walls), ckpt_path=tmp_path / "last.ckpt", weights_only=True)
+    expected, got = _weights(model), _weights(resumed)
+    assert expected.keys() == got.keys()
+    assert all(torch.equal(expected[name], got[name]) for name in expected)
+
+
+def test_a_non_finite_loss_ends_the_run_with_one_sentence(
+    model: SelfSupervisedDepth, walls: DepthDataModule, make_trainer: Callable[..., Trainer]
+) -> None:
+    with torch.no_grad():
+        next(model.depth.parameters()).fill_(float("nan"))
+    trainer = make_trainer(max_epochs=1, callbacks=[StopOnNonFinite(every_n_steps=1)])
+    with pytest.raises(SaunetError, match=r"the loss became NaN or infinite at or before step 1 \(last batch: train"):
+        trainer.fit(model, walls)
+
+
+def test_a_picture_is_written_after_every_epoch(
+    model: SelfSupervisedDepth, walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    make_trainer(max_epochs=2, limit_train_batches=1, callbacks=[PicturePanel(str(tmp_path / "p"))]).fit(model, walls)
+    pictures = sorted((tmp_path / "p").iterdir())
+    assert [path.name for path in pictures] == ["epoch_000.png", "epoch_001.png"]
+    picture = read_image(pictures[1])
+    assert picture.shape[1] > 4 * 320  # five tiles a row
+    assert picture.std() > 20
+
+
+def test_parts_that_do_not_fit_are_refused(config: dict[str, Any], walls: DepthDataModule) -> None:
+    config["model"]["pose"]["offsets"] = [-2, 2]
+    with pytest.raises(ConfigError, match=r"model.pose.offsets is \[-2, 2\] but the data give frames at \[-1, 1\]"):
+        assemble(config, walls)
+    config["model"]["pose"]["offsets"] = [-1, 1]
+    walls.height = 90
+    with pytest.raises(ConfigError, match="nearest valid size is 96x96"):
+        assemble(config, walls)
