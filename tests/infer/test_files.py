@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from saunet.checks import ConfigError, DataError
 from saunet.infer.colour import png16_to_depth
-from saunet.infer.files import MANIFEST, find_sources, predict_files
+from saunet.infer.files import MANIFEST, predict_files
 from saunet.infer.images import read_image, write_image
+from saunet.infer.pointcloud import Camera
 from saunet.infer.predictor import Predictor
+from saunet.infer.sources import find_sources
 from saunet.models.depth import DepthNet
 
 
@@ -120,6 +122,18 @@ def test_same_name_with_two_endings(
 def test_output_below_the_input_is_not_read_back(predictor: Predictor, folder: Path) -> None:
     predict_files(predictor, folder, folder / "depth")
     assert predict_files(predictor, folder, folder / "depth").skipped == 3
+
+
+def test_point_clouds(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
+    camera = Camera.from_numbers((80.0, 80.0, 44.5, 19.5), 40, 90)
+    with pytest.raises(ConfigError, match="'ply', which needs the camera's true intrinsics"):
+        predict_files(predictor, folder, tmp_path / "out", ["ply"])
+    summary = predict_files(predictor, folder / "a.png", tmp_path / "out", ["ply"], camera=camera)
+    assert [path.name for path in summary.written] == ["a_points.ply"]
+    assert b"comment unit: relative" in summary.written[0].read_bytes()
+    other = Camera.from_numbers((90.0, 80.0, 44.5, 19.5), 40, 90)
+    with pytest.raises(ConfigError, match="made with another camera"):
+        predict_files(predictor, folder / "a.png", tmp_path / "out", ["ply"], camera=other)
 
 
 class TestRefused:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import glob
 import io
 import json
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,17 +13,19 @@ import numpy as np
 from saunet.atomic import write_bytes
 from saunet.checks import ConfigError, DataError, one_of, positive
 from saunet.infer.colour import PALETTES, depth_to_png16
-from saunet.infer.images import IMAGE_SUFFIXES, read_image, write_image
+from saunet.infer.images import read_image, write_image
 from saunet.infer.pipeline import ImagePredictor
+from saunet.infer.pointcloud import Camera, point_cloud, write_ply
 from saunet.infer.prediction import Prediction
 from saunet.infer.progress import bar
+from saunet.infer.sources import Source, find_sources
 
-OUTPUTS: tuple[str, ...] = ("colour", "png16", "npy")
-"""What can be written for each image: disparity in colours, depth as 16-bit PNG (x 256), depth as float32 array."""
+OUTPUTS: tuple[str, ...] = ("colour", "png16", "npy", "ply")
+"""What can be written for each image: disparity in colours, depth as 16-bit PNG (x 256) or float32 array, points."""
 MANIFEST = "predictions.json"
 """Written into the output folder: which model and settings its files come from."""
 
-_ENDINGS = {"colour": "_disparity.png", "png16": "_depth.png", "npy": "_depth.npy"}
+_ENDINGS = {"colour": "_disparity.png", "png16": "_depth.png", "npy": "_depth.npy", "ply": "_points.ply"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +41,17 @@ class Summary:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
-    """One image to predict, and the name of its results relative to the output folder, without ending."""
+class _Style:
+    """How results are drawn and written."""
 
-    path: Path
-    stem: str
+    palette: str
+    limits: tuple[float, float] | None
+    camera: Camera | None
+    max_depth: float | None
+
+    def plain(self) -> dict[str, object]:
+        K = self.camera.K.tolist() if self.camera else None
+        return {"palette": self.palette, "limits": self.limits, "camera": K, "max_depth": self.max_depth}
 
 
 def predict_files(
@@ -56,6 +62,8 @@ def predict_files(
     *,
     palette: str = "magma",
     limits: tuple[float, float] | None = None,
+    camera: Camera | None = None,
+    max_depth: float | None = None,
     batch_size: int = 1,
     overwrite: bool = False,
     progress: bool = True,
@@ -67,9 +75,11 @@ def predict_files(
         inputs: Image files, folders (searched with everything below) and patterns such as ``frames/*.png``.
         output_dir: Where results go, keeping the folder structure of the inputs; made if missing.
         outputs: What to write: ``"colour"`` (disparity, ``*_disparity.png``), ``"png16"`` (depth x 256,
-            ``*_depth.png``) and ``"npy"`` (depth in float32, ``*_depth.npy``).
+            ``*_depth.png``), ``"npy"`` (depth in float32, ``*_depth.npy``) and ``"ply"`` (``*_points.ply``).
         palette: Colour map of ``"colour"``.
         limits: Disparities of the darkest and brightest colour; each image's own range by default.
+        camera: True intrinsics of the camera that took the images; ``"ply"`` needs them.
+        max_depth: Leave points out of ``"ply"`` that are farther, in the unit of depth.
         batch_size: Images that go through the network together.
         overwrite: Predict again what is already there, and allow a folder that another model wrote.
         progress: Show a progress bar on a terminal.
@@ -78,7 +88,8 @@ def predict_files(
         What was written and skipped, and which images could not be read.
 
     Raises:
-        ConfigError: for an unknown output, an output folder that is also an input, or one that another model wrote.
+        ConfigError: for an unknown output, points without a camera, or an output folder that holds the originals or
+            results of another model.
         DataError: if there is no image, none of them can be read, or the system refuses to write.
     """
     for output in outputs:
@@ -87,11 +98,13 @@ def predict_files(
     positive("batch_size", batch_size)
     if not outputs:
         raise ConfigError(f"outputs is empty; allowed: {', '.join(OUTPUTS)}")
+    if "ply" in outputs and camera is None:
+        raise ConfigError("outputs has 'ply', which needs the camera's true intrinsics; give camera fx, fy, cx, cy")
+    style = _Style(palette, limits, camera, max_depth)
     folder = Path(output_dir)
     sources = find_sources(inputs, folder)
     _check_folder(folder, sources)
-    settings = {"model": predictor.fingerprint, "unit": predictor.unit, "palette": palette, "limits": limits}
-    _claim(folder, settings, overwrite)
+    _claim(folder, {"model": predictor.fingerprint, "unit": predictor.unit, **style.plain()}, overwrite)
     todo = [source for source in sources if overwrite or _missing(source, folder, outputs)]
     written: list[Path] = []
     failures: list[str] = []
@@ -108,73 +121,13 @@ def predict_files(
             for source, result in zip(readable, predictor.predict_batch(images), strict=True):
                 for output in outputs if overwrite else _missing(source, folder, outputs):
                     path = folder / f"{source.stem}{_ENDINGS[output]}"
-                    _WRITERS[output](path, result, palette, limits)
+                    _WRITERS[output](path, result, style)
                     written.append(path)
             shown.advance(task, len(readable))
     if failures and len(failures) == len(sources):
         more = f" (and {len(failures) - 1} more images cannot be read)" if len(failures) > 1 else ""
         raise DataError(failures[0] + more)
     return Summary(tuple(written), len(sources) - len(todo), tuple(failures))
-
-
-def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Path) -> list[Source]:
-    """Return the images that ``inputs`` name, each input's sorted by name; what lies in ``output_dir`` does not count.
-
-    Raises:
-        DataError: if an input does not exist or holds no image.
-        ConfigError: if two images would get the same results.
-    """
-    several = [inputs] if isinstance(inputs, str | Path) else list(inputs)
-    if not several:
-        raise DataError("no input given; give an image, a folder, or a pattern such as 'frames/*.png'")
-    own = Path(output_dir).resolve()
-    found: dict[Path, Path] = {}  # image -> its path relative to the input that named it
-    for item in several:
-        base, paths = _expand(item)
-        below = base.resolve() in own.parents  # an earlier run's results are no inputs
-        kept = [path for path in paths if not (below and own in path.resolve().parents)]
-        if not kept:
-            endings = " ".join(sorted(IMAGE_SUFFIXES))
-            raise DataError(f"no images in {item}; looked for files ending in {endings}")
-        for path in kept:
-            found.setdefault(path, path.relative_to(base))
-    stems = Counter(str(relative.with_suffix("")) for relative in found.values())
-    sources = []
-    taken: dict[str, Path] = {}
-    for path, relative in found.items():
-        stem = str(relative.with_suffix(""))
-        if stems[stem] > 1:  # a.png beside a.jpg
-            stem += f"_{path.suffix[1:].lower()}"
-        if stem in taken:
-            raise ConfigError(
-                f"{taken[stem]} and {path} would both be written as '{stem}'; predict them into different folders"
-            )
-        taken[stem] = path
-        sources.append(Source(path, stem))
-    return sources
-
-
-def _expand(item: str | Path) -> tuple[Path, list[Path]]:
-    """Return the folder that results' names are relative to, and the images."""
-    path = Path(item)
-    if path.is_dir():
-        return path, sorted(p for p in path.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
-    if path.is_file():
-        return path.parent, [path]
-    if glob.has_magic(str(item)):
-        fixed = _before_magic(path.parts)
-        matches = sorted(Path(match) for match in glob.glob(str(item), recursive=True))
-        return Path(*fixed), [p for p in matches if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()]
-    raise DataError(f"no file or folder at {item}; check the path")
-
-
-def _before_magic(parts: Sequence[str]) -> list[str]:
-    fixed: list[str] = []
-    for part in parts[:-1]:
-        if glob.has_magic(part):
-            break
-        fixed.append(part)
-    return fixed
 
 
 def _check_folder(folder: Path, sources: Sequence[Source]) -> None:
@@ -215,22 +168,28 @@ def _missing(source: Source, folder: Path, outputs: Sequence[str]) -> list[str]:
     return [output for output, path in paths.items() if not path.is_file() or path.stat().st_mtime < changed]
 
 
-def _write_colour(path: Path, result: Prediction, palette: str, limits: tuple[float, float] | None) -> None:
-    write_image(path, result.colour(limits, palette))
+def _write_colour(path: Path, result: Prediction, style: _Style) -> None:
+    write_image(path, result.colour(style.limits, style.palette))
 
 
-def _write_png16(path: Path, result: Prediction, palette: str, limits: tuple[float, float] | None) -> None:
+def _write_png16(path: Path, result: Prediction, style: _Style) -> None:
     write_image(path, depth_to_png16(result.depth))
 
 
-def _write_npy(path: Path, result: Prediction, palette: str, limits: tuple[float, float] | None) -> None:
+def _write_npy(path: Path, result: Prediction, style: _Style) -> None:
     buffer = io.BytesIO()
     np.save(buffer, result.depth)
     write_bytes(path, buffer.getvalue())
 
 
-_WRITERS: dict[str, Callable[[Path, Prediction, str, tuple[float, float] | None], None]] = {
+def _write_ply(path: Path, result: Prediction, style: _Style) -> None:
+    assert style.camera is not None  # predict_files has asked for it
+    write_ply(path, point_cloud(result, style.camera, max_depth=style.max_depth))
+
+
+_WRITERS: dict[str, Callable[[Path, Prediction, _Style], None]] = {
     "colour": _write_colour,
     "png16": _write_png16,
     "npy": _write_npy,
+    "ply": _write_ply,
 }

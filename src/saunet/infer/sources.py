@@ -1,0 +1,80 @@
+"""Which images an input names (a file, a folder, a pattern), and what their results are to be called."""
+
+from __future__ import annotations
+
+import glob
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from saunet.checks import ConfigError, DataError
+from saunet.infer.images import IMAGE_SUFFIXES
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One image to predict, and the name of its results relative to the output folder, without ending."""
+
+    path: Path
+    stem: str
+
+
+def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Path) -> list[Source]:
+    """Return the images that ``inputs`` name, each input's sorted by name; what lies in ``output_dir`` does not count.
+
+    Raises:
+        DataError: if an input does not exist or holds no image.
+        ConfigError: if two images would get the same results.
+    """
+    several = [inputs] if isinstance(inputs, str | Path) else list(inputs)
+    if not several:
+        raise DataError("no input given; give an image, a folder, or a pattern such as 'frames/*.png'")
+    own = Path(output_dir).resolve()
+    found: dict[Path, Path] = {}  # image -> its path relative to the input that named it
+    for item in several:
+        base, paths = _expand(item)
+        below = base.resolve() in own.parents  # an earlier run's results are no inputs
+        kept = [path for path in paths if not (below and own in path.resolve().parents)]
+        if not kept:
+            endings = " ".join(sorted(IMAGE_SUFFIXES))
+            raise DataError(f"no images in {item}; looked for files ending in {endings}")
+        for path in kept:
+            found.setdefault(path, path.relative_to(base))
+    stems = Counter(str(relative.with_suffix("")) for relative in found.values())
+    sources = []
+    taken: dict[str, Path] = {}
+    for path, relative in found.items():
+        stem = str(relative.with_suffix(""))
+        if stems[stem] > 1:  # a.png beside a.jpg
+            stem += f"_{path.suffix[1:].lower()}"
+        if stem in taken:
+            raise ConfigError(
+                f"{taken[stem]} and {path} would both be written as '{stem}'; predict them into different folders"
+            )
+        taken[stem] = path
+        sources.append(Source(path, stem))
+    return sources
+
+
+def _expand(item: str | Path) -> tuple[Path, list[Path]]:
+    """Return the folder that results' names are relative to, and the images."""
+    path = Path(item)
+    if path.is_dir():
+        return path, sorted(p for p in path.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+    if path.is_file():
+        return path.parent, [path]
+    if glob.has_magic(str(item)):
+        fixed = _before_magic(path.parts)
+        matches = sorted(Path(match) for match in glob.glob(str(item), recursive=True))
+        return Path(*fixed), [p for p in matches if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()]
+    raise DataError(f"no file or folder at {item}; check the path")
+
+
+def _before_magic(parts: Sequence[str]) -> list[str]:
+    fixed: list[str] = []
+    for part in parts[:-1]:
+        if glob.has_magic(part):
+            break
+        fixed.append(part)
+    return fixed
