@@ -54,6 +54,10 @@ class TrainBatch(TypedDict):
     """See `FrameBatch`; cropped and flipped with the images."""
     target_teacher: NotRequired[Float[Tensor, "b 1 h w"]]
     """Depth of the target as another model predicts it, up to scale, 0 where unknown."""
+    distance: NotRequired[Float[Tensor, "b s"]]
+    """Metres the camera travelled between the target and each source (speed times time), NaN where unknown."""
+    source_depth: NotRequired[Float[Tensor, "b s 1 h w"]]
+    """Predicted depth of the sources, with its graph; the training step adds it if `Objective.needs_source_depth`."""
     T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
     """See `FrameBatch`; follows flips."""
 

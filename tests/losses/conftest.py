@@ -91,6 +91,8 @@ def make_inputs() -> Callable[..., Inputs]:
             "name": [f"sample {i}" for i in range(batch)],
             "target_depth": (rand(batch, 1, height, width) * 20 + 1) * known,
             "target_teacher": rand(batch, 1, height, width) * 3 + 1,
+            "distance": rand(batch, sources),
+            "source_depth": rand(batch, sources, 1, height, width) * 0.5 + 2,
         }
         data.update(replace)
         sigmoid = [rand(batch, 1, height >> s, width >> s) * 0.05 + 0.02 for s in range(scales)]

@@ -123,7 +123,10 @@ def test_nothing_left_is_zero_with_a_graph(name: str, options: dict[str, Any], m
     for key in ("target_depth", "target_teacher"):
         batch[key] = torch.zeros_like(batch[key])
     views = tuple(dataclasses.replace(view, valid=torch.zeros_like(view.valid)) for view in inputs.views)
-    result = build(name, options)(batch, inputs.pyramid, inputs.poses, views)
+    batch["distance"] = torch.full_like(batch["distance"], torch.nan)
+    elsewhere = torch.zeros(4, 4)
+    elsewhere[0, 3] = 1e5
+    result = build(name, options)(batch, inputs.pyramid, inputs.poses + elsewhere, views)
     assert result.value == 0
     result.value.backward()
     grads = [leaf.grad for leaf in inputs.leaves if leaf.grad is not None]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from saunet.geometry.precision import full_precision
@@ -59,8 +59,68 @@ def project(
         Pixels (u, v) in the source image, and depth z in the source camera. A point less than `MIN_Z` in front of the
         camera gets a pixel outside every image, and no gradient.
     """
-    pixels, z = _project(points, K, T[:, None])
+    pixels, z = project_each(points, K, T[:, None])
     return pixels[:, 0], z[:, 0]
+
+
+@full_precision
+def project_each(
+    points: Float[Tensor, "b 3 h w"], K: Float[Tensor, "b 3 3"], T_src_tgt: Float[Tensor, "b s 4 4"]
+) -> tuple[Float[Tensor, "b s h w 2"], Float[Tensor, "b s h w"]]:
+    """Do what `project` does, for several source cameras with the same intrinsics.
+
+    Args:
+        points: Points in the target camera's frame, metres.
+        K: Intrinsics of the source cameras, pixels.
+        T_src_tgt: One motion a source.
+
+    Returns:
+        Pixels and depth in each source camera.
+    """
+    x, y, z = points[:, None, None].unbind(3)
+    columns = T_src_tgt[:, :, :3, :, None, None].unbind(3)
+    moved = columns[0] * x + columns[1] * y + columns[2] * z + columns[3]
+    x, y, z = moved.unbind(2)
+    front = z > MIN_Z
+    safe = torch.where(front, z, torch.ones_like(z))
+    fx, skew, cx, fy, cy = (entry[:, None] for entry in _entries(K))
+    x, y = x / safe, y / safe
+    pixels = torch.stack((fx * x + skew * y + cx, fy * y + cy), dim=-1)
+    return torch.where(front[..., None], pixels, torch.full_like(pixels, _BEHIND)), z
+
+
+@full_precision
+def sample(images: Float[Tensor, "b s c h w"], pixels: Float[Tensor, "b s hp wp 2"]) -> Float[Tensor, "b s c hp wp"]:
+    """Look images up at pixels (u, v): bilinear, with the border value outside the picture.
+
+    Args:
+        images: What to look up.
+        pixels: Where, one position per pixel of the result.
+
+    Returns:
+        The values there.
+    """
+    batch, count, _, height, width = images.shape
+    u, v = pixels.unbind(-1)
+    grid = torch.stack((2 * u / max(width - 1, 1) - 1, 2 * v / max(height - 1, 1) - 1), dim=-1)
+    found = F.grid_sample(
+        images.flatten(0, 1), grid.flatten(0, 1), mode="bilinear", padding_mode="border", align_corners=True
+    )
+    return found.reshape(batch, count, *found.shape[1:])
+
+
+def visible(pixels: Float[Tensor, "*b 2"], z: Float[Tensor, "*b"], height: int, width: int) -> Bool[Tensor, "*b"]:
+    """Where a projected point lies in front of the camera and inside an image of this size.
+
+    Args:
+        pixels: Pixels (u, v) of `project`.
+        z: Depth in the camera, metres.
+        height: Height of the image.
+        width: Width of the image.
+    """
+    u, v = pixels.unbind(-1)
+    inside = (u >= -BORDER) & (u <= width - 1 + BORDER) & (v >= -BORDER) & (v <= height - 1 + BORDER)
+    return inside & (z > MIN_Z)
 
 
 @full_precision
@@ -83,29 +143,8 @@ def synthesize(
     Returns:
         The warped images, and where a point lies in front of the source camera and inside its image.
     """
-    batch, count, _, height, width = sources.shape
-    pixels, z = _project(backproject(depth.clamp(max=FAR), K), K, T_src_tgt)
-    u, v = pixels.unbind(-1)
-    inside = (u >= -BORDER) & (u <= width - 1 + BORDER) & (v >= -BORDER) & (v <= height - 1 + BORDER)
-    grid = torch.stack((2 * u / max(width - 1, 1) - 1, 2 * v / max(height - 1, 1) - 1), dim=-1)
-    image = F.grid_sample(
-        sources.flatten(0, 1), grid.flatten(0, 1), mode="bilinear", padding_mode="border", align_corners=True
-    )
-    return View(image=image.reshape(batch, count, *image.shape[1:]), valid=(inside & (z > MIN_Z))[:, :, None])
-
-
-def _project(points: Tensor, K: Tensor, T: Tensor) -> tuple[Tensor, Tensor]:
-    """Project points (b 3 h w) with several motions T (b s 4 4): pixels (b s h w 2), z (b s h w)."""
-    x, y, z = points[:, None, None].unbind(3)
-    columns = T[:, :, :3, :, None, None].unbind(3)
-    moved = columns[0] * x + columns[1] * y + columns[2] * z + columns[3]
-    x, y, z = moved.unbind(2)
-    front = z > MIN_Z
-    safe = torch.where(front, z, torch.ones_like(z))
-    fx, skew, cx, fy, cy = (entry[:, None] for entry in _entries(K))
-    x, y = x / safe, y / safe
-    pixels = torch.stack((fx * x + skew * y + cx, fy * y + cy), dim=-1)
-    return torch.where(front[..., None], pixels, torch.full_like(pixels, _BEHIND)), z
+    pixels, z = project_each(backproject(depth.clamp(max=FAR), K), K, T_src_tgt)
+    return View(image=sample(sources, pixels), valid=visible(pixels, z, *sources.shape[-2:])[:, :, None])
 
 
 def _entries(K: Tensor) -> tuple[Tensor, ...]:

@@ -30,6 +30,9 @@ class Term(nn.Module):
     device, and returns 0 with a graph where nothing can be compared.
     """
 
+    needs_source_depth: bool = False
+    """Whether the batch must hold ``source_depth``, the depth network's answer for the sources."""
+
     def forward(
         self,
         batch: TrainBatch,
@@ -58,7 +61,8 @@ class Objective(nn.Module):
         terms: Name -> term; the names appear in the log.
         weights: Name -> weight, at least 0. A term of weight 0 is left out and costs nothing.
         extra: Name -> mapping of ``weight``, optionally ``term`` (a registered name, by default the name itself, or a
-            `Term`), and the parameters of that term: ``{"smoothness": {"weight": 0.001}}``.
+            `Term`), and the parameters of that term: ``{"smoothness": {"weight": 0.001}}``. On the command line:
+            ``+objective.extra.smoothness.weight=0.001``.
 
     Raises:
         ConfigError: for a negative weight, no positive weight, a name given twice, or an unknown extra term.
@@ -80,6 +84,11 @@ class Objective(nn.Module):
         if not self.weights:
             raise ConfigError(f"all loss weights are 0 ({', '.join(weights)}); set at least one above 0")
         self.terms = nn.ModuleDict({name: terms[name] for name in self.weights})
+
+    @property
+    def needs_source_depth(self) -> bool:
+        """Whether a term compares depth between frames, so that the training step adds ``batch["source_depth"]``."""
+        return any(getattr(term, "needs_source_depth", False) for term in self.terms.values())
 
     def forward(
         self,

@@ -203,6 +203,17 @@ def gradient_loss(
 
 
 @full_precision
+def depth_inconsistency(expected: Float[Tensor, "*n"], predicted: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Relative difference |a - b| / (a + b) of two depths, in [0, 1): SC-Depth's.
+
+    Args:
+        expected: Depth that follows from one frame, greater than 0.
+        predicted: Depth predicted in the other, greater than 0.
+    """
+    return (expected - predicted).abs() / (expected + predicted)
+
+
+@full_precision
 def pool_known(depth: Float[Tensor, "b 1 _ _"], height: int, width: int) -> Float[Tensor, "b 1 {height} {width}"]:
     """Reduce a depth map with holes: each pixel is the mean of the known pixels it covers.
 

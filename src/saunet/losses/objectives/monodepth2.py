@@ -14,12 +14,12 @@ from saunet.registry import objectives
 
 @objectives.register("monodepth2")
 class Monodepth2Objective(Objective):
-    """Photometric loss plus edge-aware smoothness, each averaged over scales (Monodepth2 eq. (6)).
+    """Photometric loss plus edge-aware smoothness, each averaged over scales, as in Monodepth2.
 
     Args:
         smoothness: Weight of the smoothness term at scale 0; scale s has 1/2**s of it.
         photometric: The photometric term; with the defaults of `Monodepth2Photometric` if None.
-        extra: Further terms, each with its own weight: ``{"velocity": {"weight": 0.05}}``; see `Objective`.
+        extra: Further terms, each with its own weight: ``{"velocity": {"weight": 0.1}}``; see `Objective`.
 
     Raises:
         ConfigError: see `Objective`.
