@@ -67,6 +67,7 @@ def config() -> dict[str, Any]:
     """A resolved training config of tiny parts."""
     return {
         "name": "test",
+        "seed": 0,
         "model": {
             "encoder": plain_node("encoder", "resnet18"),
             "decoder": plain_node("decoder", "aunet"),

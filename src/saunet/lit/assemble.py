@@ -48,5 +48,6 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule) -> SelfSupervisedDep
         objective=instantiate(cfg["objective"]),
         recipe=Recipe(**{key: value for key, value in cfg["optim"].items() if not key.startswith("_")}),
         metrics=DepthMetrics(protocol(cfg.get("protocol") or data.protocol)),
+        seed=cfg["seed"],
         record=record.to_plain(),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from lightning import LightningModule
@@ -27,6 +28,7 @@ class SelfSupervisedDepth(LightningModule):
         objective: (batch, pyramid, poses, views) -> `LossTerms`.
         recipe: Optimiser and schedule.
         metrics: Scores validation batches that have ground truth.
+        seed: With step and process, all that dropped paths and tie-break noise depend on.
         record: Plain data stored in every checkpoint under ``"saunet"``; `saunet.load` rebuilds the networks from it.
     """
 
@@ -37,6 +39,7 @@ class SelfSupervisedDepth(LightningModule):
         objective: nn.Module,
         recipe: Recipe | None = None,
         metrics: DepthMetrics | None = None,
+        seed: int = 0,
         record: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -45,12 +48,18 @@ class SelfSupervisedDepth(LightningModule):
         self.objective = objective
         self.metrics = metrics if metrics is not None else DepthMetrics()
         self.recipe = recipe if recipe is not None else Recipe()
+        self.seed = seed
         self.record = dict(record or {})
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> DepthPyramid:
         """Return the depth of images in [0, 1]."""
         pyramid: DepthPyramid = self.depth(image)
         return pyramid
+
+    def on_train_batch_start(self, batch: TrainBatch, batch_idx: int) -> None:
+        """Make the step's randomness a function of seed, step and process: a resumed run draws what it would have."""
+        place = [self.seed, self.global_step, self.global_rank]
+        torch.manual_seed(int(np.random.SeedSequence(place).generate_state(1)[0]))
 
     def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
         """Return the loss of one batch, eq. (14)."""
