@@ -38,21 +38,26 @@ class DisparityHead(nn.Module):
     The bias starts at logit(0.3) instead of 0. With the usual limits of 0.1 and 100 an untrained network then predicts
     a depth of a third of a unit, three times the nearest one: room on both sides, and about where networks trained from
     video settle. Logit 0 is only twice the nearest depth, and most of a road scene lies further away than that.
+
+    Args:
+        inputs: Channels of the feature map.
+        enlarge: How much larger the disparity is than the feature map; its logits are upsampled.
     """
 
-    def __init__(self, inputs: int) -> None:
+    def __init__(self, inputs: int, enlarge: int = 1) -> None:
         super().__init__()
+        self.enlarge = enlarge
         self.conv = Conv3x3(inputs, 1)
         nn.init.constant_(self.conv.bias, math.log(START / (1 - START)))  # type: ignore[arg-type]
 
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return disparity in (0, 1) at the size of ``x``.
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 _ _"]:
+        """Return disparity in (0, 1) at ``enlarge`` times the size of ``x``.
 
         Outside autocast: a logit of bfloat16 near -4, which is a far pixel, would round depth to about two per cent.
         """
         with torch.autocast(device_type=x.device.type, enabled=False):
             logits: Tensor = self.conv(x.to(self.conv.weight.dtype))
-            return logits.sigmoid()
+            return (upsample(logits, self.enlarge) if self.enlarge > 1 else logits).sigmoid()
 
 
 def upsample(x: Float[Tensor, "b c h w"], factor: int = 2) -> Float[Tensor, "b c _ _"]:

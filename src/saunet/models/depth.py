@@ -50,7 +50,9 @@ class DepthNet(nn.Module):
         self.features = encoder.features
         self.size_divisor = int(encoder.size_divisor)  # type: ignore[arg-type]
         self.min_depth, self.max_depth = float(min_depth), float(max_depth)
-        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        for parameter in self.parameters():
+            if parameter.ndim == 4:  # PackNet has 3-D convolutions too, for which the format does not exist
+                parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> DepthPyramid:
         """Return disparity and depth at each of the decoder's scales.

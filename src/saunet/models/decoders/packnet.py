@@ -1,0 +1,78 @@
+"""PackNet's decoder (Guizilini et al., CVPR 2020): unpacking instead of interpolation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from saunet.checks import ConfigError
+from saunet.layers.conv import DisparityHead
+from saunet.layers.packing import GROUPS, ConvNormELU, Unpacking, initialise
+from saunet.models.decoders.base import by_level, check_scales
+from saunet.registry import decoders
+from saunet.types import FeatureSpec
+
+
+@decoders.register("packnet")
+class PackNetDecoder(nn.Module):
+    """Unpack, join with the skip and the coarser disparity, convolve (PackNet Table 1, version with concatenation).
+
+    Args:
+        features: The encoder's features, finest first.
+        channels: Channels at 1/1, 1/2, 1/4, 1/8, 1/16, multiples of 32; a deepest stride of 16 needs only four.
+        scales: Scales to predict disparity at, finest first.
+
+    Raises:
+        ConfigError: if the features' strides, the channels or the scales cannot work.
+    """
+
+    def __init__(
+        self,
+        features: Sequence[FeatureSpec],
+        channels: Sequence[int] = (64, 64, 128, 256, 512),
+        scales: Sequence[int] = (0, 1, 2, 3),
+    ) -> None:
+        super().__init__()
+        skips = by_level(features)
+        deepest = max(skips)
+        if len(channels) < deepest or any(c < 1 or c % (2 * GROUPS) for c in channels):
+            raise ConfigError(
+                f"channels is {list(channels)}; needed: {deepest} multiples of {2 * GROUPS}, a level each"
+            )
+        self.skip_levels = tuple(skips)
+        self.scales = check_scales(scales, deepest)
+        unpackings, joins, inputs = [], [], skips[deepest]
+        for level in range(deepest - 1, -1, -1):
+            coarser_disparity = 1 if level + 1 < len(self.scales) else 0
+            unpackings.append(Unpacking(inputs, channels[level]))
+            joins.append(ConvNormELU(channels[level] + skips.get(level, 0) + coarser_disparity, channels[level]))
+            inputs = channels[level]
+        self.unpackings = nn.ModuleList(unpackings)
+        self.joins = nn.ModuleList(joins)
+        initialise(self)
+        self.heads = nn.ModuleList([DisparityHead(channels[scale]) for scale in self.scales])
+
+    def forward(self, features: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Return sigmoid disparity, b 1 h/2**s w/2**s, for each scale s.
+
+        Args:
+            features: The encoder's feature maps, finest first.
+        """
+        skips = dict(zip(self.skip_levels, features, strict=True))
+        level = self.skip_levels[-1]
+        x = skips[level]
+        maps: list[Tensor] = []
+        for unpack, join in zip(self.unpackings, self.joins, strict=True):
+            level -= 1
+            parts = [unpack(x)]
+            if level in skips:
+                parts.append(skips[level])
+            if maps:
+                parts.append(F.interpolate(maps[-1], scale_factor=2, mode="nearest").to(parts[0].dtype))
+            x = join(torch.cat(parts, 1))
+            if level < len(self.heads):
+                maps.append(self.heads[level](x))
+        return tuple(reversed(maps))

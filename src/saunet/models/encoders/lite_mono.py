@@ -1,0 +1,179 @@
+"""Lite-Mono's encoder (Zhang et al., CVPR 2023): dilated convolutions for the near, channel attention for the far."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from saunet.checks import ConfigError, in_range
+from saunet.layers.window_block import DropPath
+from saunet.layers.xca import CrossCovarianceAttention, FourierPosition
+from saunet.registry import encoders
+from saunet.types import FeatureSpec
+
+LAYER_SCALE = 1e-6
+"""Start of the learnt factor on each residual branch."""
+
+
+@encoders.register("lite_mono")
+@encoders.register("lite_mono_small", depths=(4, 4, 7))
+@encoders.register("lite_mono_tiny", dims=(32, 64, 128), depths=(4, 4, 7))
+@encoders.register("lite_mono_8m", dims=(64, 128, 224))
+class LiteMonoEncoder(nn.Module):
+    """Lite-Mono's encoder (Lite-Mono section 3.2, Table 1): features at 1/4, 1/8, 1/16.
+
+    A stem of three 3×3 convolutions; before each stage a strided convolution over the concatenation of the previous
+    stage's input and output and the average-pooled image; each stage is dilated convolutions (`DilatedBlock`) and one
+    `GlobalBlock` at its end. With ``decoder=lite_mono`` the network has 3.1 M parameters, as published.
+
+    Args:
+        dims: Channels of the three stages.
+        depths: Blocks in each stage, the global block included.
+        rates: Dilation rates that a stage's blocks go through again and again.
+        last_rates: Dilation rates of the last dilated blocks of the last stage.
+        heads: Heads of the channel attention.
+        expansion: How much wider the pointwise layers are.
+        drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
+
+    Attributes:
+        features: Channels and stride of each feature map, finest first.
+        size_divisor: Input height and width must be multiples of it.
+
+    Raises:
+        ConfigError: if there are not three stages of at least two blocks, or the heads do not divide the channels.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        dims: Sequence[int] = (48, 80, 128),
+        depths: Sequence[int] = (4, 4, 10),
+        rates: Sequence[int] = (1, 2, 3),
+        last_rates: Sequence[int] = (2, 4, 6),
+        heads: int = 8,
+        expansion: int = 6,
+        drop_path: float = 0.2,
+    ) -> None:
+        super().__init__()
+        dims, depths = tuple(dims), tuple(depths)
+        if len(dims) != 3 or len(depths) != 3 or min(depths) < 2:
+            raise ConfigError(f"dims is {dims} and depths {depths}; Lite-Mono has three stages of at least two blocks")
+        in_range("drop_path", drop_path, 0, 0.99)
+        self.register_buffer("mean", torch.tensor(0.45), persistent=False)
+        self.register_buffer("std", torch.tensor(0.225), persistent=False)
+        self.stem = nn.Sequential(
+            *(layer for i in range(3) for layer in _conv_norm_gelu(dims[0] if i else 3, dims[0], 1 if i else 2))
+        )
+        inputs = (dims[0] + 3, 2 * dims[0] + 3, 2 * dims[1] + 3)
+        self.reductions = nn.ModuleList(
+            [nn.Conv2d(i, dim, 3, stride=2, padding=1, bias=False) for i, dim in zip(inputs, dims, strict=True)]
+        )
+        drops = iter([drop_path * i / (sum(depths) - 1) for i in range(sum(depths))])
+        stages = []
+        for stage, (dim, depth) in enumerate(zip(dims, depths, strict=True)):
+            dilations = _dilations(depth - 1, tuple(rates), tuple(last_rates) if stage == 2 else ())
+            blocks: list[nn.Module] = [DilatedBlock(dim, rate, expansion, next(drops)) for rate in dilations]
+            blocks.append(GlobalBlock(dim, heads, expansion, next(drops), position=stage == 0))
+            stages.append(nn.Sequential(*blocks))
+        self.stages = nn.ModuleList(stages)
+        self.features = tuple(FeatureSpec(dim, 4 * 2**i) for i, dim in enumerate(dims))
+        self.size_divisor = 16
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d | nn.Linear):
+                nn.init.trunc_normal_(module.weight, std=0.02)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
+        """Return the three feature maps, finest first.
+
+        Args:
+            image: RGB in [0, 1]; h and w multiples of 16.
+        """
+        pooled = (image - self.mean) / self.std
+        parts = [self.stem(pooled)]
+        features = []
+        for reduce, stage in zip(self.reductions, self.stages, strict=True):
+            pooled = F.avg_pool2d(pooled, 3, stride=2, padding=1)
+            before = reduce(torch.cat([*parts, pooled], 1))
+            after = stage(before)
+            parts = [before, after]
+            features.append(after)
+        return tuple(features)
+
+
+class DilatedBlock(nn.Module):
+    """Dilated depthwise 3×3, then two pointwise layers, added to the input (consecutive dilated convolutions, eq. (2)).
+
+    Args:
+        dim: Channels.
+        rate: Dilation.
+        expansion: How much wider the pointwise layers are.
+        drop_path: Probability of stochastic depth.
+    """
+
+    def __init__(self, dim: int, rate: int, expansion: int, drop_path: float) -> None:
+        super().__init__()
+        self.depthwise = nn.Conv2d(dim, dim, 3, padding=rate, dilation=rate, groups=dim, bias=False)
+        self.norm = nn.BatchNorm2d(dim)
+        self.expand = nn.Linear(dim, expansion * dim)
+        self.reduce = nn.Linear(expansion * dim, dim)
+        self.scale = nn.Parameter(torch.full((dim,), LAYER_SCALE))
+        self.drop_path = DropPath(drop_path)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """Return the refined map."""
+        y = self.norm(self.depthwise(x)).permute(0, 2, 3, 1)
+        y = self.scale * self.reduce(F.gelu(self.expand(y)))
+        out: Tensor = x + self.drop_path(y.permute(0, 3, 1, 2))
+        return out
+
+
+class GlobalBlock(nn.Module):
+    """Cross-covariance attention, then two pointwise layers, added to the input (local-global features, eqs. (3)–(5)).
+
+    Args:
+        dim: Channels.
+        heads: Heads of the attention.
+        expansion: How much wider the pointwise layers are.
+        drop_path: Probability of stochastic depth.
+        position: Add a code of the position first, as in the first stage.
+    """
+
+    def __init__(self, dim: int, heads: int, expansion: int, drop_path: float, position: bool) -> None:
+        super().__init__()
+        self.position = FourierPosition(dim) if position else None
+        self.norm_attention = nn.LayerNorm(dim, eps=1e-6)
+        self.attention = CrossCovarianceAttention(dim, heads)
+        self.scale_attention = nn.Parameter(torch.full((dim,), LAYER_SCALE))
+        self.norm = nn.LayerNorm(dim, eps=1e-6)
+        self.expand = nn.Linear(dim, expansion * dim)
+        self.reduce = nn.Linear(expansion * dim, dim)
+        self.scale = nn.Parameter(torch.full((dim,), LAYER_SCALE))
+        self.drop_path = DropPath(drop_path)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """Return the refined map."""
+        y = x if self.position is None else x + self.position(x)
+        tokens = y.permute(0, 2, 3, 1).flatten(1, 2)
+        tokens = tokens + self.scale_attention * self.attention(self.norm_attention(tokens))
+        tokens = self.scale * self.reduce(F.gelu(self.expand(self.norm(tokens))))
+        refined = tokens.unflatten(1, x.shape[-2:]).permute(0, 3, 1, 2)
+        out: Tensor = x + self.drop_path(refined)
+        return out
+
+
+def _dilations(count: int, rates: tuple[int, ...], last: tuple[int, ...]) -> list[int]:
+    """Return ``count`` dilation rates: ``rates`` again and again, and ``last`` at the end."""
+    last = last[-count:]
+    return [rates[i % len(rates)] for i in range(count - len(last))] + list(last)
+
+
+def _conv_norm_gelu(inputs: int, outputs: int, stride: int) -> tuple[nn.Module, ...]:
+    return nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.GELU()

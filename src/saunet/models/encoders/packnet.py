@@ -1,0 +1,79 @@
+"""PackNet's encoder (Guizilini et al., "3D Packing for Self-Supervised Monocular Depth Estimation", CVPR 2020)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from saunet.checks import ConfigError
+from saunet.layers.packing import GROUPS, ConvNormELU, Packing, ResidualConv, initialise
+from saunet.registry import encoders
+from saunet.types import FeatureSpec
+
+
+@encoders.register("packnet")
+class PackNetEncoder(nn.Module):
+    """Five packing stages, the encoder of PackNet01 (PackNet Table 1): features at 1/1, 1/2, ... 1/32.
+
+    A 5×5 convolution at full size; then per stage a block (a 7×7 convolution in the first, residual blocks after it)
+    and a `Packing`. The features are the packed maps, which PackNet's decoder joins as skips. With ``decoder=packnet``
+    and the defaults the network has 128.3 M parameters; PackNet publishes 128 M. (SAU-Net's Table 2 says 118.5.)
+
+    Four fifths of the weights are in the 2-D convolutions after packing, which see 32 times their channels.
+
+    Args:
+        channels: Channels of the five stages, multiples of 16.
+        blocks: Residual blocks in stages 2 to 5.
+
+    Attributes:
+        features: Channels and stride of each feature map, finest first.
+        size_divisor: Input height and width must be multiples of it.
+
+    Raises:
+        ConfigError: for a wrong number of stages or channels that do not divide.
+    """
+
+    def __init__(self, channels: Sequence[int] = (64, 64, 128, 256, 512), blocks: Sequence[int] = (2, 2, 3, 3)) -> None:
+        super().__init__()
+        channels, blocks = tuple(channels), tuple(blocks)
+        if len(channels) != 5 or len(blocks) != 4 or min(blocks) < 1:
+            raise ConfigError(
+                f"channels is {channels} and blocks {blocks}; PackNet has five stages, the last four with blocks"
+            )
+        check_channels(channels)
+        self.stem = ConvNormELU(3, channels[0], kernel=5)
+        stages: list[nn.Module] = [ConvNormELU(channels[0], channels[0], kernel=7)]
+        for inputs, outputs, depth in zip(channels[:-1], channels[1:], blocks, strict=True):
+            stages.append(nn.Sequential(*[ResidualConv(outputs if i else inputs, outputs) for i in range(depth)]))
+        self.stages = nn.ModuleList(stages)
+        self.packings = nn.ModuleList([Packing(c, kernel=3 if i else 5) for i, c in enumerate(channels)])
+        self.features = tuple(FeatureSpec(c, 2**i) for i, c in enumerate((channels[0], *channels)))
+        self.size_divisor = 32
+        initialise(self)
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
+        """Return the six feature maps, finest first.
+
+        Args:
+            image: RGB in [0, 1], which PackNet takes as it is; h and w multiples of 32.
+        """
+        x = self.stem(image)
+        features = [x]
+        for stage, packing in zip(self.stages, self.packings, strict=True):
+            x = packing(stage(x))
+            features.append(x)
+        return tuple(features)
+
+
+def check_channels(channels: Sequence[int]) -> None:
+    """Check that every number of channels divides into PackNet's normalisation groups.
+
+    Raises:
+        ConfigError: if one does not.
+    """
+    if any(c < 1 or c % GROUPS for c in channels):
+        raise ConfigError(
+            f"channels is {tuple(channels)}; PackNet normalises over {GROUPS} groups, give multiples of {GROUPS}"
+        )

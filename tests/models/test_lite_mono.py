@@ -1,0 +1,104 @@
+"""Lite-Mono: published sizes, its attention in NumPy, its dilations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from saunet.checks import ConfigError
+from saunet.layers.xca import CrossCovarianceAttention, FourierPosition
+from saunet.models.depth import DepthNet
+from saunet.models.encoders.lite_mono import DilatedBlock
+from saunet.registry import decoders, encoders
+from saunet.types import FeatureSpec
+
+
+# Lite-Mono's Table 2, encoder and decoder, in millions, as printed to one decimal
+@pytest.mark.parametrize(
+    ("name", "millions"),
+    [("lite_mono", 3.1), ("lite_mono_small", 2.5), ("lite_mono_tiny", 2.2), ("lite_mono_8m", 8.7)],
+)
+def test_published_size(name, millions):
+    with torch.device("meta"):
+        net = DepthNet(encoders.build(name), decoders.partial("lite_mono"))
+    assert sum(p.numel() for p in net.parameters()) / 1e6 == pytest.approx(millions, rel=0.03)
+
+
+def test_dilations():
+    with torch.device("meta"):
+        stages = encoders.build("lite_mono").stages
+    rates = [[b.depthwise.dilation[0] for b in stage if isinstance(b, DilatedBlock)] for stage in stages]
+    assert rates == [[1, 2, 3], [1, 2, 3], [1, 2, 3, 1, 2, 3, 2, 4, 6]]
+
+
+def test_attention_among_channels():
+    attention = CrossCovarianceAttention(8, heads=2)
+    torch.nn.init.uniform_(attention.temperature, 0.5, 2)
+    tokens = torch.randn(1, 12, 8)
+    with torch.no_grad():
+        got = attention(tokens)[0].numpy()
+    w = {name: p.detach().numpy().astype(np.float64) for name, p in attention.named_parameters()}
+    qkv = tokens[0].numpy() @ w["qkv.weight"].T + w["qkv.bias"]
+    mixed = []
+    for head in range(2):
+        q, k, v = (qkv[:, i * 8 + head * 4 : i * 8 + head * 4 + 4] for i in range(3))  # 12 pixels x 4 channels
+        q, k = q / np.linalg.norm(q, axis=0), k / np.linalg.norm(k, axis=0)
+        scores = np.exp(w["temperature"][head, 0, 0] * q.T @ k)
+        mixed.append(v @ (scores / scores.sum(1, keepdims=True)).T)
+    expected = np.concatenate(mixed, 1) @ w["proj.weight"].T + w["proj.bias"]
+    np.testing.assert_allclose(got, expected, atol=1e-5)
+
+
+def test_heads_must_divide():
+    with pytest.raises(ConfigError, match="heads is 3; it must divide the 8 channels"):
+        CrossCovarianceAttention(8, heads=3)
+
+
+def test_position_code_tells_rows_from_columns():
+    position = FourierPosition(16)
+    with torch.no_grad():
+        position.project.weight.zero_()
+        position.project.weight[0, 0] = 1  # the slowest sine of the row
+        position.project.weight[1, 32] = 1  # and of the column
+        position.project.bias.zero_()
+        code = position(torch.zeros(2, 16, 4, 6))
+    rows = torch.sin(2 * torch.pi * torch.arange(1, 5) / 4)
+    columns = torch.sin(2 * torch.pi * torch.arange(1, 7) / 6)
+    torch.testing.assert_close(code[0, 0], rows[:, None].expand(4, 6), atol=1e-6, rtol=0)
+    torch.testing.assert_close(code[0, 1], columns.expand(4, 6), atol=1e-6, rtol=0)
+
+
+def test_starts_as_strided_convolutions():
+    """The layer scale silences every residual branch at the start."""
+    encoder = encoders.build("lite_mono_tiny").eval()
+    with torch.no_grad():
+        image = torch.rand(1, 3, 32, 32)
+        start = encoder(image)
+        for name, parameter in encoder.named_parameters():
+            if "scale" in name:
+                parameter.zero_()
+        silent = encoder(image)
+        for name, parameter in encoder.named_parameters():
+            if "scale" in name:
+                parameter.fill_(1)
+        loud = encoder(image)
+    for a, b, c in zip(start, silent, loud, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-4)
+        assert (c - b).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("kwargs", [{"dims": (8, 8)}, {"depths": (4, 4, 1)}])
+def test_wrong_stages(kwargs):
+    with pytest.raises(ConfigError, match="Lite-Mono has three stages of at least two blocks"):
+        encoders.build("lite_mono", **kwargs)
+
+
+def test_wrong_drop_path():
+    with pytest.raises(ConfigError, match=r"drop_path is 1\.5"):
+        encoders.build("lite_mono", drop_path=1.5)
+
+
+def test_decoder_needs_a_level():
+    with pytest.raises(ConfigError, match="deepest stride is 2; decoder 'lite_mono' needs at least 4"):
+        decoders.build("lite_mono", features=(FeatureSpec(8, 2),))
