@@ -81,7 +81,9 @@ def test_prediction_needs_no_truth():
 def test_summary_says_what_is_used_and_left_out():
     data = module()
     data.setup("fit")
-    assert data.summary("train").startswith("train: 12 samples from 2 drives, sha256 ")
+    assert data.summary("train").startswith(
+        "train (2 of 2 drives): 12 frames used; left out: 4 without neighbour; sha256 "
+    )
     assert "a l: 6 frames used; left out: 2 without neighbour" in data.summary("train")
     assert len(data.fingerprints()["train"]) == 64
 
@@ -104,3 +106,20 @@ def test_a_loader_before_setup_is_an_error():
 def test_impossible_settings_are_refused(option):
     with pytest.raises(ConfigError, match=next(iter(option))):
         module(**option)
+
+
+class Broken(NumberDrive):
+    def image(self, index):
+        if index == 3:
+            raise DataError("frame 3 is broken")
+        return super().image(index)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_bad_file_is_one_sentence_even_from_a_loader_process(workers):
+    data = module(workers=workers)
+    data.select = lambda split: [Selection(Broken(), range(8))]
+    data.setup("fit")
+    for loader in (data.train_dataloader(), data.val_dataloader()):
+        with pytest.raises(DataError, match=r"^frame 3 is broken$"):
+            list(loader)

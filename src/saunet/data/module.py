@@ -15,7 +15,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch.utils.data import DataLoader
 
 from saunet.checks import ConfigError, DataError, in_range, positive
-from saunet.data.sampling import EvalBatches, ResumableLoader, TrainBatches, share
+from saunet.data.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, share
 from saunet.data.transforms import Augment, Prepare
 from saunet.data.windows import Selection, Usage, WindowDataset, check_offsets, collate, find_windows
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
@@ -45,6 +45,8 @@ class DepthDataModule(LightningDataModule):
 
     protocol: str = "eigen_camera_z"
     """Name of the evaluation protocol that fits this data set's ground truth."""
+    ground_truth: str = "camera_z"
+    """What kind of depth evaluation batches carry, as the protocols call it."""
 
     def __init__(
         self,
@@ -93,9 +95,15 @@ class DepthDataModule(LightningDataModule):
     def summary(self, split: str) -> str:
         """Return what a split uses and leaves out, readable, with the fingerprint of its frames."""
         dataset, usage = self.datasets[split], self.usage[split]
-        lines = [str(drive) for drive in usage if drive.left_out or len(usage) <= 8]
-        total = f"{split}: {len(dataset)} samples from {len(usage)} drives, sha256 {dataset.fingerprint()[:16]}"
-        return "\n  ".join([total, *lines])
+        reasons: dict[str, int] = {}
+        for drive in usage:
+            for reason, count in drive.left_out.items():
+                reasons[reason] = reasons.get(reason, 0) + count
+        sources = sum(1 for drive in usage if drive.used)
+        total = Usage(f"{split} ({sources} of {len(usage)} drives)", len(dataset), reasons)
+        lines = [str(drive) for drive in usage if len(usage) <= 8 or not drive.used]
+        more = [f"... and {len(lines) - 12} drives more"] if len(lines) > 12 else []
+        return "\n  ".join([f"{total}; sha256 {dataset.fingerprint()[:16]}", *lines[:12], *more])
 
     def fingerprints(self) -> dict[str, str]:
         """Return the SHA-256 of the sample names of each split that is set up."""
@@ -149,7 +157,7 @@ class DepthDataModule(LightningDataModule):
     def _eval_loader(self, split: str) -> DataLoader[Any]:
         rank, world_size = self._place()
         sampler = EvalBatches(self._set_up(split), share(self.batch_size, world_size), rank, world_size)
-        return DataLoader(self.datasets[split], sampler=sampler, **self._loading())
+        return Loader(self.datasets[split], sampler=sampler, **self._loading())
 
     def _set_up(self, split: str) -> WindowDataset:
         if split not in self.datasets:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
-from saunet.checks import ConfigError
+from saunet.checks import ConfigError, SaunetError
 from saunet.data.windows import Item
 
 
@@ -109,7 +109,19 @@ def share(batch_size: int, world_size: int) -> int:
     return batch_size // world_size
 
 
-class ResumableLoader(DataLoader[Any]):
+class Loader(DataLoader[Any]):
+    """A loader whose processes report a bad file in one sentence, not with their traceback."""
+
+    def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
+        try:
+            yield from super().__iter__()
+        except SaunetError as error:
+            # torch prefixes what a loader process raised with its traceback, of which the last line is the error
+            name = f"{type(error).__module__}.{type(error).__qualname__}: "
+            raise type(error)(str(error).rpartition(name)[2].strip()) from error
+
+
+class ResumableLoader(Loader):
     """A loader over `TrainBatches` that can be saved in the middle of an epoch and go on with the next batch."""
 
     _done = 0

@@ -52,6 +52,8 @@ class Usage:
 
     def __str__(self) -> str:
         reasons = ", ".join(f"{count} {reason}" for reason, count in self.left_out.items() if count)
+        if not self.used and not reasons:
+            return f"{self.drive}: no frames"
         return f"{self.drive}: {self.used} frames used" + (f"; left out: {reasons}" if reasons else "")
 
 

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kitti_tree import CALIBRATION, SCANNER
+
+from saunet.checks import DataError
+from saunet.data.calibration import read_calibration
+
+
+def write(folder, cameras=CALIBRATION, scanner=SCANNER):
+    (folder / "calib_cam_to_cam.txt").write_text(cameras)
+    if scanner is not None:
+        (folder / "calib_velo_to_cam.txt").write_text(scanner)
+    return folder
+
+
+def test_each_camera_has_its_own_intrinsics(tmp_path):
+    calibration = read_calibration(write(tmp_path))
+    assert calibration.intrinsics(2).tolist() == [[50, 0, 30], [0, 50, 10], [0, 0, 1]]
+    assert calibration.intrinsics(3)[0].tolist() == [55, 0, 31]
+    assert calibration.sizes[2] == (20, 60)
+    assert calibration.T_cam_velo[:3, :3].tolist() == [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+
+
+def test_real_intrinsics(kitti_mini):
+    calibration = read_calibration(kitti_mini / "raw" / "2011_09_26")
+    assert calibration.intrinsics(2) == pytest.approx(
+        np.array([[721.5377, 0, 609.5593], [0, 721.5377, 172.854], [0, 0, 1]])
+    )
+    assert calibration.sizes == dict.fromkeys(range(4), (375, 1242))
+    assert calibration.T_cam_velo[:3, 3] == pytest.approx([-4.069766e-03, -7.631618e-02, -2.717806e-01])
+
+
+def test_no_scanner_calibration_is_no_error(tmp_path):
+    assert read_calibration(write(tmp_path, scanner=None)).T_cam_velo is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("50 0 30 3 0 50", "50 0 30 3 0", r"calib_cam_to_cam.txt, line 7 \(P_rect_02\): expected 12 numbers, got 11"),
+        ("50 0 30 3 0 50", "50 0 x 3 0 50", r"line 7 \(P_rect_02\): expected 12 numbers, got 'x' among them"),
+        ("50 0 30 3 0 50", "50 0 nan 3 0 50", r"line 7 \(P_rect_02\): expected 12 finite numbers"),
+        ("corner_dist:", "corner_dist", r"line 2: expected 'key: numbers', got 'corner_dist 9.95"),
+        ("R_rect_00:", "R_rect_xx:", r"lacks R_rect_00"),
+        ("P_rect", "Q_rect", r"lacks P_rect_00 to P_rect_03"),
+    ],
+)
+def test_malformed_lines_are_named(tmp_path, old, new, message):
+    with pytest.raises(DataError, match=message):
+        read_calibration(write(tmp_path, CALIBRATION.replace(old, new)))
+
+
+def test_a_scanner_without_its_position_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"calib_velo_to_cam.txt lacks T; expected a line 'T: ' with 3 numbers"):
+        read_calibration(write(tmp_path, scanner="R: 0 -1 0 0 0 -1 1 0 0"))
+
+
+def test_intrinsics_that_cannot_be_right_are_refused(tmp_path):
+    calibration = read_calibration(write(tmp_path, CALIBRATION.replace("50 0 30 3", "50 0 61 3")))
+    with pytest.raises(DataError, match=r"P_rect_02 has focal lengths 50, 50 and centre 61, 10 for an image of 20x60"):
+        calibration.intrinsics(2)
+    with pytest.raises(DataError, match=r"has no P_rect_01; cameras in it: 00, 02, 03"):
+        calibration.intrinsics(1)
+
+
+def test_a_missing_calibration_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"no calibration at .*calib_cam_to_cam.txt"):
+        read_calibration(tmp_path)

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+from kitti_tree import DATE, make_drive, name
+
+from saunet.checks import ConfigError, DataError
+from saunet.data.kitti import KittiRaw
+from saunet.data.sequences import Drive
+
+
+@pytest.mark.parametrize("where", ["..", ".", DATE, f"{DATE}/{DATE}_drive_0001_sync"])
+def test_layout_is_found_at_above_and_below_the_date(tmp_path, where):
+    make_drive(tmp_path / "raw", 1)
+    raw = KittiRaw(tmp_path / "raw" / where)
+    assert list(raw.drives) == [name(1)]
+    assert len(raw.drive(name(1)).indices) == 6
+
+
+def test_a_relative_root_and_foreign_folders(tmp_path, monkeypatch):
+    make_drive(tmp_path, 1)
+    (tmp_path / DATE / f"{DATE}_drive_0002_extract").mkdir()
+    (tmp_path / "notes").mkdir()
+    monkeypatch.chdir(tmp_path / DATE)
+    assert list(KittiRaw(".").drives) == [name(1)]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_drive(tmp_path, suffix):
+    make_drive(tmp_path, 1, frames=[0, 1, 3], suffix=suffix)
+    drive = KittiRaw(tmp_path).drive(name(1), "right")
+    assert isinstance(drive, Drive)
+    assert drive.name == f"{name(1)} r"
+    assert list(drive.indices) == [0, 1, 3]
+    assert drive.image(3).shape == (20, 60, 3)
+    assert np.abs(drive.image(3).astype(int) - [3, 3, 0]).max() <= 2  # red is the frame, green the camera
+    assert drive.intrinsics(0)[0].tolist() == [55, 0, 31]
+    assert drive.pose(0) is None
+    assert drive.depth(0).shape == (20, 60)
+    assert pickle.loads(pickle.dumps(drive)).indices == drive.indices
+
+
+def test_png_comes_before_jpeg(tmp_path):
+    make_drive(tmp_path, 1, frames=[0])
+    folder = tmp_path / name(1) / "image_02" / "data"
+    (folder / "0000000000.jpg").write_bytes(b"")
+    assert KittiRaw(tmp_path).drive(name(1)).path(0).suffix == ".png"
+
+
+def test_depth_kinds(tmp_path):
+    make_drive(tmp_path, 1)
+    raw = KittiRaw(tmp_path)
+    assert sorted(set(raw.drive(name(1)).depth(0).ravel())) == [0, 10, 20]
+    assert raw.drive(name(1), depth_kind="improved").depth(0) is None
+    truth = tmp_path / name(1) / "proj_depth" / "groundtruth" / "image_02"
+    truth.mkdir(parents=True)
+    cv2.imwrite(str(truth / "0000000000.png"), np.full((20, 60), 512, np.uint16))
+    assert (raw.drive(name(1), depth_kind="improved").depth(0) == 2).all()
+
+
+def test_missing_scans_and_scanner_are_no_depth(tmp_path):
+    make_drive(tmp_path, 1, scans=False)
+    make_drive(tmp_path, 2)
+    raw = KittiRaw(tmp_path)
+    assert raw.drive(name(1)).depth(0) is None
+    assert raw.drive(name(2)).has_depth(0)
+    (tmp_path / DATE / "calib_velo_to_cam.txt").unlink()
+    assert KittiRaw(tmp_path).drive(name(2)).depth(0) is None
+
+
+def test_images_made_smaller_scale_the_intrinsics_but_not_the_truth(tmp_path):
+    make_drive(tmp_path, 1, size=(10, 30))
+    drive = KittiRaw(tmp_path).drive(name(1))
+    assert drive.intrinsics(0)[0].tolist() == pytest.approx([25, 0, 30.5 / 2 - 0.5])
+    assert drive.depth(0).shape == (20, 60)
+
+
+def test_images_of_another_shape_are_refused(tmp_path):
+    make_drive(tmp_path, 1, size=(20, 50))
+    with pytest.raises(DataError, match=r"0000000000.png has 20x50 .* but .*calib_cam_to_cam.txt is for 20x60"):
+        KittiRaw(tmp_path).drive(name(1)).intrinsics(0)
+
+
+def test_an_absent_drive_has_no_frames(tmp_path):
+    make_drive(tmp_path, 1)
+    raw = KittiRaw(tmp_path)
+    assert list(raw.drive(name(7)).indices) == []
+    assert list(raw.drive("2011_10_03/2011_10_03_drive_0001_sync").indices) == []
+
+
+def test_missing_root_and_no_drives_are_named(tmp_path):
+    with pytest.raises(DataError, match=r"no data root at .*gone; set data.root"):
+        KittiRaw(tmp_path / "gone")
+    with pytest.raises(DataError, match=r"no KITTI drives found at .*expected folders such as"):
+        KittiRaw(tmp_path)
+
+
+def test_unknown_words_are_refused(tmp_path):
+    make_drive(tmp_path, 1)
+    with pytest.raises(ConfigError, match="camera is 'middle'"):
+        KittiRaw(tmp_path).drive(name(1), "middle")
