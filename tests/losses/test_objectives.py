@@ -232,3 +232,19 @@ def test_compiles_as_one_graph(name: str, options: dict[str, Any]) -> None:
     code = COMPILE.replace("NAME", repr(name)).replace("OPTIONS", repr(options))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@every_objective
+def test_the_host_never_waits_for_a_gpu(name: str, make_inputs: Make) -> None:
+    inputs, objective = make_inputs(), saunet.build("objective", name).cuda()
+    for key, value in inputs.batch.items():
+        inputs.batch[key] = value.cuda() if isinstance(value, torch.Tensor) else value
+    leaves = [leaf.detach().cuda().requires_grad_() for leaf in inputs.leaves]
+    objective(*inputs.rebuilt(*leaves)).total.backward()  # once before, so that nothing is left to initialise
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        objective(*inputs.rebuilt(*leaves)).total.backward()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")

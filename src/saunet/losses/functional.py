@@ -9,6 +9,7 @@ from torch import Tensor
 
 from saunet.checks import one_of
 from saunet.geometry.precision import full_precision
+from saunet.losses.box import box_mean
 
 _C1, _C2 = 0.01**2, 0.03**2
 
@@ -26,13 +27,12 @@ def ssim_loss(prediction: Float[Tensor, "*b c h w"], target: Float[Tensor, "*#b 
     Returns:
         One map a channel.
     """
-    mean_p, mean_t = _box(prediction), _box(target)
-    var_p = _box(prediction.square()) - mean_p.square()
-    var_t = _box(target.square()) - mean_t.square()
-    covariance = _box(prediction * target) - mean_p * mean_t
-    similarity = (2 * mean_p * mean_t + _C1) * (2 * covariance + _C2)
-    largest = (mean_p.square() + mean_t.square() + _C1) * (var_p + var_t + _C2)
-    return ((1 - similarity / largest) / 2).clamp(0, 1)
+    mean_p, mean_t = box_mean(prediction), box_mean(target)
+    means, squares = mean_p * mean_t, mean_p * mean_p + mean_t * mean_t
+    covariance = box_mean(prediction * target) - means
+    variances = box_mean(prediction * prediction + target * target) - squares  # of both, which is all that is needed
+    similarity = (2 * means + _C1) * (2 * covariance + _C2) / ((squares + _C1) * (variances + _C2))
+    return (0.5 - 0.5 * similarity).clamp(0, 1)
 
 
 @full_precision
@@ -231,9 +231,3 @@ def pool_known(depth: Float[Tensor, "b 1 _ _"], height: int, width: int) -> Floa
         return filled
     share = F.adaptive_avg_pool2d(known.to(filled), (height, width))
     return F.adaptive_avg_pool2d(filled, (height, width)) / torch.where(share > 0, share, 1.0)
-
-
-def _box(x: Tensor) -> Tensor:
-    """3x3 mean with reflection padding over the last two dimensions."""
-    flat = F.pad(x.flatten(0, -4), (1, 1, 1, 1), mode="reflect")
-    return F.avg_pool2d(flat, 3, stride=1).reshape(x.shape)
