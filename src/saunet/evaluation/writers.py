@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
+from rich.box import HORIZONTALS
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -30,21 +31,20 @@ _SUMMARY_FIELDS = ("predictor", "protocol", *ERROR_NAMES, "scale", "scale_std", 
 
 
 def print_table(result: EvaluationResult, console: Console | None = None) -> None:
-    """Print one table a protocol, the best of each column in bold."""
+    """Print one table a protocol, the best of each column in bold, then where the errors are, if that was asked for."""
     console = console or Console()
     for protocol in result.protocols:
-        console.print(protocol_table(protocol, [s for s in result.summaries() if s.protocol == protocol.name]))
+        console.print(protocol_table(protocol, [s for s in result.summaries() if s.protocol == protocol.name]), "")
     for protocol in result.protocols:
-        if rows := [row for row in result.buckets if row.protocol == protocol.name]:
-            console.print(bucket_table(protocol, rows))
+        for predictor in result.predictors:
+            rows = [r for r in result.buckets if (r.protocol, r.predictor) == (protocol.name, predictor)]
+            if rows:
+                console.print(bucket_table(rows), "")
 
 
 def protocol_table(protocol: Protocol, summaries: Sequence[Summary]) -> Table:
     """Return the table of one protocol: errors to three decimals, the images behind them and the scale found."""
-    table = Table(title=f"{protocol.name}: {protocol.summary}", title_justify="left")
-    table.add_column("predictor")
-    for heading in (*HEADINGS, "scale"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = _error_table(f"[bold]{protocol.name}[/bold]: {protocol.summary}", "predictor", "scale")
     best = _best(summaries)
     for summary in summaries:
         cells = [
@@ -57,19 +57,26 @@ def protocol_table(protocol: Protocol, summaries: Sequence[Summary]) -> Table:
     return table
 
 
-def bucket_table(protocol: Protocol, rows: Sequence[BucketRow]) -> Table:
-    """Return the table of errors by distance, region and edges under one protocol."""
-    table = Table(
-        title=f"{protocol.name}: where the errors are", title_justify="left", caption="over pixels, not images"
-    )
-    for heading in ("predictor", "where"):
-        table.add_column(heading)
-    for heading in (*HEADINGS, "pixels"):
-        table.add_column(heading, justify="right", no_wrap=True)
+def bucket_table(rows: Sequence[BucketRow]) -> Table:
+    """Return the table of one predictor's errors by distance, region and edges under one protocol."""
+    title = f"[bold]{rows[0].protocol}[/bold]: where the errors of '{escape(rows[0].predictor)}' are"
+    table = _error_table(title, "where", "pixels")
     for row, following in zip(rows, (*rows[1:], None), strict=True):
-        ends = following is None or (following.predictor, following.group) != (row.predictor, row.group)
-        cells = [f"{value:.3f}" for value in row.errors]
-        table.add_row(escape(row.predictor), row.bucket, *cells, f"{row.pixels:,}", end_section=ends)
+        ends = following is not None and following.group != row.group
+        table.add_row(row.bucket, *(f"{value:.3f}" for value in row.errors), f"{row.pixels:,}", end_section=ends)
+    table.caption = "over pixels, not images"
+    return table
+
+
+def _error_table(title: str, first: str, last: str) -> Table:
+    """An empty table that fits a terminal of 80 columns: headings on two lines, no vertical rules."""
+    table = Table(title=title, box=HORIZONTALS, padding=0, show_edge=False, title_justify="left", title_style="")
+    table.caption_justify = "left"
+    table.add_column(first, min_width=9)
+    for heading in HEADINGS:
+        name, arrow = heading.rsplit(" ", 1)
+        table.add_column(f"{name.replace(' ', chr(10))} {arrow}", justify="right", no_wrap=True, min_width=6)
+    table.add_column(last, justify="right", no_wrap=True)
     return table
 
 
