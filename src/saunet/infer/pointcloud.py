@@ -9,12 +9,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from saunet.atomic import write_bytes
 from saunet.checks import ConfigError, in_range, positive
-from saunet.geometry.camera import scale_intrinsics
 from saunet.infer.prediction import Prediction
 
 
@@ -78,6 +76,10 @@ class Camera:
 
     def resized(self, height: int, width: int) -> Camera:
         """Return the camera of the same picture at another size."""
+        import torch  # here, so that prediction from an exported file starts without torch
+
+        from saunet.geometry.camera import scale_intrinsics
+
         K = scale_intrinsics(torch.from_numpy(self.K.astype(np.float64)), width / self.width, height / self.height)
         return Camera(K.numpy(), height, width)
 

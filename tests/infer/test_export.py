@@ -1,0 +1,210 @@
+"""Exported files compute what the network computes, carry their record, and predict without torch."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from saunet.checkpoint import ModelRecord, Scale, atomic_save, build_networks
+from saunet.checks import CheckpointError, ConfigError
+from saunet.infer import export
+from saunet.infer.export import export_model, export_onnx, export_program
+from saunet.infer.images import write_image
+from saunet.infer.onnx import OnnxPredictor
+from saunet.infer.parity import Parity
+from saunet.infer.predictor import Predictor
+from saunet.models.depth import DepthNet
+from saunet.registry import REGISTRIES, decoders, encoders
+
+Picture = NDArray[np.uint8]
+onnx = pytest.importorskip("onnx", reason="ONNX export needs saunet[export]")
+pytest.importorskip("onnxscript", reason="ONNX export needs saunet[export]")
+pytest.importorskip("onnxruntime", reason="ONNX export needs saunet[export]")
+
+
+def node(kind: str, name: str) -> dict[str, Any]:
+    plain = dataclasses.asdict(REGISTRIES[kind].node(name)())
+    return {key: value for key, value in plain.items() if value != "???"}
+
+
+@pytest.fixture(scope="module")
+def record() -> ModelRecord:
+    return ModelRecord(
+        {**node("encoder", "resnet18"), "blocks": [1, 1, 1, 1]}, {**node("decoder", "unet"), "channels": [8] * 5},
+        None, 0.1, 100.0, 32, 64,
+        scale=Scale(12.5, "camera height 1.65 m"), data={"name": "synthetic"},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def checkpoint(record: ModelRecord, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run") / "last.ckpt"
+    depth, _ = build_networks(record)
+    state = {f"depth.{name}": value for name, value in depth.state_dict().items()}
+    atomic_save({"state_dict": state, "saunet": record.to_plain()}, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def exported(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Parity]]:
+    folder = tmp_path_factory.mktemp("export")
+    y, x = np.mgrid[0:50, 0:100]
+    write_image(folder / "road.png", np.stack([x * 2, y * 5, x + y], axis=-1).astype(np.uint8))
+    return folder / "model", export_model(checkpoint, folder / "model", images=[folder / "road.png"])
+
+
+def test_folder_has_files_record_report_and_card(exported: tuple[Path, list[Parity]], record: ModelRecord) -> None:
+    folder, reports = exported
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "README.md", "model.onnx", "model.pt2", "record.json", "report.json",
+    ]  # fmt: skip
+    assert [report.file for report in reports] == ["model.onnx", "model.pt2"]
+    for report in reports:
+        assert report.difference < 1e-5
+        assert report.images == 3
+        assert report.eager_ms > 0
+        assert report.exported_ms > 0
+    assert ModelRecord.from_plain(json.loads((folder / "record.json").read_text())) == record
+    assert json.loads((folder / "report.json").read_text()) == [dataclasses.asdict(report) for report in reports]
+    card = (folder / "README.md").read_text()
+    for text in (
+        "ResNet(",
+        "64 x 32",
+        "Network depth x 12.5 is metres",
+        "camera height 1.65 m",
+        "synthetic",
+        "model.onnx",
+    ):
+        assert text in card, text
+
+
+def test_onnx_predicts_what_the_checkpoint_predicts(
+    exported: tuple[Path, list[Parity]], checkpoint: Path, picture: Picture
+) -> None:
+    onnx_predictor = OnnxPredictor(exported[0] / "model.onnx")
+    images = [picture, picture[:, ::-1].copy(), picture[:30]]
+    expected = Predictor.from_checkpoint(checkpoint).predict_batch(images)
+    for got, wanted in zip(onnx_predictor.predict_batch(images), expected, strict=True):
+        assert np.allclose(got.disparity, wanted.disparity, atol=1e-5)
+        assert got.unit == wanted.unit == "metres (scale from camera height 1.65 m)"
+    assert len(onnx_predictor.fingerprint) == 16
+
+
+def test_program_runs_without_saunet(exported: tuple[Path, list[Parity]], checkpoint: Path) -> None:
+    image = torch.rand(3, 3, 32, 64)
+    program = torch.export.load(exported[0] / "model.pt2")
+    network = Predictor.from_checkpoint(checkpoint).network
+    assert torch.allclose(program.module()(image), network(image).disparity[0], atol=1e-5)
+
+
+def test_predicting_from_onnx_does_not_import_torch(exported: tuple[Path, list[Parity]], tmp_path: Path) -> None:
+    write_image(tmp_path / "in" / "x.png", np.zeros((20, 30, 3), np.uint8))
+    code = (
+        "import sys\n"
+        "from saunet.infer.onnx import OnnxPredictor\n"
+        "from saunet.infer.files import predict_files\n"
+        "predict_files(OnnxPredictor(sys.argv[1]), sys.argv[2], sys.argv[3])\n"
+        "print([name for name in ('torch', 'lightning', 'onnx') if name in sys.modules])"
+    )
+    arguments = [str(exported[0] / "model.onnx"), str(tmp_path / "in"), str(tmp_path / "out")]
+    result = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+    assert (tmp_path / "out" / "x_disparity.png").exists()
+
+
+def test_fixed_batch_is_filled_up(network: DepthNet, record: ModelRecord, tmp_path: Path, picture: Picture) -> None:
+    export_onnx(network, record, tmp_path / "x.onnx", dynamic_batch=False)
+    images = [picture, picture[:20], picture[:, ::-1].copy()]
+    expected = Predictor(network, 32, 64, scale=record.scale).predict_batch(images)
+    for got, wanted in zip(OnnxPredictor(tmp_path / "x.onnx").predict_batch(images), expected, strict=True):
+        assert np.allclose(got.disparity, wanted.disparity, atol=1e-5)
+
+
+def test_a_file_that_differs_is_not_written(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(export._RUNNERS, "program", lambda path: lambda image: image[:, :1] * 0)
+    with pytest.raises(CheckpointError, match=r"model\.pt2 differs from the network by .* so it is not written"):
+        export_model(checkpoint, tmp_path / "out", ["program"])
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_network_that_fixes_its_batch_size(network: DepthNet, record: ModelRecord, tmp_path: Path) -> None:
+    class FixedBatch(torch.nn.Module):
+        def forward(self, image: Tensor) -> tuple[Tensor, ...]:
+            return (image.view(int(image.shape[0]), 3, 32, 64)[:, :, ::2, ::2],)
+
+    network.encoder = FixedBatch()
+    with pytest.raises(ConfigError, match="fixes its batch size when it is exported; export with dynamic_batch=false"):
+        export_program(network, record, tmp_path / "x.pt2")
+    export_program(network, record, tmp_path / "x.pt2", dynamic_batch=False)
+    assert (tmp_path / "x.pt2").stat().st_size > 0
+
+
+def test_refused(
+    network: DepthNet, record: ModelRecord, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ConfigError, match="formats is 'onx'; did you mean 'onnx'"):
+        export_model(checkpoint, tmp_path, ["onx"])
+    with pytest.raises(CheckpointError, match="no checkpoint at"):
+        export_model(tmp_path / "absent.ckpt", tmp_path)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="needs the package onnx; run: pip install"):
+        export_onnx(network, record, tmp_path / "x.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+class TestOnnxFile:
+    def test_missing_broken_foreign(self, tmp_path: Path) -> None:
+        with pytest.raises(CheckpointError, match="no ONNX model at"):
+            OnnxPredictor(tmp_path / "x.onnx")
+        (tmp_path / "x.onnx").write_bytes(b"nothing")
+        with pytest.raises(CheckpointError, match="not an ONNX model that onnxruntime can read"):
+            OnnxPredictor(tmp_path / "x.onnx")
+        value = onnx.helper.make_tensor_value_info
+        graph = onnx.helper.make_graph(
+            [onnx.helper.make_node("Identity", ["image"], ["disparity"])], "g",
+            [value("image", 1, [1, 3, 8, 8])], [value("disparity", 1, [1, 3, 8, 8])],
+        )  # fmt: skip
+        model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9)
+        onnx.save(model, tmp_path / "y.onnx")
+        with pytest.raises(CheckpointError, match="not one that saunet exported"):
+            OnnxPredictor(tmp_path / "y.onnx")
+
+    def test_truncated(self, exported: tuple[Path, list[Parity]], tmp_path: Path) -> None:
+        data = (exported[0] / "model.onnx").read_bytes()
+        (tmp_path / "x.onnx").write_bytes(data[: len(data) // 2])
+        with pytest.raises(CheckpointError, match="or is damaged"):
+            OnnxPredictor(tmp_path / "x.onnx")
+
+    def test_device(self, exported: tuple[Path, list[Parity]]) -> None:
+        with pytest.raises(ConfigError, match=r"device 'tpu' is not supported by this onnxruntime; available: .*cpu"):
+            OnnxPredictor(exported[0] / "model.onnx", device="tpu")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("decoder", decoders.names())
+@pytest.mark.parametrize("encoder", encoders.names())
+def test_every_pair_exports(encoder: str, decoder: str, record: ModelRecord, tmp_path: Path) -> None:
+    network = DepthNet(encoders.build(encoder), decoders.partial(decoder)).eval()
+    height, width = 2 * network.size_divisor, 4 * network.size_divisor
+    own = dataclasses.replace(
+        record, encoder=node("encoder", encoder), decoder=node("decoder", decoder), height=height, width=width
+    )
+    export_onnx(network, own, tmp_path / "x.onnx", dynamic_batch=False)
+    export_program(network, own, tmp_path / "x.pt2", dynamic_batch=False)
+    image = torch.rand(1, 3, height, width)
+    with torch.no_grad():
+        expected = network(image).disparity[0]
+        program = torch.export.load(tmp_path / "x.pt2").module()(image)
+    got = OnnxPredictor(tmp_path / "x.onnx").disparity(image.numpy())
+    assert np.abs(got - expected[:, 0].numpy()).max() < 1e-4 * 10
+    assert (program - expected).abs().max() < 1e-4 * 10
