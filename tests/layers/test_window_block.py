@@ -8,7 +8,7 @@ import torch.nn.functional as F
 
 from saunet.checks import ConfigError
 from saunet.layers.window_block import DropPath, Mlp, PatchMerging, SwinBlock, SwinStage
-from saunet.layers.window_stream import rows_per_piece, stream
+from saunet.layers.window_stream import rows_per_piece, streams
 
 
 def test_block_is_eqs_1_to_4() -> None:
@@ -66,4 +66,13 @@ def test_pieces_change_nothing() -> None:
     mlp = Mlp(6, 4000).double()
     x = torch.randn(3 * rows_per_piece(4000) + 5, 6, dtype=torch.double)
     with torch.no_grad():
-        torch.testing.assert_close(stream(mlp._rows, x, 4000), mlp._rows(x))
+        assert streams(x, mlp.fc1, mlp.fc2)
+        torch.testing.assert_close(mlp(x), mlp.fc2(F.gelu(mlp.fc1(x))))
+
+
+def test_hooks_see_their_layer_once() -> None:
+    mlp, seen = Mlp(6, 4000), []
+    mlp.fc1.register_forward_hook(lambda *call: seen.append(call[2].shape))
+    with torch.no_grad():
+        mlp(torch.randn(2 * rows_per_piece(4000), 6))
+    assert seen == [(2 * rows_per_piece(4000), 4000)]

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from saunet import checks
 from saunet.layers.window_plan import WindowGroup, relative_position_index, window_groups, window_order
-from saunet.layers.window_stream import rows_per_piece, streams
+from saunet.layers.window_stream import linear_into, rows_per_piece, streams
 
 
 class _Reorder(torch.autograd.Function):
@@ -71,7 +71,8 @@ class WindowAttention(nn.Module):
         order, inverse = window_order(batch, rows, columns, self.window, self.shift, x.device)
         groups = window_groups(rows, columns, self.window, self.shift)
         tokens = reorder(x.reshape(-1, self.dim), order, inverse)
-        attended = self._stream(tokens, groups, batch) if streams(tokens) else self._whole(tokens, groups, batch)
+        attend = self._stream if streams(tokens, self.qkv, self.proj) else self._whole
+        attended = attend(tokens, groups, batch)
         out = reorder(attended, inverse, order).view(batch, rows, columns, self.dim)
         return out if (rows, columns) == (height, width) else out[:, :height, :width]
 
@@ -94,19 +95,19 @@ class WindowAttention(nn.Module):
 
     def _stream(self, tokens: Float[Tensor, "n c"], groups: list[WindowGroup], batch: int) -> Float[Tensor, "n c"]:
         """Attend a few windows at a time: intermediate results stay in a CPU's cache."""
-        out, start = torch.empty_like(tokens), 0
+        out, start, size = torch.empty_like(tokens), 0, rows_per_piece(3 * self.dim)
+        buffer = tokens.new_empty(min(max(size, self.window**2), len(tokens)), 3 * self.dim)
         for group in groups:
             stop = start + batch * group.windows * group.area
-            windows = max(1, rows_per_piece(3 * self.dim) // group.area)
-            bias: Tensor | None = None
+            rows = max(1, size // group.area) * group.area
+            bias = self.bias(group, tokens.dtype)
             for piece, target in zip(
-                torch.split(tokens[start:stop], windows * group.area),
-                torch.split(out[start:stop], windows * group.area),
+                torch.split(tokens[start:stop], rows),
+                torch.split(out[start:stop], rows),
                 strict=True,
             ):
-                qkv = self.qkv(piece)
-                bias = self.bias(group, qkv.dtype) if bias is None else bias
-                target.copy_(self.proj(self._attend(qkv, group, bias)))
+                qkv = linear_into(self.qkv, piece, buffer[: len(piece)])
+                linear_into(self.proj, self._attend(qkv, group, bias), target)
             start = stop
         return out
 

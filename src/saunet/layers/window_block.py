@@ -12,7 +12,7 @@ from torch.utils.checkpoint import checkpoint
 
 from saunet import checks
 from saunet.layers.window_attention import WindowAttention
-from saunet.layers.window_stream import stream
+from saunet.layers.window_stream import linear_into, rows_per_piece, streams
 
 
 class DropPath(nn.Module):
@@ -55,10 +55,16 @@ class Mlp(nn.Module):
 
     def forward(self, x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
         """Map each token on its own."""
-        return stream(self._rows, x, self.fc1.out_features)
-
-    def _rows(self, x: Tensor) -> Tensor:
-        return self.fc2(F.gelu(self.fc1(x)))  # type: ignore[no-any-return]
+        if not streams(x, self.fc1, self.fc2):
+            return self.fc2(F.gelu(self.fc1(x)))  # type: ignore[no-any-return]
+        rows = x.reshape(-1, x.shape[-1])
+        out = torch.empty_like(rows)
+        size = rows_per_piece(self.fc1.out_features)
+        buffer = rows.new_empty(min(size, len(rows)), self.fc1.out_features)
+        for piece, target in zip(torch.split(rows, size), torch.split(out, size), strict=True):
+            hidden = linear_into(self.fc1, piece, buffer[: len(piece)])
+            linear_into(self.fc2, torch.ops.aten.gelu_(hidden), target)
+        return out.view(x.shape)
 
 
 class SwinBlock(nn.Module):
