@@ -123,3 +123,12 @@ def test_a_bad_file_is_one_sentence_even_from_a_loader_process(workers):
     for loader in (data.train_dataloader(), data.val_dataloader()):
         with pytest.raises(DataError, match=r"^frame 3 is broken$"):
             list(loader)
+
+
+def test_nothing_held_out_means_no_validation():
+    data = module()
+    data.select = lambda split: [] if split == "val" else [Selection(NumberDrive(), range(8))]
+    data.setup("fit")
+    assert data.val_dataloader() == []
+    assert len(list(data.train_dataloader())) == 1
+    assert set(data.fingerprints()) == {"train"}

@@ -69,6 +69,11 @@ def test_few_drives_hold_out_their_tails_with_a_gap():
     assert {frame.side for frame in val} == {"l", "r"}
 
 
+def test_no_share_holds_nothing_out():
+    everything = frames(2, 5)
+    assert splits.hold_out(everything, 0.0, gap=2, seed=0) == (everything, [])
+
+
 def test_many_drives_hold_out_whole_drives():
     train, val = splits.hold_out(frames(20, 10), 0.1, gap=2, seed=0)
     assert len(val) == 20

@@ -53,7 +53,7 @@ class KittiDrive:
         self.depth_kind = one_of("depth kind", depth_kind, DEPTH_KINDS)
         self.folder, self.calibration = folder, calibration
         self.name = f"{folder.parent.name}/{folder.name} {side}"
-        self._files = _frames(folder / f"image_{self.number:02d}" / "data")
+        self._files = frame_files(folder / f"image_{self.number:02d}" / "data")
         self._indices = sorted(self._files)
 
     @property
@@ -203,7 +203,7 @@ def _folders(folder: Path) -> list[str]:
         return []
 
 
-def _frames(folder: Path) -> dict[int, str]:
+def frame_files(folder: Path) -> dict[int, str]:
     """Return frame number -> file name; PNG before JPEG where a frame has both."""
     try:
         names = sorted(os.listdir(folder), reverse=True)

@@ -43,6 +43,8 @@ class DepthDataModule(LightningDataModule):
         ConfigError: if a parameter is out of range.
     """
 
+    neighbours: Sequence[str] = ("train", "val")
+    """Splits whose samples carry source frames."""
     protocol: str = "eigen_camera_z"
     """Name of the evaluation protocol that fits this data set's ground truth."""
     ground_truth: str = "camera_z"
@@ -78,7 +80,10 @@ class DepthDataModule(LightningDataModule):
         self.datasets: dict[str, WindowDataset] = {}
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return the frames of ``train``, ``val``, ``test`` or ``predict``; the one thing a data set must say."""
+        """Return the frames of ``train``, ``val``, ``test`` or ``predict``; the one thing a data set must say.
+
+        Nothing at all for ``val`` means training without validation.
+        """
         raise NotImplementedError(f"{type(self).__name__} does not say which frames belong to '{split}'")
 
     def setup(self, stage: str | None = None) -> None:
@@ -88,8 +93,9 @@ class DepthDataModule(LightningDataModule):
             DataError: if a split has no usable frame.
         """
         for split in STAGES[str(getattr(stage, "value", stage))] if stage else ("train", "val", "test", "predict"):
-            if split not in self.datasets:
-                self.datasets[split] = self._dataset(split)
+            selections = [] if split in self.datasets else [Selection(*each) for each in self.select(split)]
+            if selections or (split != "val" and split not in self.datasets):
+                self.datasets[split] = self._dataset(split, selections)
                 rank_zero_info(self.summary(split))
 
     def summary(self, split: str) -> str:
@@ -109,9 +115,8 @@ class DepthDataModule(LightningDataModule):
         """Return the SHA-256 of the sample names of each split that is set up."""
         return {split: dataset.fingerprint() for split, dataset in self.datasets.items()}
 
-    def _dataset(self, split: str) -> WindowDataset:
-        selections = [Selection(*selection) for selection in self.select(split)]
-        offsets = self.offsets if split in ("train", "val") else ()
+    def _dataset(self, split: str, selections: Sequence[Selection]) -> WindowDataset:
+        offsets = self.offsets if split in self.neighbours else ()
         windows, usage = find_windows(selections, offsets)
         if not windows:
             found = "; ".join(str(drive) for drive in usage[:3]) or "no drives"
@@ -129,8 +134,8 @@ class DepthDataModule(LightningDataModule):
             width=self.width,
             margin=margin if split == "train" else (0, 0),
             with_depth=split in ("val", "test"),
-            with_target_depth=self.target_depth and split in ("train", "val"),
-            with_pose=self.with_pose and split in ("train", "val"),
+            with_target_depth=self.target_depth and split in self.neighbours,
+            with_pose=self.with_pose and split in self.neighbours,
         )
 
     def train_dataloader(self) -> DataLoader[Any]:
@@ -138,9 +143,9 @@ class DepthDataModule(LightningDataModule):
         sampler = TrainBatches(self._set_up("train"), self.batch_size, self.seed, *self._place())
         return ResumableLoader(self.datasets["train"], sampler=sampler, **self._loading())
 
-    def val_dataloader(self) -> DataLoader[Any]:
-        """Return validation batches, each sample once."""
-        return self._eval_loader("val")
+    def val_dataloader(self) -> DataLoader[Any] | list[Any]:
+        """Return validation batches, each sample once; an empty list where the data set holds nothing out."""
+        return self._eval_loader("val") if "val" in self.datasets or "train" not in self.datasets else []
 
     def test_dataloader(self) -> DataLoader[Any]:
         """Return test batches, each sample once."""

@@ -152,7 +152,8 @@ def hold_out_tails(frames: Iterable[Frame], share: float, gap: int) -> Parts:
     first_held = {}
     for drive, numbers in by_drive.items():
         ordered = sorted(numbers)
-        first_held[drive] = ordered[len(ordered) - math.ceil(share * len(ordered))]
+        held = math.ceil(share * len(ordered))
+        first_held[drive] = ordered[-held] if held else ordered[-1] + gap + 1
     for frame in frames:
         if frame.number >= first_held[frame.drive]:
             val.append(frame)

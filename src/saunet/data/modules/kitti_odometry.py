@@ -1,0 +1,111 @@
+"""The KITTI odometry benchmark as a data module."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from saunet.checks import in_range, one_of
+from saunet.data.module import DepthDataModule
+from saunet.data.odometry import CAMERAS, OdometrySequence, find_root
+from saunet.data.splits import Frame, hold_out_tails
+from saunet.data.windows import Selection
+from saunet.registry import datamodules
+
+
+@datamodules.register("kitti_odometry")
+class KittiOdometryDataModule(DepthDataModule):
+    """KITTI odometry sequences with true camera motion: colour or grey, standard or chosen sequences.
+
+    Args:
+        root: Folder that holds ``sequences`` and ``poses``.
+        train_sequences: Sequences to train on.
+        test_sequences: Sequences to test and predict.
+        val_share: Share of each training sequence, its end, that validates.
+        camera: ``colour_left``, ``colour_right``, ``grey_left`` or ``grey_right``.
+        height: Image height in pixels.
+        width: Image width in pixels.
+        offsets: Time offsets of the source frames.
+        batch_size: Samples a step over all devices together.
+        workers: Loader processes a device.
+        translate: Frames are loaded this much larger in training (0.1 = 10 %) and a random window is cut.
+        flip: Probability of mirroring in training.
+        colour: Probability of colour jitter in training.
+        seed: Decides order and augmentation.
+        with_pose: Batches carry the true motion.
+
+    Raises:
+        ConfigError: if a parameter is out of range or a word unknown.
+    """
+
+    neighbours = ("train", "val", "test")
+
+    def __init__(
+        self,
+        *,
+        root: str = "data/kitti_odometry",
+        train_sequences: Sequence[str] = ("00", "01", "02", "03", "04", "05", "06", "07", "08"),
+        test_sequences: Sequence[str] = ("09", "10"),
+        val_share: float = 0.05,
+        camera: Literal["colour_left", "colour_right", "grey_left", "grey_right"] = "colour_left",
+        height: int = 192,
+        width: int = 640,
+        offsets: Sequence[int] = (-1, 1),
+        batch_size: int = 12,
+        workers: int = 4,
+        translate: float = 0.05,
+        flip: float = 0.5,
+        colour: float = 0.5,
+        seed: int = 0,
+        with_pose: bool = False,
+    ) -> None:
+        super().__init__(
+            height=height,
+            width=width,
+            offsets=offsets,
+            batch_size=batch_size,
+            workers=workers,
+            translate=translate,
+            flip=flip,
+            colour=colour,
+            seed=seed,
+            with_pose=with_pose,
+        )
+        self.root = root
+        self.train_sequences, self.test_sequences = tuple(train_sequences), tuple(test_sequences)
+        self.val_share = in_range("val_share", val_share, 0.0, 0.9)
+        self.camera = one_of("camera", camera, CAMERAS)
+
+    def select(self, split: str) -> Sequence[Selection]:
+        """Return the frames of a split, a sequence each.
+
+        Raises:
+            DataError: if a sequence, its images or its calibration is missing.
+        """
+        root: Path = find_root(self.root)
+        names = self.train_sequences if split in ("train", "val") else self.test_sequences
+        selections = []
+        for name in names:
+            drive = OdometrySequence(root, name, self.camera)
+            frames: Sequence[int] = drive.indices
+            left_out = {}
+            if split in ("train", "val"):
+                gap = max(0, *self.offsets) - min(0, *self.offsets) if self.offsets else 0
+                parts = hold_out_tails([Frame(name, index, "l") for index in frames], self.val_share, gap)
+                if split == "train":
+                    left_out = {"between training and validation": len(frames) - len(parts[0]) - len(parts[1])}
+                frames = [frame.number for frame in parts[split == "val"]]
+                if not frames:
+                    continue
+            if self.with_pose and split in self.neighbours:
+                known = self._with_motion(drive, frames)
+                left_out["without pose"] = len(frames) - len(known)
+                frames = known
+            selections.append(Selection(drive, frames, left_out))
+        return selections
+
+    def _with_motion(self, drive: OdometrySequence, frames: Sequence[int]) -> list[int]:
+        """Drop the frames of which a pose is missing, their own or that of a neighbour that exists."""
+        unknown = {index for index in drive.indices if drive.pose(index) is None}
+        return [index for index in frames if not any(index + offset in unknown for offset in (0, *self.offsets))]

@@ -1,0 +1,124 @@
+"""Sequences of the KITTI odometry benchmark, with calibration and true poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from saunet.checks import DataError, one_of
+from saunet.data.calibration import read_matrices
+from saunet.data.images import read_image
+from saunet.data.kitti import frame_files
+
+CAMERAS = {"grey_left": (0, "l"), "grey_right": (1, "r"), "colour_left": (2, "l"), "colour_right": (3, "r")}
+"""Camera name -> its number on disk and its letter in names."""
+
+
+class OdometrySequence:
+    """One camera of one sequence, a `saunet.data.sequences.Drive`.
+
+    Args:
+        root: Folder that holds ``sequences`` and, where poses are known, ``poses``.
+        sequence: Its name, such as ``09``.
+        camera: One of `CAMERAS`.
+
+    Raises:
+        ConfigError: for an unknown camera.
+        DataError: if the sequence or its calibration is missing or broken.
+    """
+
+    def __init__(self, root: Path, sequence: str, camera: str = "colour_left") -> None:
+        number, side = CAMERAS[one_of("camera", camera, CAMERAS)]
+        folder = root / "sequences" / sequence
+        if not folder.is_dir():
+            there = ", ".join(sequences(root)) or "none"
+            raise DataError(f"no sequence '{sequence}' at {folder.parent.absolute()}; sequences there: {there}")
+        self.name = f"odometry/{sequence} {side}"
+        self._images = folder / f"image_{number}"
+        self._files = frame_files(self._images)
+        if not self._files:
+            cameras = ", ".join(name for name, (n, _) in CAMERAS.items() if (folder / f"image_{n}").is_dir()) or "none"
+            raise DataError(f"{self._images} holds no images; cameras of sequence '{sequence}' there: {cameras}")
+        self._indices = sorted(self._files)
+        key = f"P{number}"
+        matrices = read_matrices(folder / "calib.txt", {key: (3, 4)})
+        if key not in matrices:
+            raise DataError(f"{folder / 'calib.txt'} lacks {key}; expected a line '{key}: ' with 12 numbers")
+        self._K = matrices[key][:, :3]
+        # P = K [I | t] maps points of camera 0, so t is where camera 0 lies seen from this camera
+        self._T_cam_cam0 = np.eye(4)
+        self._T_cam_cam0[:3, 3] = np.linalg.solve(self._K, matrices[key][:, 3])
+        poses = root / "poses" / f"{sequence}.txt"
+        self._poses = read_poses(poses) if poses.is_file() else None
+
+    @property
+    def indices(self) -> Sequence[int]:
+        """Numbers of the frames that exist, ascending."""
+        return self._indices
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """Return the frame, h x w x 3, RGB; grey cameras give three equal channels."""
+        return read_image(self._images / self._files[index])
+
+    def intrinsics(self, index: int) -> NDArray[np.float64]:
+        """Return K of this camera, 3 x 3, in pixels."""
+        return self._K.copy()
+
+    def depth(self, index: int) -> NDArray[np.float32] | None:
+        """Return None: the benchmark comes without depth."""
+        return None
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        """Return T_world_cam of this camera, 4 x 4, metres; None where the file of poses is missing or shorter."""
+        if self._poses is None or not 0 <= index < len(self._poses):
+            return None
+        pose: NDArray[np.float64] = self._poses[index] @ np.linalg.inv(self._T_cam_cam0)
+        return pose
+
+
+def find_root(root: str | Path) -> Path:
+    """Return the folder that holds ``sequences``: the one given, or ``dataset`` or ``odometry`` in it.
+
+    Raises:
+        DataError: if there is none.
+    """
+    folder = Path(root).expanduser()
+    for candidate in (folder, folder / "dataset", folder / "odometry", folder.parent):
+        if (candidate / "sequences").is_dir():
+            return candidate
+    raise DataError(f"no folder 'sequences' at {folder.absolute()}; set data.root to the KITTI odometry data")
+
+
+def sequences(root: Path) -> list[str]:
+    """Return the names of the sequences on disk, sorted."""
+    folder = root / "sequences"
+    return sorted(entry.name for entry in folder.iterdir() if entry.is_dir()) if folder.is_dir() else []
+
+
+def read_poses(path: Path) -> NDArray[np.float64]:
+    """Read poses of camera 0, n x 4 x 4, T_world_cam: twelve numbers a line.
+
+    Raises:
+        DataError: if a line is malformed: names file, line and what was expected.
+    """
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            values = np.array([float(word) for word in words])
+        except ValueError:
+            values = np.empty(0)
+        if values.size != 12 or not np.isfinite(values).all():
+            raise DataError(
+                f"{path}, line {number}: expected 12 finite numbers (a 3 x 4 pose), got '{line.strip()[:60]}'"
+            )
+        rows.append(values)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if rows:
+        poses[:, :3] = np.stack(rows).reshape(-1, 3, 4)
+    return poses

@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from saunet.checks import ConfigError, DataError
+from saunet.data.odometry import OdometrySequence, find_root, read_poses
+from saunet.data.sequences import Drive
+from saunet.registry import datamodules
+
+
+@pytest.fixture
+def root(tmp_path):
+    """Two sequences of ten frames: the colour camera stands 0.5 m right of camera 0, the car drives 1 m a frame."""
+    for sequence in ("00", "09"):
+        for camera in (0, 2):
+            folder = tmp_path / "sequences" / sequence / f"image_{camera}"
+            folder.mkdir(parents=True)
+            for frame in range(10):
+                cv2.imwrite(str(folder / f"{frame:06d}.png"), np.full((20, 60), 20 * frame, np.uint8))
+        (tmp_path / "sequences" / sequence / "calib.txt").write_text(
+            "P0: 50 0 30 0 0 50 10 0 0 0 1 0\nP2: 50 0 30 -25 0 50 10 0 0 0 1 0\n"
+        )
+    (tmp_path / "poses").mkdir()
+    rows = [f"1 0 0 0 0 1 0 0 0 0 1 {frame}" for frame in range(10)]
+    (tmp_path / "poses" / "00.txt").write_text("\n".join(rows) + "\n")
+    return tmp_path
+
+
+def module(root, **options):
+    defaults = {"train_sequences": ["00"], "test_sequences": ["09"], "val_share": 0.2, "batch_size": 2, "workers": 0}
+    return datamodules.build("kitti_odometry", root=str(root), height=10, width=30, **{**defaults, **options})
+
+
+def test_sequence(root):
+    drive = OdometrySequence(root, "00")
+    assert isinstance(drive, Drive)
+    assert drive.name == "odometry/00 l"
+    assert list(drive.indices) == list(range(10))
+    assert drive.image(3).shape == (20, 60, 3)
+    assert drive.intrinsics(0).tolist() == [[50, 0, 30], [0, 50, 10], [0, 0, 1]]
+    assert drive.depth(0) is None
+    assert drive.pose(3)[:3, 3].tolist() == [0.5, 0, 3]  # right of camera 0
+    assert OdometrySequence(root, "00", "grey_left").pose(3)[:3, 3].tolist() == [0, 0, 3]
+    assert OdometrySequence(root, "09").pose(3) is None
+
+
+def test_root_is_found_around_the_sequences(root):
+    for given in (root, root / "sequences", root.parent / root.name):
+        assert find_root(given) == root
+    with pytest.raises(DataError, match=r"no folder 'sequences' at"):
+        find_root(root / "poses" / "x")
+
+
+def test_batches_with_motion(root):
+    data = module(root, with_pose=True, test_sequences=["00"])
+    data.setup()
+    batch = data.on_after_batch_transfer(next(iter(data.test_dataloader())), 0)
+    assert batch["name"][0] == "odometry/00 0000000001 l"
+    assert batch["sources"].shape == (2, 2, 3, 10, 30)
+    assert batch["T_src_tgt"][0, :, 2, 3].tolist() == [1, -1]
+    assert len(data.datasets["train"]) == 5  # 1 to 5; 6 and 7 are the gap
+    assert len(data.datasets["val"]) == 1
+    assert data.usage["train"][0].left_out == {
+        "between training and validation": 2,
+        "without pose": 0,
+        "without neighbour": 1,
+    }
+
+
+def test_without_poses_motion_is_left_out_and_counted(root):
+    data = module(root, with_pose=True)
+    with pytest.raises(DataError, match=r"split 'test' has no usable frame .*10 without pose"):
+        data.setup("test")
+    (root / "poses" / "00.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 5)
+    short = module(root, with_pose=True, val_share=0.0)
+    short.setup("fit")
+    assert len(short.datasets["train"]) == 3
+    assert short.usage["train"][0].left_out == {
+        "between training and validation": 0,
+        "without pose": 6,
+        "without neighbour": 1,
+    }
+    assert short.val_dataloader() == []
+
+
+def test_without_motion_poses_are_not_needed(root):
+    data = module(root)
+    data.setup()
+    assert len(data.datasets["test"]) == 8
+    assert len(data.datasets["predict"]) == 10
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"test_sequences": ["21"]}, DataError, r"no sequence '21' at .*sequences there: 00, 09"),
+        ({"camera": "colour_right"}, DataError, r"image_3 holds no images; cameras .*: grey_left, colour_left"),
+        ({"val_share": 2.0}, ConfigError, r"val_share is 2.0"),
+        ({"root": "/nowhere"}, DataError, r"no folder 'sequences' at /nowhere"),
+    ],
+)
+def test_wrong_settings_are_one_sentence(root, options, error, message):
+    with pytest.raises(error, match=message):
+        module(**{"root": root, **options}).setup()
+
+
+def test_malformed_files_are_named(root):
+    (root / "poses" / "09.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 2 3\n")
+    with pytest.raises(DataError, match=r"09.txt, line 2: expected 12 finite numbers \(a 3 x 4 pose\), got '1 2 3'"):
+        OdometrySequence(root, "09")
+    (root / "poses" / "09.txt").write_text("a " * 12)
+    with pytest.raises(DataError, match=r"09.txt, line 1"):
+        read_poses(root / "poses" / "09.txt")
+    (root / "sequences" / "00" / "calib.txt").write_text("P0: 50 0 30 0 0 50 10 0 0 0 1 0\n")
+    with pytest.raises(DataError, match=r"calib.txt lacks P2"):
+        OdometrySequence(root, "00")
+
+
+def test_real_sequence(kitti_mini):
+    data = module(
+        kitti_mini / "odometry",
+        train_sequences=["06"],
+        test_sequences=["06"],
+        camera="grey_left",
+        with_pose=True,
+    )
+    data.setup()
+    assert len(data.datasets["test"]) == 49
+    sample = data.datasets["test"][0]
+    assert sample["T_src_tgt"][1, 2, 3] == pytest.approx(-1.185, abs=0.02)  # forward in 0.1 s
+    assert sample["K"][0, 0] == pytest.approx(707.0912 * 30 / 1226)
+    assert torch.equal(sample["frames"][0, 0], sample["frames"][0, 2])
