@@ -20,7 +20,7 @@ ALLOWED: dict[str, set[str]] = {
     "models": {"registry", "types", "checks", "layers", "geometry.depth", "geometry.pose"},
     "losses": {"registry", "types", "checks", "geometry"},
     "metrics": {"types", "checks", "geometry.depth"},
-    "data": {"registry", "types", "checks", "geometry.camera"},
+    "data": {"registry", "types", "checks", "geometry.camera", "atomic"},
     "atomic": {"checks"},
     "record": {"registry", "checks"},
     "checkpoint": {"registry", "types", "checks", "models", "atomic", "record"},

@@ -1,0 +1,129 @@
+"""Data module of the synthetic world: nothing to download, exact depth, pose and intrinsics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+
+from saunet.checks import ConfigError, positive
+from saunet.data.module import DepthDataModule
+from saunet.data.synthetic import SyntheticDrive
+from saunet.data.windows import Selection
+from saunet.registry import datamodules
+
+_SEEDS_A_SPLIT = 10_000
+_SPLITS = ("train", "val", "test")
+
+
+@datamodules.register("synthetic")
+class SyntheticDataModule(DepthDataModule):
+    """Procedurally generated streets with exact ground truth; train, val and test drives are different streets.
+
+    Args:
+        height: Image height in pixels.
+        width: Image width in pixels.
+        offsets: Time offsets of the source frames.
+        batch_size: Samples a step over all devices together.
+        workers: Loader processes a device.
+        translate: Training frames are rendered this much larger (0.1 = 10 %) and a random window is cut; K follows.
+        flip: Probability of mirroring in training.
+        colour: Probability of colour jitter in training.
+        seed: Decides the streets, the order and the augmentation.
+        target_depth: Training batches carry the depth of the target, for losses that use it.
+        with_pose: Batches carry the true motion.
+        train_drives: Number of drives to train on.
+        val_drives: Number of drives to validate on.
+        test_drives: Number of drives to test on.
+        frames_per_drive: Length of each drive, at 10 frames a second.
+        moving_cars: Cars that move in each drive, by turns ahead and oncoming.
+        camera_height: Metres above the road.
+        cache: Folder in which rendered drives are kept between runs; None renders them each time.
+
+    Raises:
+        ConfigError: if a parameter is out of range.
+    """
+
+    protocol = "synthetic"
+    ground_truth = "exact"
+
+    def __init__(
+        self,
+        height: int = 64,
+        width: int = 192,
+        offsets: Sequence[int] = (-1, 1),
+        batch_size: int = 8,
+        workers: int = 0,
+        translate: float = 0.05,
+        flip: float = 0.5,
+        colour: float = 0.5,
+        seed: int = 0,
+        target_depth: bool = False,
+        with_pose: bool = False,
+        train_drives: int = 8,
+        val_drives: int = 1,
+        test_drives: int = 1,
+        frames_per_drive: int = 60,
+        moving_cars: int = 0,
+        camera_height: float = 1.65,
+        cache: str | None = None,
+    ) -> None:
+        super().__init__(
+            height=height,
+            width=width,
+            offsets=offsets,
+            batch_size=batch_size,
+            workers=workers,
+            translate=translate,
+            flip=flip,
+            colour=colour,
+            seed=seed,
+            target_depth=target_depth,
+            with_pose=with_pose,
+        )
+        self.counts = {"train": train_drives, "val": val_drives, "test": test_drives}
+        for split, count in self.counts.items():
+            positive(f"{split}_drives", count)
+            if count > _SEEDS_A_SPLIT:
+                raise ConfigError(f"{split}_drives is {count}; at most {_SEEDS_A_SPLIT} drives a split are kept apart")
+        self.frames_per_drive = int(positive("frames_per_drive", frames_per_drive))
+        self.moving_cars = int(positive("moving_cars", moving_cars, allow_zero=True))
+        self.camera_height = positive("camera_height", camera_height)
+        self.cache = None if cache is None else Path(cache)
+        self._drives: dict[str, list[SyntheticDrive]] = {}
+
+    def drives(self, split: str) -> list[SyntheticDrive]:
+        """Return the drives of ``train``, ``val`` or ``test`` (``predict`` is ``test``), rendered."""
+        name = "test" if split == "predict" else split
+        if name not in self._drives:
+            first = (self.seed * len(_SPLITS) + _SPLITS.index(name)) * _SEEDS_A_SPLIT
+            larger = 1 + self.translate if name == "train" else 1.0
+            self._drives[name] = [
+                SyntheticDrive(
+                    seed=first + number,
+                    frames=self.frames_per_drive,
+                    height=round(self.height * larger),
+                    width=round(self.width * larger),
+                    moving_cars=self.moving_cars,
+                    camera_height=self.camera_height,
+                    cache=self.cache,
+                )
+                for number in range(self.counts[name])
+            ]
+            _render(self._drives[name], name, show=self._place()[0] == 0)
+        return self._drives[name]
+
+    def select(self, split: str) -> Sequence[Selection]:
+        """Return all frames of a split's drives."""
+        return [Selection(drive, drive.indices) for drive in self.drives(split)]
+
+
+def _render(drives: Sequence[SyntheticDrive], split: str, show: bool) -> None:
+    """Render before loading starts: loader processes then share the frames."""
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not (show and console.is_terminal), transient=True) as progress:
+        task = progress.add_task(f"rendering {split} drives", total=sum(len(d.indices) for d in drives))
+        for drive in drives:
+            drive.render(lambda: progress.advance(task))
