@@ -13,8 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 from saunet.checks import ConfigError, DataError
+from saunet.infer.clips import VideoReader, VideoWriter, open_clip
+from saunet.infer.images import write_image
 from saunet.infer.predictor import Predictor
-from saunet.infer.video import RunningRange, VideoReader, VideoWriter, compose, render_video
+from saunet.infer.video import RunningRange, compose, render_video
 
 Picture = NDArray[np.uint8]
 
@@ -105,6 +107,18 @@ def test_colours_are_stable_over_a_clip() -> None:
         RunningRange(1.0)
 
 
+def test_folder_of_images_and_truncated_ones(predictor: Predictor, tmp_path: Path) -> None:
+    for index, frame in enumerate(clip(3)):
+        write_image(tmp_path / "in" / f"{index}.png", frame)
+    for source in (tmp_path / "in", str(tmp_path / "in" / "*.png")):
+        assert render_video(predictor, source, tmp_path / "out.mp4").frames == 3
+    (tmp_path / "in" / "1.png").write_bytes(b"")
+    (tmp_path / "out.mp4").unlink()
+    with pytest.raises(DataError, match=r"1\.png is empty"):
+        render_video(predictor, tmp_path / "in", tmp_path / "out.mp4")
+    assert not (tmp_path / "out.mp4").exists()
+
+
 class TestBrokenSource:
     def test_missing_empty_text(self, tmp_path: Path) -> None:
         (tmp_path / "empty.mp4").touch()
@@ -116,6 +130,8 @@ class TestBrokenSource:
     def test_folder(self, tmp_path: Path) -> None:
         with pytest.raises(DataError, match="no video at"):
             VideoReader(tmp_path)
+        with pytest.raises(DataError, match="no images in"):
+            open_clip(tmp_path)
 
     def test_no_frames(self, tmp_path: Path) -> None:
         writer = cv2.VideoWriter(str(tmp_path / "x.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 32))
@@ -144,13 +160,12 @@ class TestBrokenSource:
             VideoReader(97)
 
 
-class FakeCamera:
+class FakeCamera(VideoReader):
     """Gives three frames; then the user has seen enough."""
-
-    fps, declared = 20.0, None
 
     def __init__(self, source: int) -> None:
         assert source == 0
+        self.fps, self.declared = 20.0, None
 
     def __iter__(self) -> Iterator[Picture]:
         yield from clip(3)
@@ -164,7 +179,7 @@ class TestUnfinished:
     def test_interrupting_a_camera_finishes_its_video(
         self, predictor: Predictor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("saunet.infer.video.VideoReader", FakeCamera)
+        monkeypatch.setattr("saunet.infer.clips.VideoReader", FakeCamera)
         assert render_video(predictor, 0, tmp_path / "out.mp4").frames == 3
         with VideoReader(tmp_path / "out.mp4") as reader:
             assert reader.declared == 3

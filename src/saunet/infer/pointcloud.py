@@ -108,7 +108,7 @@ def point_cloud(
     if max_depth is not None:
         keep &= depth <= positive("max_depth", max_depth)
     if edge:
-        keep &= ~_edges(prediction.disparity, edge)
+        keep &= ~jumps(prediction.disparity, edge)
     rows, columns = np.nonzero(keep[::stride, ::stride])
     rows, columns = rows * stride, columns * stride
     z = depth[rows, columns].astype(np.float64)
@@ -144,7 +144,7 @@ def write_ply(path: str | Path, cloud: PointCloud) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def _edges(disparity: Float32[np.ndarray, "h w"], share: float) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels at which depth jumps by more than ``share``: neighbours' disparities differ by that factor."""
+def jumps(disparity: Float32[np.ndarray, "h w"], share: float) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels around which disparity, and so depth, changes by more than ``share``."""
     square = np.ones((3, 3), np.uint8)
     return np.asarray(cv2.dilate(disparity, square) > (1 + share) * cv2.erode(disparity, square))

@@ -37,8 +37,7 @@ def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Pa
         below = base.resolve() in own.parents  # an earlier run's results are no inputs
         kept = [path for path in paths if not (below and own in path.resolve().parents)]
         if not kept:
-            endings = " ".join(sorted(IMAGE_SUFFIXES))
-            raise DataError(f"no images in {item}; looked for files ending in {endings}")
+            raise _nothing(item)
         for path in kept:
             found.setdefault(path, path.relative_to(base))
     stems = Counter(str(relative.with_suffix("")) for relative in found.values())
@@ -55,6 +54,22 @@ def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Pa
         taken[stem] = path
         sources.append(Source(path, stem))
     return sources
+
+
+def image_paths(item: str | Path) -> list[Path]:
+    """Return the images that a file, folder or pattern names, sorted.
+
+    Raises:
+        DataError: if it does not exist or holds no image.
+    """
+    paths = _expand(item)[1]
+    if not paths:
+        raise _nothing(item)
+    return paths
+
+
+def _nothing(item: str | Path) -> DataError:
+    return DataError(f"no images in {item}; looked for files ending in {' '.join(sorted(IMAGE_SUFFIXES))}")
 
 
 def _expand(item: str | Path) -> tuple[Path, list[Path]]:

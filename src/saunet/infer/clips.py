@@ -1,0 +1,219 @@
+"""Clips of frames, one in memory at a time: from a video, a camera or images; and whole, verified mp4 files."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from saunet.atomic import replacing
+from saunet.checks import DataError, one_of, positive
+from saunet.infer.images import IMAGE_SUFFIXES, read_image
+from saunet.infer.sources import image_paths
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ts"})
+"""File name endings that are taken for videos."""
+
+
+class VideoReader:
+    """Frames of a video file or a camera, as RGB bytes, in order.
+
+    Args:
+        source: A video file, or the number of a camera.
+
+    Attributes:
+        fps: Frames a second; 25 where the file does not say.
+        declared: Number of frames that the file claims to hold; None for a camera or where it does not say.
+
+    Raises:
+        DataError: if it does not exist, is no video that can be read, or holds no frame.
+    """
+
+    def __init__(self, source: str | Path | int) -> None:
+        self.name = f"camera {source}" if isinstance(source, int) else str(source)
+        if not isinstance(source, int):
+            path = Path(source)
+            if not path.is_file():
+                raise DataError(f"no video at {path}; check the path")
+            if path.stat().st_size == 0:
+                raise DataError(f"{path} is empty (0 bytes); copy it again")
+        self._capture = cv2.VideoCapture(source if isinstance(source, int) else str(source))
+        opened = self._capture.isOpened()
+        done, frame = self._capture.read() if opened else (False, None)
+        if not done or frame is None:
+            self._capture.release()
+            raise DataError(self._why(isinstance(source, int), opened))
+        self._first: UInt8[np.ndarray, "h w 3"] | None = frame
+        self.height, self.width = frame.shape[:2]
+        fps = self._capture.get(cv2.CAP_PROP_FPS)
+        self.fps = float(fps) if 0 < fps < 1000 else 25.0
+        count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.declared = count if count > 0 and not isinstance(source, int) else None
+
+    def _why(self, camera: bool, opened: bool) -> str:
+        if camera:
+            return f"{self.name} gives no picture; check that it is connected and that no other program uses it"
+        if opened:
+            return f"{self.name} holds no frame that can be decoded; it may be truncated or have an unusual codec"
+        return f"{self.name} is not a video that can be read, or is truncated; copy it again or convert it to mp4"
+
+    def __iter__(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        while self._first is not None:
+            yield cv2.cvtColor(self._first, cv2.COLOR_BGR2RGB)
+            done, frame = self._capture.read()
+            self._first = frame if done else None
+
+    def close(self) -> None:
+        """Release the file or camera."""
+        self._capture.release()
+        self._first = None
+
+    def __enter__(self) -> VideoReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class VideoWriter:
+    """Writes RGB frames to an mp4 file that gets its name only when it is complete and plays back every frame.
+
+    Use it as a context manager; leaving it by an error discards the file.
+
+    Args:
+        path: The file to write, ending in ``.mp4``.
+        fps: Frames a second.
+
+    Raises:
+        ConfigError: for another ending or a frame rate that is not positive.
+        DataError: if the system refuses to write, or the written file does not play back (a full disk).
+    """
+
+    def __init__(self, path: str | Path, fps: float | int) -> None:
+        self.path = Path(path)
+        one_of(f"the suffix of {self.path.name}", self.path.suffix.lower(), [".mp4"])
+        self.fps = positive("fps", fps)
+        self.count = 0
+        self._writer: cv2.VideoWriter | None = None
+        self._size = (0, 0)
+        self._replacing = replacing(self.path)
+
+    def __enter__(self) -> VideoWriter:
+        self._temporary = self._replacing.__enter__()
+        return self
+
+    def write(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> None:
+        """Append a frame; all have the size of the first, made even, since the codec needs that.
+
+        Raises:
+            DataError: if a frame has another size, or the file cannot be opened.
+        """
+        if self._writer is None:
+            self._size = (frame.shape[0], frame.shape[1])
+            even = (self._size[1] + self._size[1] % 2, self._size[0] + self._size[0] % 2)
+            self._writer = cv2.VideoWriter(str(self._temporary), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, even)
+            if not self._writer.isOpened():
+                raise DataError(f"cannot write {self.path}; check the folder, its rights and its space")
+        if frame.shape[:2] != self._size:
+            raise DataError(
+                f"frame {self.count} is {frame.shape[:2]} (height, width), the ones before it are {self._size}"
+            )
+        pad = ((0, self._size[0] % 2), (0, self._size[1] % 2), (0, 0))
+        self._writer.write(cv2.cvtColor(np.pad(frame, pad, mode="edge"), cv2.COLOR_RGB2BGR))
+        self.count += 1
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._writer is not None:
+            self._writer.release()
+        if kind is None:
+            try:
+                self._check()
+            except DataError as problem:
+                self._replacing.__exit__(DataError, problem, problem.__traceback__)
+                raise
+        self._replacing.__exit__(kind, error, trace)
+
+    def _check(self) -> None:
+        if self.count == 0:
+            raise DataError(f"no frame was given, so {self.path} was not written")
+        capture = cv2.VideoCapture(str(self._temporary))
+        kept = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+        capture.release()
+        if kept != self.count:
+            raise DataError(f"{self.path} kept {kept} of {self.count} frames, so it was discarded; is the disk full?")
+
+
+class ImageClip:
+    """Image files as a clip, read one at a time; the counterpart of `VideoReader` for frames that are files.
+
+    Args:
+        source: A folder, a pattern such as ``frames/*.png``, or an image.
+
+    Attributes:
+        fps: 10, KITTI's frame rate; files do not say.
+        declared: Number of images.
+
+    Raises:
+        DataError: if there is no image.
+    """
+
+    def __init__(self, source: str | Path) -> None:
+        self._paths = image_paths(source)
+        self.name, self.fps, self.declared = str(source), 10.0, len(self._paths)
+
+    def __iter__(self) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:
+        return map(read_image, self._paths)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+class ArrayClip:
+    """RGB arrays as a clip; they may come from a generator.
+
+    Args:
+        frames: RGB images.
+
+    Attributes:
+        fps: 10; arrays do not say.
+        declared: None: the number is not known beforehand.
+    """
+
+    def __init__(self, frames: Iterable[UInt8[np.ndarray, "_ _ 3"]]) -> None:
+        self._frames = frames
+        self.name, self.fps, self.declared = "frames", 10.0, None
+
+    def __iter__(self) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:
+        return iter(self._frames)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+Source = str | Path | int | Iterable[UInt8[np.ndarray, "_ _ 3"]]
+"""A video file, a folder or pattern of images, a camera's number, or RGB frames."""
+Clip = VideoReader | ImageClip | ArrayClip
+
+
+def open_clip(source: Source) -> Clip:
+    """Open what frames come from.
+
+    Raises:
+        DataError: if it does not exist or holds no frame.
+    """
+    if isinstance(source, int):
+        return VideoReader(source)
+    if isinstance(source, str | Path):
+        path = Path(source)
+        images = path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES or glob.has_magic(str(source))
+        return ImageClip(source) if images else VideoReader(source)
+    return ArrayClip(source)
