@@ -17,6 +17,7 @@ from saunet.checks import DataError, one_of
 from saunet.data.calibration import KittiCalibration, read_calibration
 from saunet.data.images import image_size, read_depth, read_image
 from saunet.data.lidar import lidar_depth, read_scan
+from saunet.data.static import oxts_speed
 from saunet.geometry.camera import scale_intrinsics
 
 DepthKind = Literal["camera_z", "lidar_x", "improved"]
@@ -124,6 +125,15 @@ class KittiDrive:
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """Return None: raw recordings come without camera poses."""
         return None
+
+    def speed(self, index: int) -> float | None:
+        """Return the car's speed in m/s; None where there is no OXTS record.
+
+        Raises:
+            DataError: if the record is malformed.
+        """
+        record = self.folder / "oxts" / "data" / f"{index:010d}.txt"
+        return oxts_speed(record) if record.is_file() else None
 
     def _depth_file(self, index: int) -> Path:
         if self.depth_kind == "improved":

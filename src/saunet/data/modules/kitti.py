@@ -12,9 +12,14 @@ from saunet.data import splits
 from saunet.data.kitti import CAMERAS, DEPTH_KINDS, DepthKind, KittiRaw
 from saunet.data.module import DepthDataModule
 from saunet.data.splits import Frame
+from saunet.data.static import static_by_flow
 from saunet.data.windows import Selection
 from saunet.registry import datamodules
 
+MIN_SPEED = 0.5
+"""Metres a second under which a car counts as standing."""
+MIN_FLOW = 0.5
+"""Pixels of median flow, at 320 pixels width, under which a frame counts as static."""
 _PROTOCOLS = {"camera_z": "eigen_camera_z", "lidar_x": "eigen_lidar_x", "improved": "eigen_improved"}
 
 
@@ -33,6 +38,9 @@ class KittiDataModule(DepthDataModule):
         val_drives: Drives to hold out, in place of what the split would; ``2011_09_26_drive_0001_sync`` names one.
         val_share: Share to hold out of ``all`` or of a file: whole drives where there are ten, else the drives' tails.
         cameras: ``left``, ``right`` or both.
+        static: Frames of a standing car in training and validation: ``keep`` them; drop those whose OXTS ``speed`` is
+            under 0.5 m/s (without OXTS, by flow); or drop those whose median optical ``flow`` to the frame before is
+            under half a pixel at 320 pixels width. Flow reads every frame once at set-up.
         depth: Ground truth: LiDAR depth as ``camera_z`` or ``lidar_x`` (evaluation only), or ``improved``.
         height: Image height in pixels.
         width: Image width in pixels.
@@ -58,6 +66,7 @@ class KittiDataModule(DepthDataModule):
         val_drives: Sequence[str] = (),
         val_share: float = 0.1,
         cameras: Sequence[str] = ("left", "right"),
+        static: Literal["keep", "speed", "flow"] = "keep",
         depth: Literal["camera_z", "lidar_x", "improved"] = "camera_z",
         height: int = 192,
         width: int = 640,
@@ -90,6 +99,7 @@ class KittiDataModule(DepthDataModule):
         self.cameras = tuple(one_of("cameras", camera, CAMERAS) for camera in cameras)
         if not self.cameras:
             raise ConfigError(f"cameras is empty; name at least one of {', '.join(CAMERAS)}")
+        self.static = one_of("static", static, ("keep", "speed", "flow"))
         self.ground_truth = one_of("depth", depth, DEPTH_KINDS)
         self.protocol = _PROTOCOLS[depth]
         self._depth: DepthKind = depth
@@ -112,6 +122,8 @@ class KittiDataModule(DepthDataModule):
         # Losses compare with the camera's depth, whatever the evaluation reads.
         kind: DepthKind = "camera_z" if split == "train" and self._depth == "lidar_x" else self._depth
         selections = _group(raw, frames, kind, between)
+        if self.static != "keep" and split in ("train", "val"):
+            selections = [_moving(selection, by_speed=self.static == "speed") for selection in selections]
         if split == "test":
             selections = [_with_truth(selection) for selection in selections]
         if split == "train" and self.target_depth and not any(map(_has_truth, selections)):
@@ -198,6 +210,17 @@ def _group(
         )
         for (drive, side), wanted in numbers.items()
     ]
+
+
+def _moving(selection: Selection, by_speed: bool) -> Selection:
+    drive = selection.drive
+    existing = set(drive.indices)
+    frames = [frame for frame in selection.frames if frame in existing]
+    speeds = {frame: drive.speed(frame) if by_speed else None for frame in frames}  # type: ignore[attr-defined]
+    static = {frame for frame, speed in speeds.items() if speed is not None and speed < MIN_SPEED}
+    static |= static_by_flow(drive, [frame for frame, speed in speeds.items() if speed is None], MIN_FLOW)
+    kept = [frame for frame in selection.frames if frame not in static]
+    return Selection(drive, kept, {**selection.left_out, "static": len(static)})
 
 
 def _has_truth(selection: Selection) -> bool:
