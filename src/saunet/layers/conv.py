@@ -63,3 +63,10 @@ class DisparityHead(nn.Module):
 def upsample(x: Float[Tensor, "b c h w"], factor: int = 2) -> Float[Tensor, "b c _ _"]:
     """Return ``x`` enlarged bilinearly; a pixel covers its area (``align_corners=False``), as in resizing images."""
     return F.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
+
+
+def channels_last_weights(network: nn.Module) -> None:
+    """Store the weights of 2-D convolutions in channels-last order, so that no forward pass has to reorder them."""
+    for parameter in network.parameters():
+        if parameter.ndim == 4:  # 3-D convolutions have another format of that kind, which gains nothing here
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from saunet.checks import ConfigError, divisible
 from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
+from saunet.layers.conv import channels_last_weights
 from saunet.types import DepthPyramid
 
 torch.export.register_dataclass(DepthPyramid)  # so that a depth network can be exported with its result as it is
@@ -50,9 +51,7 @@ class DepthNet(nn.Module):
         self.features = encoder.features
         self.size_divisor = int(encoder.size_divisor)  # type: ignore[arg-type]
         self.min_depth, self.max_depth = float(min_depth), float(max_depth)
-        for parameter in self.parameters():
-            if parameter.ndim == 4:  # PackNet has 3-D convolutions too, for which the format does not exist
-                parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+        channels_last_weights(self)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> DepthPyramid:
         """Return disparity and depth at each of the decoder's scales.

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from saunet.layers.conv import channels_last_weights
 from saunet.models.poses.base import check_offsets, check_sources, motions_to_sources, ordered_pairs
 from saunet.registry import poses
 
@@ -37,6 +38,7 @@ class PoseCNN(nn.Module):
             inputs = outputs
         self.layers = nn.Sequential(*layers)
         self.project = nn.Conv2d(inputs, 6, 1)
+        channels_last_weights(self)
 
     def forward(
         self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b s 3 h w"]

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.checks import ConfigError, divisible, one_of
+from saunet.layers.conv import channels_last_weights
 from saunet.models.encoders.resnet import ResNet
 from saunet.models.poses.base import check_offsets, check_sources, motions_to_sources, ordered_pairs
 from saunet.registry import poses
@@ -33,9 +34,11 @@ class ResNetPose(nn.Module):
         bottleneck: Bottleneck blocks (ResNet-50) instead of basic ones.
         input: What the encoder sees at once.
         offsets: Time offset of each source, in frames.
+        weights: Public weights for the encoder to start from: ``imagenet``, a name, a URL or a file.
 
     Raises:
         ConfigError: for a wrong word or offsets, or ``triplet`` without exactly two sources.
+        CheckpointError: if ``weights`` cannot be found, fetched, read or fitted.
     """
 
     def __init__(
@@ -44,6 +47,7 @@ class ResNetPose(nn.Module):
         bottleneck: bool = False,
         input: Literal["pairs", "triplet"] = "pairs",
         offsets: Sequence[int] = (-1, 1),
+        weights: str | None = None,
     ) -> None:
         super().__init__()
         self.input = one_of("input", input, ("pairs", "triplet"))
@@ -54,8 +58,9 @@ class ResNetPose(nn.Module):
                 f"{list(self.offsets)}); it needs 3: give two offsets such as [-1, 1], or use input=pairs"
             )
         triplet = input == "triplet"
-        self.encoder = ResNet(blocks, bottleneck, frames=3 if triplet else 2)
+        self.encoder = ResNet(blocks, bottleneck, frames=3 if triplet else 2, weights=weights)
         self.head = PoseHead(self.encoder.features[-1].channels, motions=2 if triplet else 1)
+        channels_last_weights(self)
 
     def forward(
         self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b s 3 h w"]
