@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from saunet.checks import ConfigError
-from saunet.models.encoders.resnet import ResNet, tile_frames
+from saunet.models.encoders.resnet import ResNet
+from saunet.models.pretrained_keys import tile_frames
 from saunet.registry import encoders
 
 

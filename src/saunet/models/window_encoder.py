@@ -14,6 +14,10 @@ from saunet.types import FeatureSpec
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+_PUBLIC = {
+    (96, (2, 2, 6, 2), (3, 6, 12, 24)): "swin_tiny",
+    (96, (2, 2, 18, 2), (3, 6, 12, 24)): "swin_small",
+}
 
 
 class WindowEncoder(nn.Module):
@@ -36,6 +40,8 @@ class WindowEncoder(nn.Module):
     Attributes:
         features: Channels and stride of each feature map, finest first.
         size_divisor: Input height and width must be multiples of it.
+        variant: Name of the public weights that fit, None where there are none.
+        not_pretrained: Beginnings of the names of entries that no public file has.
 
     Raises:
         ConfigError: if the sequences differ in length or hold a value below 1.
@@ -70,6 +76,8 @@ class WindowEncoder(nn.Module):
         stages = len(depths)
         self.features = tuple(FeatureSpec(dim * 2**i, stride * 2**i) for i in range(stages))
         self.size_divisor = self.features[-1].stride
+        self.variant = _PUBLIC.get((dim, depths, heads))
+        self.not_pretrained: tuple[str, ...] = tuple(f"norm{i}." for i in range(stages - 1))
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.checks import ConfigError, positive
+from saunet.models.pretrained import load_pretrained
 from saunet.registry import encoders
 from saunet.types import FeatureSpec
 
@@ -76,6 +77,7 @@ class ResNet(nn.Module):
         blocks: Residual blocks in each of the four stages.
         bottleneck: Bottleneck blocks (ResNet-50 and up) instead of basic ones.
         frames: RGB images stacked in the channels of the input: 1 for depth, 2 or 3 for pose.
+        weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
 
     Attributes:
         features: Channels and stride of each feature map, finest first.
@@ -84,6 +86,7 @@ class ResNet(nn.Module):
 
     Raises:
         ConfigError: if there are not four stages of at least one block, or no frame.
+        CheckpointError: if ``weights`` cannot be found, fetched, read or fitted.
     """
 
     mean: Tensor
@@ -94,6 +97,7 @@ class ResNet(nn.Module):
         blocks: Sequence[int] = (2, 2, 2, 2),
         bottleneck: bool = False,
         frames: int = 1,
+        weights: str | None = None,
     ) -> None:
         super().__init__()
         blocks = tuple(blocks)
@@ -124,6 +128,8 @@ class ResNet(nn.Module):
         self.features = tuple(FeatureSpec(channels, 2 ** (i + 1)) for i, channels in enumerate(outputs))
         self.size_divisor = 32
         _initialise(self)
+        if weights is not None:
+            load_pretrained(self, weights)
 
     def forward(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, ...]:
         """Return the five feature maps, finest first.
@@ -138,15 +144,6 @@ class ResNet(nn.Module):
             x = stage(x)
             features.append(x)
         return tuple(features)
-
-
-def tile_frames(weight: Float[Tensor, "o 3 kh kw"], frames: int) -> Float[Tensor, "o c kh kw"]:
-    """Return first-layer weights for ``frames`` stacked images from those for one.
-
-    The weights are repeated and divided by the number of frames, as Monodepth2 does, so that equal frames give the
-    response of one.
-    """
-    return weight.repeat(1, frames, 1, 1) / frames
 
 
 def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Sequential | None:

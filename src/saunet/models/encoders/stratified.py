@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from saunet.models.pretrained import load_pretrained
 from saunet.models.window_encoder import WindowEncoder
 from saunet.registry import encoders
 
@@ -29,6 +30,7 @@ class StratifiedTransformer(WindowEncoder):
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
         mask_padding: Windows over the border attend to real tokens only; False pads with zeros that take part.
         checkpointing: Recompute blocks in the backward pass: less memory, more time.
+        weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
 
     Attributes:
         features: Channels and stride of each feature map, finest first.
@@ -36,6 +38,7 @@ class StratifiedTransformer(WindowEncoder):
 
     Raises:
         ConfigError: for sequences of different lengths, values below 1, or heads that do not divide the channels.
+        CheckpointError: if ``weights`` cannot be found, fetched, read or fitted.
     """
 
     def __init__(
@@ -48,11 +51,15 @@ class StratifiedTransformer(WindowEncoder):
         drop_path: float = 0.1,
         mask_padding: bool = True,
         checkpointing: bool = False,
+        weights: str | None = None,
     ) -> None:
         super().__init__(2, dim, depths, heads, window, mlp_ratio, drop_path, mask_padding, checkpointing)
         self.size_divisor = 2 * self.features[-1].stride  # decoders may halve the deepest map once more
         self.stem = nn.ModuleDict({"conv": nn.Conv2d(3, dim, 3, stride=2, padding=1), "norm": nn.LayerNorm(dim)})
+        self.not_pretrained += ("stem.",)
         self._init_weights()
+        if weights is not None:
+            load_pretrained(self, weights)
 
     def tokens(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h2 w2 c"]:
         """Turn a normalised image into tokens at half its size."""

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet import checks
+from saunet.models.pretrained import load_pretrained
 from saunet.models.window_encoder import WindowEncoder
 from saunet.registry import encoders
 
@@ -30,6 +31,7 @@ class SwinTransformer(WindowEncoder):
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
         mask_padding: True keeps padded tokens out of the attention instead.
         checkpointing: Recompute blocks in the backward pass: less memory, more time.
+        weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
 
     Attributes:
         features: Channels and stride of each feature map, finest first.
@@ -37,6 +39,7 @@ class SwinTransformer(WindowEncoder):
 
     Raises:
         ConfigError: for sequences of different lengths, values below 1, or heads that do not divide the channels.
+        CheckpointError: if ``weights`` cannot be found, fetched, read or fitted.
     """
 
     def __init__(
@@ -50,11 +53,14 @@ class SwinTransformer(WindowEncoder):
         drop_path: float = 0.2,
         mask_padding: bool = False,
         checkpointing: bool = False,
+        weights: str | None = None,
     ) -> None:
         checks.positive("patch", patch)
         super().__init__(patch, dim, depths, heads, window, mlp_ratio, drop_path, mask_padding, checkpointing)
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, dim, patch, stride=patch), "norm": nn.LayerNorm(dim)})
         self._init_weights()
+        if weights is not None:
+            load_pretrained(self, weights)
 
     def tokens(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h4 w4 c"]:
         """Turn a normalised image into one token per patch."""
