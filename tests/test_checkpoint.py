@@ -87,6 +87,16 @@ def test_building_leaves_the_random_state_alone(record: ModelRecord) -> None:
     assert torch.equal(torch.rand(3), expected)
 
 
+def test_what_training_started_from_is_not_fetched_again(record: ModelRecord, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("reading a checkpoint must not fetch anything")
+
+    monkeypatch.setattr(torch.hub, "download_url_to_file", refuse)
+    started = dataclasses.replace(record, encoder={**record.encoder, "weights": "https://example.org/w.pth"})
+    depth, _ = build_networks(started)
+    assert depth.features
+
+
 def test_model_without_pose_network(content: dict[str, Any], record: ModelRecord, tmp_path: Path) -> None:
     plain = dataclasses.replace(record, pose=None, scale=None).to_plain()
     atomic_save({**content, "saunet": plain}, tmp_path / "x.ckpt")

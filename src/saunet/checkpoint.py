@@ -77,15 +77,20 @@ def build_networks(record: ModelRecord) -> tuple[DepthNet, nn.Module | None]:
     record.check_registered()
     with torch.random.fork_rng(devices=[]):
         try:
-            encoder = instantiate(record.encoder)
+            encoder = instantiate(_without_pretraining(record.encoder))
             decoder = instantiate({**record.decoder, "_partial_": True})
             depth = DepthNet(encoder, decoder, record.min_depth, record.max_depth)
-            pose = instantiate(record.pose) if record.pose is not None else None
+            pose = instantiate(_without_pretraining(record.pose)) if record.pose is not None else None
         except ConfigError:
             raise
         except (TypeError, ValueError, RuntimeError) as reason:
             raise ConfigError(f"the architecture cannot be built from its record: {reason}") from reason
     return depth, pose
+
+
+def _without_pretraining(node: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out what training started from: it is in the file already, and no file makes us fetch another."""
+    return {key: value for key, value in node.items() if key != "weights"}
 
 
 def load_weights(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
