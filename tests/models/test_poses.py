@@ -8,6 +8,7 @@ import torch
 
 from saunet.checks import ConfigError
 from saunet.geometry.pose import invert_pose
+from saunet.models.encoders.resnet import ResNet
 from saunet.models.poses.base import MOTION_SCALE, motions_to_sources
 from saunet.registry import poses
 
@@ -133,3 +134,12 @@ def test_wrong_input(monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # else the type checker speaks first
     with pytest.raises(ConfigError, match="input is 'pair'; did you mean 'pairs'"):
         poses.build("resnet18", input="pair")
+
+
+@pytest.mark.parametrize(("input_", "frames"), [("pairs", 2), ("triplet", 3)])
+def test_weights_are_shared_among_frames(tmp_path, input_, frames):
+    one = ResNet(BLOCKS)
+    torch.save(one.state_dict(), tmp_path / "resnet10.pth")
+    pose = poses.build("resnet18", blocks=BLOCKS, input=input_, weights=str(tmp_path / "resnet10.pth"))
+    torch.testing.assert_close(pose.encoder.conv1.weight[:, -3:], one.conv1.weight / frames)
+    torch.testing.assert_close(pose.encoder.layer4[0].conv2.weight, one.layer4[0].conv2.weight)
