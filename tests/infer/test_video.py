@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -158,6 +160,23 @@ class TestBrokenSource:
     def test_camera_that_is_not_there(self) -> None:
         with pytest.raises(DataError, match="camera 97 gives no picture"):
             VideoReader(97)
+
+
+@pytest.mark.slow
+def test_memory_stays_flat_over_a_long_clip(predictor: Predictor, tmp_path: Path) -> None:
+    used: list[float] = []
+
+    def frames() -> Iterator[Picture]:
+        for index, frame in enumerate(itertools.islice(itertools.cycle(list(clip(12))), 10_000)):
+            if index % 1000 == 999:
+                pages = int(Path("/proc/self/statm").read_text().split()[1])
+                used.append(pages * os.sysconf("SC_PAGE_SIZE") / 2**20)
+            yield frame
+
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("no /proc to read the memory in use from")
+    assert render_video(predictor, frames(), tmp_path / "out.mp4").frames == 10_000
+    assert used[-1] - used[0] < 10, f"MB in use every 1000 frames: {used}"
 
 
 class FakeCamera(VideoReader):

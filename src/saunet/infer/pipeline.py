@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
-from saunet.checks import CheckpointError, ConfigError, DataError, divisible, positive
+from saunet.checks import CheckpointError, DataError, divisible, positive
 from saunet.infer.images import as_rgb_bytes, network_input, read_image
 from saunet.infer.prediction import Prediction, unit_of
 from saunet.record import Scale
@@ -142,15 +142,3 @@ def _from_tensor(values: NDArray[Any]) -> UInt8[np.ndarray, "h w 3"]:
             )
         values = np.round(values * 255).astype(np.uint8)
     return as_rgb_bytes(values.transpose(1, 2, 0), "the image tensor")
-
-
-def check_fixed_size(keep_aspect: bool) -> None:
-    """Refuse ``keep_aspect`` for a network that takes one input size only.
-
-    Raises:
-        ConfigError: if it is set.
-    """
-    if keep_aspect:
-        raise ConfigError(
-            "keep_aspect needs a network that takes any input size; this exported one is fixed, leave it off"
-        )

@@ -42,7 +42,7 @@ class Predictor(ImagePredictor):
     ) -> None:
         super().__init__(height, width, scale, keep_aspect, depth_net.size_divisor)
         self.device = _device(device)
-        self.network = depth_net.to(self.device).eval().requires_grad_(False)
+        self.network = depth_net.to(self.device).eval()
         self.flip = flip
         self._fingerprint: str | None = None
 
