@@ -39,6 +39,6 @@ def make_drive(root, number, frames=range(6), sides=(2, 3), scans=True, suffix="
         folder = drive / "velodyne_points" / "data"
         folder.mkdir(parents=True)
         for frame in frames:
-            points = np.array([[10, 0, 0, 0.5], [20, -2, 1, 0.5], [-5, 0, 0, 0.5]], np.float32)
+            points = np.array([[10, 0, 0, 0.5], [20, -2, 1.2, 0.5], [-5, 0, 0, 0.5]], np.float32)
             points.tofile(folder / f"{frame:010d}.bin")
     return drive

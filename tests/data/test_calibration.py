@@ -17,8 +17,9 @@ def write(folder, cameras=CALIBRATION, scanner=SCANNER):
 
 def test_each_camera_has_its_own_intrinsics(tmp_path):
     calibration = read_calibration(write(tmp_path))
-    assert calibration.intrinsics(2).tolist() == [[50, 0, 30], [0, 50, 10], [0, 0, 1]]
-    assert calibration.intrinsics(3)[0].tolist() == [55, 0, 31]
+    assert calibration.intrinsics(2).tolist() == [[50, 0, 29], [0, 50, 9], [0, 0, 1]]  # from zero
+    assert calibration.intrinsics(3)[0].tolist() == [55, 0, 30]
+    assert calibration.projections[2].tolist() == [[50, 0, 30, 3], [0, 50, 10, 0], [0, 0, 1, 0]]
     assert calibration.sizes[2] == (20, 60)
     assert calibration.T_cam_velo[:3, :3].tolist() == [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
 
@@ -26,7 +27,7 @@ def test_each_camera_has_its_own_intrinsics(tmp_path):
 def test_real_intrinsics(kitti_mini):
     calibration = read_calibration(kitti_mini / "raw" / "2011_09_26")
     assert calibration.intrinsics(2) == pytest.approx(
-        np.array([[721.5377, 0, 609.5593], [0, 721.5377, 172.854], [0, 0, 1]])
+        np.array([[721.5377, 0, 608.5593], [0, 721.5377, 171.854], [0, 0, 1]])
     )
     assert calibration.sizes == dict.fromkeys(range(4), (375, 1242))
     assert calibration.T_cam_velo[:3, 3] == pytest.approx([-4.069766e-03, -7.631618e-02, -2.717806e-01])

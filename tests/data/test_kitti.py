@@ -37,7 +37,7 @@ def test_drive(tmp_path, suffix):
     assert list(drive.indices) == [0, 1, 3]
     assert drive.image(3).shape == (20, 60, 3)
     assert np.abs(drive.image(3).astype(int) - [3, 3, 0]).max() <= 2  # red is the frame, green the camera
-    assert drive.intrinsics(0)[0].tolist() == [55, 0, 31]
+    assert drive.intrinsics(0)[0].tolist() == [55, 0, 30]
     assert drive.pose(0) is None
     assert drive.depth(0).shape == (20, 60)
     assert pickle.loads(pickle.dumps(drive)).indices == drive.indices
@@ -74,7 +74,7 @@ def test_missing_scans_and_scanner_are_no_depth(tmp_path):
 def test_images_made_smaller_scale_the_intrinsics_but_not_the_truth(tmp_path):
     make_drive(tmp_path, 1, size=(10, 30))
     drive = KittiRaw(tmp_path).drive(name(1))
-    assert drive.intrinsics(0)[0].tolist() == pytest.approx([25, 0, 30.5 / 2 - 0.5])
+    assert drive.intrinsics(0)[0].tolist() == pytest.approx([25, 0, 29.5 / 2 - 0.5])
     assert drive.depth(0).shape == (20, 60)
 
 
@@ -102,3 +102,13 @@ def test_unknown_words_are_refused(tmp_path):
     make_drive(tmp_path, 1)
     with pytest.raises(ConfigError, match="camera is 'middle'"):
         KittiRaw(tmp_path).drive(name(1), "middle")
+
+
+def test_lidar_and_intrinsics_agree_on_where_a_point_is(tmp_path):
+    make_drive(tmp_path, 1)
+    drive = KittiRaw(tmp_path).drive(name(1), "left")
+    K, depth = drive.intrinsics(0), drive.depth(0)
+    for point in ([0, 0, 10], [2, -1.2, 20]):  # the scan's points, x right, y down, z forward
+        seen = point + np.array([3 / 50, 0, 0])  # camera 2 stands left of camera 0
+        u, v, _ = np.round(K @ seen / seen[2]).astype(int)
+        assert depth[v, u] == point[2]

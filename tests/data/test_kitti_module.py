@@ -156,7 +156,7 @@ def test_real_frames(kitti_mini):
     assert train["K"][0, 0, 0] == pytest.approx(721.5377 * round(320 * 1.05) / 1242, rel=1e-5)
     test = data.on_after_batch_transfer(next(iter(data.test_dataloader())), 0)
     assert test["target"].shape == (2, 3, 96, 320)
-    assert test["K"][0, 0, 2] == pytest.approx((609.5593 + 0.5) * 320 / 1242 - 0.5)
+    assert test["K"][0, 0, 2] == pytest.approx((608.5593 + 0.5) * 320 / 1242 - 0.5)
     assert test["K"][0, 1, 1] == pytest.approx(721.5377 * 96 / 375)
     depth = test["depth"]
     assert depth.shape == (2, 1, 375, 1242)

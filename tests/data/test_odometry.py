@@ -40,7 +40,7 @@ def test_sequence(root):
     assert drive.name == "odometry/00 l"
     assert list(drive.indices) == list(range(10))
     assert drive.image(3).shape == (20, 60, 3)
-    assert drive.intrinsics(0).tolist() == [[50, 0, 30], [0, 50, 10], [0, 0, 1]]
+    assert drive.intrinsics(0).tolist() == [[50, 0, 29], [0, 50, 9], [0, 0, 1]]
     assert drive.depth(0) is None
     assert drive.pose(3)[:3, 3].tolist() == [0.5, 0, 3]  # right of camera 0
     assert OdometrySequence(root, "00", "grey_left").pose(3)[:3, 3].tolist() == [0, 0, 3]

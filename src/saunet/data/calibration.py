@@ -1,4 +1,9 @@
-"""KITTI's calibration files: true intrinsics of each camera and date, and where the laser scanner sits."""
+"""KITTI's calibration files: true intrinsics of each camera and date, and where the laser scanner sits.
+
+The files count pixels from one, which is why the field's LiDAR maps lie one pixel up and left of u and v. Everywhere
+else integer coordinates are pixel centres counted from zero, so the principal point of `zero_based` is one pixel less
+than the number in the file.
+"""
 
 from __future__ import annotations
 
@@ -75,15 +80,12 @@ def _is_number(word: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class KittiCalibration:
-    """Calibration of one day of KITTI raw recordings.
-
-    The projection matrices are taken as printed; see `saunet.data.lidar` for the pixel that their origin differs by.
-    """
+    """Calibration of one day of KITTI raw recordings."""
 
     path: Path
     """The ``calib_cam_to_cam.txt`` it comes from."""
     projections: Mapping[int, Array]
-    """P_rect of each camera, 3 x 4: rectified camera 0 to homogeneous pixels."""
+    """P_rect of each camera as printed, 3 x 4: rectified camera 0 to homogeneous pixels counted from one."""
     sizes: Mapping[int, tuple[int, int]]
     """(height, width) of the rectified images of each camera."""
     rectification: Array
@@ -92,7 +94,7 @@ class KittiCalibration:
     """Laser scanner to unrectified camera 0, 4 x 4; None without ``calib_velo_to_cam.txt``."""
 
     def intrinsics(self, camera: int) -> Array:
-        """Return K of a camera, 3 x 3, in pixels of its rectified image.
+        """Return K of a camera, 3 x 3, in pixels of its rectified image counted from zero.
 
         Raises:
             DataError: if the calibration does not know that camera, or its K cannot be right.
@@ -108,7 +110,14 @@ class KittiCalibration:
                 f"{K[0, 2]:g}, {K[1, 2]:g} for an image of {height}x{width} (height x width); "
                 "the lengths must be positive and the centre inside"
             )
-        return K.copy()
+        return zero_based(K)
+
+
+def zero_based(K: Array) -> Array:
+    """Return K for pixels counted from zero, given one for pixels counted from one."""
+    moved = K.copy()
+    moved[:2, 2] -= 1
+    return moved
 
 
 def read_calibration(folder: Path) -> KittiCalibration:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saunet.checks import DataError, one_of
-from saunet.data.calibration import read_matrices
+from saunet.data.calibration import read_matrices, zero_based
 from saunet.data.images import read_image
 from saunet.data.kitti import frame_files
 
@@ -64,8 +64,8 @@ class OdometrySequence:
         return read_image(self._images / self._files[index])
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
-        """Return K of this camera, 3 x 3, in pixels."""
-        return self._K.copy()
+        """Return K of this camera, 3 x 3, in pixels counted from zero."""
+        return zero_based(self._K)
 
     def depth(self, index: int) -> NDArray[np.float32] | None:
         """Return None: the benchmark comes without depth."""
