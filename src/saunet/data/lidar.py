@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from saunet.checks import DataError, one_of
 from saunet.data.images import read_bytes
-from saunet.data.windows import nearest_map
+from saunet.data.resize import nearest_map
 
 LidarDepth = Literal["camera_z", "lidar_x"]
 KINDS = ("camera_z", "lidar_x")

@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from saunet.checks import ConfigError, DataError
+from saunet.data.resize import resize_depth, resize_image
 from saunet.data.sequences import Drive
 from saunet.geometry.camera import scale_intrinsics
 from saunet.types import FrameBatch
@@ -242,44 +242,3 @@ def fingerprint(names: Sequence[str]) -> str:
     """Return the SHA-256 of names sorted bytewise, joined by newlines, with a final one."""
     lines = sorted(name.encode() for name in names)
     return hashlib.sha256(b"\n".join([*lines, b""])).hexdigest()
-
-
-def resize_image(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """Resize an image with pixel areas averaged (bilinear where it grows); u maps to (u + 0.5) * s - 0.5."""
-    if image.shape[:2] == (height, width):
-        return image
-    shrinks = height <= image.shape[0] and width <= image.shape[1]
-    resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return np.asarray(resized, dtype=np.uint8)
-
-
-def resize_depth(depth: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
-    """Resize a depth map without mixing values.
-
-    A sparse map (less than half of it known) moves each measurement to the pixel where it now falls, the nearest wins;
-    a dense map is sampled at the new pixel centres.
-
-    Args:
-        depth: h x w, metres, 0 where unknown.
-        height: New height.
-        width: New width.
-    """
-    if depth.shape == (height, width):
-        return np.ascontiguousarray(depth, dtype=np.float32)
-    rows, columns = np.nonzero(depth)
-    if 2 * rows.size > depth.size:
-        return np.asarray(cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT), dtype=np.float32)
-    values = depth[rows, columns]
-    rows = np.minimum(((rows + 0.5) * (height / depth.shape[0])).astype(np.int64), height - 1)
-    columns = np.minimum(((columns + 0.5) * (width / depth.shape[1])).astype(np.int64), width - 1)
-    return nearest_map(rows, columns, values, (height, width))
-
-
-def nearest_map(
-    rows: NDArray[np.int64], columns: NDArray[np.int64], values: NDArray[Any], size: tuple[int, int]
-) -> NDArray[np.float32]:
-    """Scatter values into a map of zeros; where several fall on one pixel the smallest stays."""
-    order = np.argsort(-values, kind="stable")
-    out = np.zeros(size, np.float32)
-    out[rows[order], columns[order]] = values[order]
-    return out
