@@ -123,7 +123,7 @@ def test_predicting_from_onnx_does_not_import_torch(exported: tuple[Path, list[P
 
 
 def test_fixed_batch_is_filled_up(network: DepthNet, record: ModelRecord, tmp_path: Path, picture: Picture) -> None:
-    export_onnx(network, record, tmp_path / "x.onnx", dynamic_batch=False)
+    export_onnx(network, record, tmp_path / "x.onnx", batch="one")
     images = [picture, picture[:20], picture[:, ::-1].copy()]
     expected = Predictor(network, 32, 64, scale=record.scale).predict_batch(images)
     for got, wanted in zip(OnnxPredictor(tmp_path / "x.onnx").predict_batch(images), expected, strict=True):
@@ -143,10 +143,25 @@ def test_network_that_fixes_its_batch_size(network: DepthNet, record: ModelRecor
             return (image.view(int(image.shape[0]), 3, 32, 64)[:, :, ::2, ::2],)
 
     network.encoder = FixedBatch()
-    with pytest.raises(ConfigError, match="fixes its batch size when it is exported; export with dynamic_batch=false"):
-        export_program(network, record, tmp_path / "x.pt2")
-    export_program(network, record, tmp_path / "x.pt2", dynamic_batch=False)
-    assert (tmp_path / "x.pt2").stat().st_size > 0
+    with pytest.raises(ConfigError, match="fixes its batch size when it is exported; export with batch=one"):
+        export_program(network, record, tmp_path / "x.pt2", batch="any")
+    for batch in ("one", "auto"):
+        export_program(network, record, tmp_path / f"{batch}.pt2", batch=batch)
+        program = torch.export.load(tmp_path / f"{batch}.pt2").module()
+        assert program(torch.zeros(1, 3, 32, 64)).shape == (1, 1, 32, 64)
+
+
+@pytest.mark.slow
+def test_windowed_attention_exports(record: ModelRecord, tmp_path: Path) -> None:
+    """The paper's encoder in small: its shifted windows and its attention survive, for one image at a time."""
+    encoder = encoders.build("stratified_nano", dim=16, depths=(2, 2, 2, 2), heads=(1, 2, 4, 8))
+    network = DepthNet(encoder, decoders.partial("aunet")).eval()
+    size = (2 * network.size_divisor, 4 * network.size_divisor)
+    export_onnx(network, dataclasses.replace(record, height=size[0], width=size[1]), tmp_path / "x.onnx", "one")
+    image = torch.rand(2, 3, *size)
+    with torch.no_grad():
+        expected = network(image).disparity[0][:, 0].numpy()
+    assert np.abs(OnnxPredictor(tmp_path / "x.onnx").disparity(image.numpy()) - expected).max() < 1e-4
 
 
 def test_refused(
@@ -199,8 +214,8 @@ def test_every_pair_exports(encoder: str, decoder: str, record: ModelRecord, tmp
     own = dataclasses.replace(
         record, encoder=node("encoder", encoder), decoder=node("decoder", decoder), height=height, width=width
     )
-    export_onnx(network, own, tmp_path / "x.onnx", dynamic_batch=False)
-    export_program(network, own, tmp_path / "x.pt2", dynamic_batch=False)
+    export_onnx(network, own, tmp_path / "x.onnx", batch="one")
+    export_program(network, own, tmp_path / "x.pt2", batch="one")
     image = torch.rand(1, 3, height, width)
     with torch.no_grad():
         expected = network(image).disparity[0]

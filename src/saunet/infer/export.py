@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch._dynamo.exc import UserError
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from saunet.atomic import replacing, write_bytes
 from saunet.checkpoint import read_checkpoint
@@ -29,11 +31,14 @@ from saunet.record import ModelRecord
 
 FORMATS: tuple[str, ...] = ("onnx", "program")
 """``onnx``: model.onnx, for onnxruntime, TensorRT and others. ``program``: model.pt2, for torch alone."""
+BATCHES: tuple[str, ...] = ("auto", "any", "one")
+"""``any``: any number of images at once. ``one``: exactly one. ``auto``: any where the network allows it, else one."""
 TOLERANCE = 1e-4
 """Largest difference to the original network that passes, as a share of the range of disparity."""
 
 _FILES = {"onnx": "model.onnx", "program": "model.pt2"}
 _LARGEST_BATCH = 256
+_TRACING_ERRORS = (UserError, RuntimeError, ValueError)
 
 
 class FinestDisparity(nn.Module):
@@ -54,7 +59,7 @@ def export_model(
     formats: Sequence[str] = FORMATS,
     *,
     images: Sequence[str | Path] = (),
-    dynamic_batch: bool = True,
+    batch: str = "auto",
 ) -> list[Parity]:
     """Export a checkpoint's depth network into a folder, with its record, a parity report and a model card.
 
@@ -63,7 +68,7 @@ def export_model(
         output_dir: Where ``model.onnx``, ``model.pt2``, ``record.json``, ``report.json`` and ``README.md`` go.
         formats: Which files to write; see `FORMATS`.
         images: Real images to compare on, besides random ones.
-        dynamic_batch: Accept any number of images at once; else exactly one.
+        batch: How many images the files take at once; see `BATCHES`.
 
     Returns:
         One comparison a format.
@@ -75,6 +80,7 @@ def export_model(
     """
     for name in formats:
         one_of("formats", name, FORMATS)
+    one_of("batch", batch, BATCHES)
     read = read_checkpoint(checkpoint)
     network, record = read.networks()[0].eval(), read.record
     inputs = _inputs(record, images)
@@ -84,7 +90,7 @@ def export_model(
     for name in dict.fromkeys(formats):
         path = folder / _FILES[name]
         with replacing(path) as temporary:
-            _EXPORTERS[name](network, record, temporary, dynamic_batch)
+            _EXPORTERS[name](network, record, temporary, batch)
             report = compare(path.name, _run_eager(network), _RUNNERS[name](temporary), inputs, span)
             if not report.difference <= TOLERANCE:
                 raise CheckpointError(
@@ -99,14 +105,14 @@ def export_model(
     return reports
 
 
-def export_onnx(network: DepthNet, record: ModelRecord, path: str | Path, dynamic_batch: bool = True) -> None:
+def export_onnx(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> None:
     """Write a depth network as ONNX, with its record inside, so that one file is enough to predict from.
 
     Args:
         network: The network.
         record: Its record; gives the input size and goes into the file.
         path: The file to write.
-        dynamic_batch: Accept any number of images at once; else exactly one.
+        batch: How many images it takes at once; see `BATCHES`.
 
     Raises:
         ConfigError: if the packages are missing, or the network cannot be exported this way.
@@ -114,47 +120,61 @@ def export_onnx(network: DepthNet, record: ModelRecord, path: str | Path, dynami
     for package in ("onnx", "onnxscript"):
         if importlib.util.find_spec(package) is None:
             raise ConfigError(f"ONNX export needs the package {package}; run: pip install 'saunet[export]'")
-    program = _program(network, record, dynamic_batch)
-    with _quiet():
-        exported: Any = torch.onnx.export(
-            program, input_names=[INPUT], output_names=[OUTPUT], dynamo=True, verbose=False
-        )
+    # Attention in its plain form: what the fused kernel returns has strides that the exporter's own run of it has not.
+    with sdpa_kernel(SDPBackend.MATH):
+        program = _program(network, record, batch)
+    try:
+        with _quiet():
+            exported: Any = torch.onnx.export(
+                program, input_names=[INPUT], output_names=[OUTPUT], dynamo=True, verbose=False
+            )
+    except torch.onnx.OnnxExporterError as reason:
+        names = f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
+        raise ConfigError(f"{names} cannot be exported to ONNX; export the format 'program'") from reason
     exported.model.metadata_props[METADATA] = json.dumps(record.to_plain())
     exported.save(str(path))
 
 
-def export_program(network: DepthNet, record: ModelRecord, path: str | Path, dynamic_batch: bool = True) -> None:
+def export_program(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> None:
     """Write a depth network as a torch.export program: ``torch.export.load(path).module()(image)`` needs no saunet.
 
     Args:
         network: The network.
         record: Its record; gives the input size and goes into the file.
         path: The file to write.
-        dynamic_batch: Accept any number of images at once; else exactly one.
+        batch: How many images it takes at once; see `BATCHES`.
 
     Raises:
         ConfigError: if the network cannot be exported this way.
     """
     extra = {METADATA: json.dumps(record.to_plain())}
-    torch.export.save(_program(network, record, dynamic_batch), path, extra_files=extra)
+    torch.export.save(_program(network, record, batch), path, extra_files=extra)
 
 
-def _program(network: DepthNet, record: ModelRecord, dynamic_batch: bool) -> torch.export.ExportedProgram:
+def _program(network: DepthNet, record: ModelRecord, batch: str) -> torch.export.ExportedProgram:
+    one_of("batch", batch, BATCHES)
     module = FinestDisparity(network).eval()
-    image = torch.zeros(2 if dynamic_batch else 1, 3, record.height, record.width)
-    shapes = {"image": {0: torch.export.Dim("batch", min=1, max=_LARGEST_BATCH)}} if dynamic_batch else None
+    names = f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
+    if batch != "one":
+        try:
+            return _trace(module, torch.zeros(2, 3, record.height, record.width), dynamic=True)
+        except _TRACING_ERRORS as reason:
+            if batch == "any":
+                raise ConfigError(
+                    f"{names} fixes its batch size when it is exported; export with batch=one"
+                ) from reason
     try:
-        with torch.no_grad(), _quiet():
-            program: torch.export.ExportedProgram = torch.export.export(module, (image,), dynamic_shapes=shapes)
-            program = program.run_decompositions({})  # inlines autocast regions, which cannot be saved
-    except (torch._dynamo.exc.UserError, RuntimeError, ValueError) as reason:
-        if dynamic_batch:
-            raise ConfigError(
-                f"{type(network.encoder).__name__} with {type(network.decoder).__name__} fixes its batch size when "
-                "it is exported; export with dynamic_batch=false"
-            ) from reason
-        raise ConfigError(f"the network cannot be exported: {str(reason).splitlines()[0]}") from reason
-    return program
+        return _trace(module, torch.zeros(1, 3, record.height, record.width), dynamic=False)
+    except _TRACING_ERRORS as reason:
+        raise ConfigError(f"{names} cannot be exported: {str(reason).splitlines()[0]}") from reason
+
+
+def _trace(module: nn.Module, image: Tensor, dynamic: bool) -> torch.export.ExportedProgram:
+    shapes = {"image": {0: torch.export.Dim("batch", min=1, max=_LARGEST_BATCH)}} if dynamic else None
+    with torch.no_grad(), _quiet():
+        program: torch.export.ExportedProgram = torch.export.export(module, (image,), dynamic_shapes=shapes)
+        # decomposing into nothing new inlines autocast regions, which cannot be saved
+        return program.run_decompositions({})  # type: ignore[no-any-return]
 
 
 def _inputs(record: ModelRecord, images: Sequence[str | Path]) -> list[NDArray[np.float32]]:
@@ -198,7 +218,7 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-_EXPORTERS: dict[str, Callable[[DepthNet, ModelRecord, Path, bool], None]] = {
+_EXPORTERS: dict[str, Callable[[DepthNet, ModelRecord, Path, str], None]] = {
     "onnx": export_onnx,
     "program": export_program,
 }
