@@ -26,7 +26,19 @@ ALLOWED: dict[str, set[str]] = {
     "checkpoint": {"registry", "types", "checks", "models", "atomic", "record"},
     "evaluation": {"types", "checks", "metrics", "atomic"},
     "infer": {"types", "checks", "atomic", "record", "checkpoint", "geometry", "metrics.functional", "models.depth"},
-    "lit": {"registry", "types", "checks", "checkpoint", "geometry", "metrics", "infer", "data.module"},
+    "lit": {
+        "registry",
+        "types",
+        "checks",
+        "record",
+        "checkpoint",
+        "geometry",
+        "metrics",
+        "infer",
+        "data.module",
+        "losses.base",
+    },
+    "benchmarking": {"checks", "atomic"},
     "config": {"registry", "schema", "checks", "lit.optim"},
 }
 # third-party package -> the rooms that may import it

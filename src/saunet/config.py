@@ -85,11 +85,34 @@ class PredictConfig:
     device: str = "auto"
 
 
+@dataclass
+class BenchmarkConfig:
+    """Root of ``saunet-benchmark``: ``model`` alone, or each of ``models`` (names of choices of ``model``)."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    models: list[str] = field(default_factory=list)
+    sizes: list[str] = field(default_factory=lambda: ["192x640"])
+    devices: list[str] = field(default_factory=lambda: ["auto"])
+    precisions: list[str] = field(default_factory=lambda: ["fp32"])
+    modes: list[str] = field(default_factory=lambda: ["eager"])
+    batch_sizes: list[int] = field(default_factory=lambda: [1])
+    runs: int = 20
+    warmup: int = 3
+    threads: int | None = None
+    figure: bool = False
+    abs_rel: dict[str, float] = field(default_factory=dict)
+    output_dir: str = MISSING
+
+
+ROOTS = (TrainConfig, EvaluateConfig, PredictConfig, BenchmarkConfig, ModelConfig)
+"""The typed roots, and what lies directly below them."""
+
+
 def register_configs() -> None:
     """Put the root schemas and every registered component into Hydra's config store."""
     store = ConfigStore.instance()
-    for name, root in (("train", TrainConfig), ("evaluate", EvaluateConfig), ("predict", PredictConfig)):
-        store.store(name=f"{name}_schema", node=root)
+    for root in ROOTS[:-1]:
+        store.store(name=f"{root.__name__.removesuffix('Config').lower()}_schema", node=root)
     for registry in REGISTRIES.values():
         if registry.group is None:
             continue
@@ -131,8 +154,8 @@ def check(cfg: DictConfig) -> None:
         )
     objective = plain(cfg.objective)
     gradient = objective.get("gradient") or {}
-    if gradient.get("target") == "lidar" and not cfg.data.get("with_target_depth", False):
+    if gradient.get("target") == "lidar" and not cfg.data.get("target_depth", False):
         raise ConfigError(
             "objective.gradient.target=lidar needs LiDAR depth in the training batches; "
-            "set data.with_target_depth=true, or use objective.gradient.target=image"
+            "set data.target_depth=true, or use objective.gradient.target=image"
         )
