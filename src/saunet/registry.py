@@ -89,7 +89,7 @@ class Registry:
             ConfigError: for an unknown name or parameter.
         """
         entry = self.entry(name)
-        self._check_keys(entry, kwargs)
+        _check_keys(f"{self.kind} '{name}'", entry.target, kwargs)
         return entry.target(**{**entry.preset, **kwargs})
 
     def partial(self, name: str, /, **kwargs: Any) -> Callable[..., Any]:
@@ -120,15 +120,6 @@ class Registry:
         """Return the typed config node of ``name``."""
         entry = self.entry(name)
         return schema.node(entry.target, entry.preset, self.late)
-
-    def _check_keys(self, entry: Entry, kwargs: Mapping[str, Any]) -> None:
-        known = schema.parameters(entry.target)
-        for key in kwargs:
-            if key not in known:
-                hint = suggest(key, known)
-                raise ConfigError(
-                    f"{self.kind} '{entry.name}' has no parameter '{key}'{hint or ';'} allowed: {', '.join(known)}"
-                )
 
     def _import_home(self) -> None:
         if self._home is None:
@@ -179,20 +170,28 @@ def instantiate(node: Any) -> Any:
         if "_target_" not in node:
             return values
         path = values.pop("_target_")
-        owner, entry = _by_path(path)
-        owner._check_keys(entry, values)
-        return functools.partial(entry.target, **values) if node.get("_partial_") else entry.target(**values)
+        target = _by_path(path).target
+        _check_keys(f"'{target.__qualname__}'", target, values)
+        return functools.partial(target, **values) if node.get("_partial_") else target(**values)
     if isinstance(node, list | tuple):
         return [instantiate(item) for item in node]
     return node
 
 
-def _by_path(path: str) -> tuple[Registry, Entry]:
+def _by_path(path: str) -> Entry:
     for owner in REGISTRIES.values():
         for entry in owner:
             if entry.path == path:
-                return owner, entry
+                return entry
     raise ConfigError(
         f"'{path}' is not a registered component, so it is not built; "
         "import the module that registers it first, or see `saunet-components` for what is available"
     )
+
+
+def _check_keys(what: str, target: Callable[..., Any], kwargs: Mapping[str, Any]) -> None:
+    known = schema.parameters(target)
+    for key in kwargs:
+        if key not in known:
+            hint = suggest(key, known)
+            raise ConfigError(f"{what} has no parameter '{key}'{hint or ';'} allowed: {', '.join(known)}")

@@ -2,37 +2,58 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import re
 import sys
+import warnings
 from collections.abc import Callable
 from functools import wraps
+from typing import Any, NoReturn
 
 import hydra
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
-from saunet.checks import SaunetError
-from saunet.config import config_dir, register_configs
+from saunet import schema
+from saunet.checks import SaunetError, suggest
+from saunet.config import ROOTS, config_dir, register_configs
+from saunet.registry import REGISTRIES
 
 
-def run(name: str, task: Callable[[DictConfig], None]) -> None:
-    """Run ``task`` as the Hydra application whose root config is ``conf/<name>.yaml``."""
+def run(name: str, task: Callable[[DictConfig], Any]) -> None:
+    """Run ``task`` as the Hydra application whose root config is ``conf/<name>.yaml``.
+
+    What a user can mend ends in one sentence and exit code 1; only a defect of the program shows a traceback.
+    ``HYDRA_FULL_ERROR=1`` shows it always.
+    """
+    before = os.environ.get("HYDRA_FULL_ERROR")
+    # A process that DDP started inherits the variable from us, not from the user.
+    debug = before == "1" and "LOCAL_RANK" not in os.environ
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then lets exceptions through instead of printing them its own way
     register_configs()
+    _quieten()
 
     @wraps(task)
-    def guarded(cfg: DictConfig) -> None:
-        try:
-            _require(cfg)
-            task(cfg)
-        except SaunetError as error:
-            _fail(name, str(error))
-        except MissingMandatoryValue as error:
-            _fail(name, str(error).splitlines()[0])
-        except OmegaConfBaseException as error:
-            _fail(name, " ".join(str(error).split()))
-        except KeyboardInterrupt:
-            _fail(name, "interrupted", code=130)
+    def required(cfg: DictConfig) -> None:
+        missing = sorted(OmegaConf.missing_keys(cfg))
+        if missing:
+            needed = " ".join(f"{key}=..." for key in missing)
+            raise SaunetError(f"{missing[0]} is not set; add {needed} to the command line")
+        task(cfg)
 
-    hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(guarded)()
+    try:
+        hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(required)()
+    except KeyboardInterrupt:
+        _fail(name, "interrupted", code=130)
+    except (SaunetError, HydraException, OmegaConfBaseException, OSError) as error:
+        if debug:
+            raise
+        _fail(name, _sentence(error))
+    finally:
+        if before is None:
+            del os.environ["HYDRA_FULL_ERROR"]
 
 
 def pick_device(name: str) -> str:
@@ -42,14 +63,62 @@ def pick_device(name: str) -> str:
     return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
 
 
-def _require(cfg: DictConfig) -> None:
-    missing = sorted(OmegaConf.missing_keys(cfg))
-    if missing:
-        raise SaunetError(
-            f"{missing[0]} is not set; add {' '.join(f'{key}=...' for key in missing)} to the command line"
-        )
+def _quieten() -> None:
+    """Keep the terminal to what concerns the user: no advertisements, no deprecations inside other libraries."""
+
+    class NoAdvertisement(logging.Filter):
+        def filter(self, record: logging.LogRecord) -> bool:
+            text = record.getMessage()
+            return not text.startswith(("💡", "TPU available", "Loading `train_dataloader` to estimate"))
+
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(NoAdvertisement())
+    warnings.filterwarnings("ignore", message=r".*LeafSpec.*")
+    warnings.filterwarnings("ignore", message=r".*does not have many workers.*")
 
 
-def _fail(name: str, message: str, code: int = 1) -> None:
+def _fail(name: str, message: str, code: int = 1) -> NoReturn:
     print(f"saunet-{name}: {message}", file=sys.stderr)
     raise SystemExit(code)
+
+
+def _sentence(error: Exception) -> str:
+    """Say in one sentence what Hydra, OmegaConf or the system say in many lines."""
+    text = f"{error}\n{error.__cause__ or ''}"
+    if isinstance(error, MissingConfigException):  # which is an OSError too
+        return _unknown_choice(text)
+    if isinstance(error, OSError):
+        return f"cannot use {error.filename or 'a file'}: {error.strerror or error}; check the path and its rights"
+    if isinstance(error, SaunetError):
+        return str(error)
+    full_key = re.search(r"full_key: (\S+)", text)
+    unknown = re.search(r"Key '(\w+)' (?:is )?not in '(\w+)'", text)
+    if unknown and full_key:
+        key, owner = unknown.groups()
+        allowed = _keys(owner)
+        return f"unknown key '{full_key[1]}'{suggest(key, allowed) or ';'} allowed: {', '.join(allowed)}"
+    wrong = re.search(r"Value '.*' of type .*", text)
+    if wrong and full_key:
+        return f"{full_key[1]}: {wrong[0][0].lower()}{wrong[0][1:]}"
+    return " ".join(text.split())
+
+
+def _unknown_choice(text: str) -> str:
+    wanted = re.search(r"Could not find '([^']+)'", text)
+    listed = re.search(r"Available options in '([^']+)':\n(.*?)\nConfig search path", text, re.DOTALL)
+    if not wanted or not listed:
+        return " ".join(text.split())
+    options = [option for option in listed[2].split() if option not in ("base", "lightning")]
+    name = wanted[1].rpartition("/")[2]
+    return f"unknown {listed[1]} '{name}'{suggest(name, options) or ';'} available: {', '.join(options)}"
+
+
+def _keys(owner: str) -> list[str]:
+    """Return the keys of a config node by the name of its class."""
+    for root in ROOTS:
+        if root.__name__ == owner:
+            return list(root.__dataclass_fields__)
+    for registry in REGISTRIES.values():
+        for entry in registry:
+            if entry.target.__name__ == owner:
+                return [name for name in schema.parameters(entry.target) if name not in registry.late]
+    return []

@@ -1,4 +1,4 @@
-"""What watches a training: stop on a non-finite loss, and a picture of what the network sees and does every epoch."""
+"""What accompanies a training: checkpoints, the progress bar, a stop on a non-finite loss, a picture every epoch."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
 from torch import Tensor
 
 from saunet.checks import SaunetError
@@ -44,6 +46,40 @@ class StopOnNonFinite(Callback):
             )
 
 
+class Checkpoints(ModelCheckpoint):
+    """The best and the last state, also where no validation frame has ground truth.
+
+    Args:
+        folder: Where ``best.ckpt`` and ``last.ckpt`` go.
+        monitor: Decides what is best (smaller is better); where it is not measured, ``val/loss`` does, else
+            ``train/loss``.
+    """
+
+    def __init__(self, folder: str, monitor: str = "val/abs_rel") -> None:
+        super().__init__(folder, "best", monitor, mode="min", save_last=True, enable_version_counter=False)
+
+    @property
+    def state_key(self) -> str:
+        """Name in the checkpoint; without the monitor, which may have fallen back."""
+        return "Checkpoints"
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Choose what to monitor, then save."""
+        self._choose(trainer)
+        super().on_validation_end(trainer, pl_module)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Choose what to monitor, then save."""
+        self._choose(trainer)
+        super().on_train_epoch_end(trainer, pl_module)
+
+    def _choose(self, trainer: Trainer) -> None:
+        measured = [name for name in (self.monitor, "val/loss", "train/loss") if name in trainer.callback_metrics]
+        if measured and measured[0] != self.monitor:
+            rank_zero_warn(f"{self.monitor} is not measured on these data; the best checkpoint is by {measured[0]}")
+            self.monitor = measured[0]
+
+
 class PicturePanel(Callback):
     """Write input, disparity, warped view and auto-mask of one validation batch after every validation.
 
@@ -76,3 +112,24 @@ class PicturePanel(Callback):
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 logger.experiment.add_image("panel", panel, trainer.global_step, dataformats="HWC")
+
+
+class Progress(TQDMProgressBar):
+    """One bar with what matters, after one line that says how large the networks are."""
+
+    def __init__(self, refresh_rate: int = 5) -> None:
+        super().__init__(refresh_rate=refresh_rate)
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say how many parameters are trained."""
+        counts = {
+            name: sum(parameter.numel() for parameter in module.parameters()) / 1e6
+            for name, module in pl_module.named_children()
+        }
+        parts = ", ".join(f"{name} {count:.1f} M" for name, count in counts.items() if count)
+        rank_zero_info(f"networks: {parts}; together {sum(counts.values()):.1f} M parameters")
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
+        """Return what the bar shows; the logger's version number is not a metric."""
+        metrics = super().get_metrics(trainer, pl_module)
+        return {name: value for name, value in metrics.items() if name != "v_num"}

@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from saunet.geometry import warp
 from saunet.geometry.depth import disparity_to_depth
 from saunet.lit.optim import Recipe
+from saunet.losses.base import Objective
 from saunet.metrics.depth import DepthMetrics
 from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
 
@@ -36,7 +37,7 @@ class SelfSupervisedDepth(LightningModule):
         self,
         depth: nn.Module,
         pose: nn.Module,
-        objective: nn.Module,
+        objective: Objective,
         recipe: Recipe | None = None,
         metrics: DepthMetrics | None = None,
         seed: int = 0,
@@ -73,8 +74,16 @@ class SelfSupervisedDepth(LightningModule):
         pyramid: DepthPyramid = self.depth(batch["target"])  # Z_t
         poses = self.pose(batch["target"], batch["sources"])  # D_{t->t'}
         views = self.synthesize(batch, pyramid, poses)  # H_{t'->t}, eq. (7)
+        if self.objective.needs_source_depth:
+            batch = {**batch, "source_depth": self._source_depth(batch)}
         terms: LossTerms = self.objective(batch, pyramid, poses, views)  # alpha L1 + beta L2, eq. (14)
         return pyramid, views, terms
+
+    def _source_depth(self, batch: TrainBatch) -> Float[Tensor, "b s 1 h w"]:
+        """Return the depth of the source images, for terms that compare it with the target's."""
+        sources = batch["sources"]
+        pyramid: DepthPyramid = self.depth(sources.flatten(0, 1))
+        return pyramid.depth[0].unflatten(0, sources.shape[:2])
 
     @staticmethod
     def synthesize(batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"]) -> tuple[View, ...]:
