@@ -12,6 +12,7 @@ from functools import wraps
 from typing import Any, NoReturn
 
 import hydra
+import torch
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -58,8 +59,6 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
 
 def pick_device(name: str) -> str:
     """Return the device that ``auto`` stands for: a GPU where there is one; any other name as it is."""
-    import torch
-
     return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
 
 

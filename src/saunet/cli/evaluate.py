@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig
 
 from saunet import config
-from saunet.checks import ConfigError, one_of
+from saunet.checks import DataError, one_of
 from saunet.cli._app import pick_device, run
 
 
@@ -36,34 +38,44 @@ def evaluate_model(
         A `saunet.evaluation.EvaluationResult`.
 
     Raises:
-        ConfigError: if the data set has no ground truth, or a protocol does not fit it.
+        ConfigError: if a protocol does not fit the data set's ground truth.
+        DataError: if the split has no frame with ground truth.
     """
     from saunet.evaluation import NetworkPredictor, evaluate
-    from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
+    from saunet.metrics.baselines import ConstantDepth
     from saunet.metrics.protocols import protocol
 
     one_of("split", split, ("val", "test"))
-    if data.ground_truth is None:
-        raise ConfigError(
-            f"data set '{type(data).__name__}' has no ground truth; choose one that has, such as data=kitti"
-        )
     predictors = {"model": NetworkPredictor(network, flip=flip)}
     if baselines:
         predictors["constant depth"] = NetworkPredictor(ConstantDepth())
-        data.setup("fit")
-        mean = MeanDepthMap()
-        for depth in data.ground_truths("train"):
-            mean.update(depth[None], depth.new_tensor([depth.shape[-2:]]).long())
-        if mean.count.sum() > 0:
+        mean = _mean_depth_map(data)
+        if mean is not None:
             predictors["mean depth map"] = NetworkPredictor(mean)
     data.setup("test" if split == "test" else "fit")
     return evaluate(
         predictors,
-        data.eval_batches(split, next(network.parameters()).device),
+        data.batches(split, next(network.parameters()).device),
         [protocol(name) for name in protocols or [data.protocol]],
         ground_truth=data.ground_truth,
         total=len(data.datasets[split]),
     )
+
+
+def _mean_depth_map(data: Any) -> Any:
+    """Return the mean depth map of the training split, or None, and say so, where there is no training depth."""
+    from saunet.metrics.baselines import MeanDepthMap
+
+    mean = MeanDepthMap()
+    try:
+        data.setup("fit")
+        for depth in data.ground_truths("train"):
+            mean.update(depth[None], torch.tensor([depth.shape[-2:]]))
+        mean.depth_map()
+    except DataError as reason:
+        print(f"the mean depth map is left out: {reason}", file=sys.stderr)
+        return None
+    return mean
 
 
 def evaluate(cfg: DictConfig) -> None:

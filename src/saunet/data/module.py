@@ -5,13 +5,15 @@ A data set subclasses `DepthDataModule`, names its own parameters beside the sha
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
+from jaxtyping import Float
 from lightning.pytorch import LightningDataModule
-from lightning.pytorch.utilities import rank_zero_info
+from lightning.pytorch.utilities import move_data_to_device, rank_zero_info
 from torch.utils.data import DataLoader
 
 from saunet.checks import ConfigError, DataError, in_range, positive
@@ -154,6 +156,19 @@ class DepthDataModule(LightningDataModule):
     def predict_dataloader(self) -> DataLoader[Any]:
         """Return the frames to predict, each once."""
         return self._eval_loader("predict")
+
+    def batches(self, split: str, device: str | torch.device) -> Iterator[EvalBatch]:
+        """Yield a split's batches as the networks want them, on a device: evaluation without a trainer."""
+        for batch in self._eval_loader(split):
+            yield self.prepare(move_data_to_device(batch, torch.device(device)))
+
+    def ground_truths(self, split: str) -> Iterator[Float[torch.Tensor, "1 h w"]]:
+        """Yield the true depth of a split's frames at native size, metres, 0 where unknown; skips those without any."""
+        dataset = self._set_up(split)
+        for position, frame in dataset.windows:
+            depth = dataset.drives[position].depth(frame)
+            if depth is not None:
+                yield torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32))[None]
 
     def on_after_batch_transfer(self, batch: FrameBatch, dataloader_idx: int) -> TrainBatch | EvalBatch:
         """Turn bytes into images on the device; samples that carry random numbers are augmented."""

@@ -83,7 +83,7 @@ class SelfSupervisedDepth(LightningModule):
         """Return the depth of the source images, for terms that compare it with the target's."""
         sources = batch["sources"]
         pyramid: DepthPyramid = self.depth(sources.flatten(0, 1))
-        return pyramid.depth[0].unflatten(0, sources.shape[:2])
+        return pyramid.depth[0].reshape(*sources.shape[:2], 1, *sources.shape[-2:])
 
     @staticmethod
     def synthesize(batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"]) -> tuple[View, ...]:
