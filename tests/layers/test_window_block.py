@@ -7,8 +7,9 @@ import torch
 import torch.nn.functional as F
 
 from saunet.checks import ConfigError
-from saunet.layers.window_block import DropPath, Mlp, PatchMerging, SwinBlock, SwinStage
-from saunet.layers.window_stream import rows_per_piece, streams
+from saunet.layers import window_stream
+from saunet.layers.window_block import DropPath, PatchMerging, SwinBlock, SwinStage
+from saunet.layers.window_stream import streams
 
 
 def test_block_is_eqs_1_to_4() -> None:
@@ -62,17 +63,32 @@ def test_recomputation_gives_the_same_gradients() -> None:
         torch.testing.assert_close(plain, recomputed)
 
 
-def test_pieces_change_nothing() -> None:
-    mlp = Mlp(6, 4000).double()
-    x = torch.randn(3 * rows_per_piece(4000) + 5, 6, dtype=torch.double)
+@pytest.mark.parametrize("mask_padding", [True, False])
+@pytest.mark.parametrize("size", [(8, 12), (9, 11)])
+def test_pieces_change_nothing(size: tuple[int, int], mask_padding: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(window_stream, "_CACHED_ELEMENTS", 64 * 24)  # several pieces in every group
+    block = SwinBlock(8, 2, 4, shift=2, mask_padding=mask_padding).double().eval()
+    x = torch.randn(3, *size, 8, dtype=torch.double)
+    before = x.clone()
     with torch.no_grad():
-        assert streams(x, mlp.fc1, mlp.fc2)
-        torch.testing.assert_close(mlp(x), mlp.fc2(F.gelu(mlp.fc1(x))))
+        assert streams(x, block)
+        torch.testing.assert_close(block(x), x + (y := block.attn(block.norm1(x))) + block.mlp(block.norm2(x + y)))
+    assert torch.equal(x, before)
 
 
-def test_hooks_see_their_layer_once() -> None:
-    mlp, seen = Mlp(6, 4000), []
-    mlp.fc1.register_forward_hook(lambda *call: seen.append(call[2].shape))
+def test_what_watches_or_replaces_a_layer_is_respected() -> None:
+    block, x, seen = SwinBlock(8, 2, 4).eval(), torch.randn(1, 8, 8, 8), []
+    assert not streams(x, block)
     with torch.no_grad():
-        mlp(torch.randn(2 * rows_per_piece(4000), 6))
-    assert seen == [(2 * rows_per_piece(4000), 4000)]
+        assert streams(x, block)
+        assert not streams(x, block.train())
+        block.eval()
+        with torch.autocast("cpu", torch.bfloat16):
+            assert not streams(x, block)
+        handle = block.mlp.fc1.register_forward_hook(lambda *call: seen.append(call[2].shape))
+        assert not streams(x, block)
+        block(x)
+        assert seen == [(1, 8, 8, 32)]
+        handle.remove()
+        block.mlp.fc1 = torch.nn.Sequential(block.mlp.fc1)  # type: ignore[assignment]
+        assert not streams(x, block)

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from saunet import checks
 from saunet.layers.window_plan import WindowGroup, relative_position_index, window_groups, window_order
-from saunet.layers.window_stream import linear_into, rows_per_piece, streams
 
 
 class _Reorder(torch.autograd.Function):
@@ -65,16 +64,23 @@ class WindowAttention(nn.Module):
     def forward(self, x: Float[Tensor, "b h w c"]) -> Float[Tensor, "b h w c"]:
         """Attend within each window of a map of tokens."""
         height, width = x.shape[1:3]
-        if not self.mask_padding:
+        if self.pads(height, width):
             x = F.pad(x, (0, 0, 0, -width % self.window, 0, -height % self.window))
         batch, rows, columns, _ = x.shape
         order, inverse = window_order(batch, rows, columns, self.window, self.shift, x.device)
         groups = window_groups(rows, columns, self.window, self.shift)
         tokens = reorder(x.reshape(-1, self.dim), order, inverse)
-        attend = self._stream if streams(tokens, self.qkv, self.proj) else self._whole
-        attended = attend(tokens, groups, batch)
+        qkv = torch.split(self.qkv(tokens), [batch * group.windows * group.area for group in groups])
+        parts = [
+            self.attend(part, group, self.bias(group, part.dtype)) for part, group in zip(qkv, groups, strict=True)
+        ]
+        attended = self.proj(parts[0] if len(parts) == 1 else torch.cat(parts))
         out = reorder(attended, inverse, order).view(batch, rows, columns, self.dim)
         return out if (rows, columns) == (height, width) else out[:, :height, :width]
+
+    def pads(self, height: int, width: int) -> bool:
+        """Return whether a map of this size is padded with zeros."""
+        return not self.mask_padding and (height % self.window != 0 or width % self.window != 0)
 
     def bias(self, group: WindowGroup, dtype: torch.dtype) -> Float[Tensor, "1 heads n n"]:
         """Return the relative position bias of a window size."""
@@ -83,37 +89,10 @@ class WindowAttention(nn.Module):
         pairs = table.to(dtype).t().index_select(1, index)
         return pairs.view(1, self.heads, group.area, group.area)
 
-    def _whole(self, tokens: Float[Tensor, "n c"], groups: list[WindowGroup], batch: int) -> Float[Tensor, "n c"]:
-        """Attend with one projection over all tokens: few kernels, for training, accelerators and compilers."""
-        qkv = self.qkv(tokens)
-        sizes = [batch * group.windows * group.area for group in groups]
-        parts = [
-            self._attend(part, group, self.bias(group, part.dtype))
-            for part, group in zip(torch.split(qkv, sizes), groups, strict=True)
-        ]
-        return self.proj(parts[0] if len(parts) == 1 else torch.cat(parts))  # type: ignore[no-any-return]
-
-    def _stream(self, tokens: Float[Tensor, "n c"], groups: list[WindowGroup], batch: int) -> Float[Tensor, "n c"]:
-        """Attend a few windows at a time: intermediate results stay in a CPU's cache."""
-        out, start, size = torch.empty_like(tokens), 0, rows_per_piece(3 * self.dim)
-        buffer = tokens.new_empty(min(max(size, self.window**2), len(tokens)), 3 * self.dim)
-        for group in groups:
-            stop = start + batch * group.windows * group.area
-            rows = max(1, size // group.area) * group.area
-            bias = self.bias(group, tokens.dtype)
-            for piece, target in zip(
-                torch.split(tokens[start:stop], rows),
-                torch.split(out[start:stop], rows),
-                strict=True,
-            ):
-                qkv = linear_into(self.qkv, piece, buffer[: len(piece)])
-                linear_into(self.proj, self._attend(qkv, group, bias), target)
-            start = stop
-        return out
-
-    def _attend(
+    def attend(
         self, qkv: Float[Tensor, "n c3"], group: WindowGroup, bias: Float[Tensor, "1 heads a a"]
     ) -> Float[Tensor, "n c"]:
+        """Attend inside each window of a group, given queries, keys and values of its tokens and its bias."""
         split = qkv.view(-1, group.area, 3, self.heads, self.dim // self.heads)
         query, key, value = split.permute(2, 0, 3, 1, 4).unbind(0)
         out = F.scaled_dot_product_attention(query, key, value, attn_mask=bias)

@@ -12,7 +12,7 @@ from torch.utils.checkpoint import checkpoint
 
 from saunet import checks
 from saunet.layers.window_attention import WindowAttention
-from saunet.layers.window_stream import linear_into, rows_per_piece, streams
+from saunet.layers.window_stream import add_attention, add_mlp, streams
 
 
 class DropPath(nn.Module):
@@ -55,16 +55,7 @@ class Mlp(nn.Module):
 
     def forward(self, x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
         """Map each token on its own."""
-        if not streams(x, self.fc1, self.fc2):
-            return self.fc2(F.gelu(self.fc1(x)))  # type: ignore[no-any-return]
-        rows = x.reshape(-1, x.shape[-1])
-        out = torch.empty_like(rows)
-        size = rows_per_piece(self.fc1.out_features)
-        buffer = rows.new_empty(min(size, len(rows)), self.fc1.out_features)
-        for piece, target in zip(torch.split(rows, size), torch.split(out, size), strict=True):
-            hidden = linear_into(self.fc1, piece, buffer[: len(piece)])
-            linear_into(self.fc2, torch.ops.aten.gelu_(hidden), target)
-        return out.view(x.shape)
+        return self.fc2(F.gelu(self.fc1(x)))  # type: ignore[no-any-return]
 
 
 class SwinBlock(nn.Module):
@@ -99,6 +90,9 @@ class SwinBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "b h w c"]) -> Float[Tensor, "b h w c"]:
         """Apply attention and MLP, each behind a norm and around a residual."""
+        if streams(x, self) and not self.attn.pads(x.shape[1], x.shape[2]):
+            x = add_attention(x, self.norm1, self.attn)
+            return add_mlp(x, self.norm2, self.mlp.fc1, self.mlp.fc2)
         x = x + self.drop_path(self.attn(self.norm1(x)))
         return x + self.drop_path(self.mlp(self.norm2(x)))  # type: ignore[no-any-return]
 

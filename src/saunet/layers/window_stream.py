@@ -1,21 +1,25 @@
-"""Linear layers over a few rows at a time on a CPU, so that wide intermediate results never leave its cache.
+"""Window blocks a few rows at a time, for prediction on a CPU: wide intermediate results never leave its cache.
 
 At 192x640 the hidden activations of one block of the first stage fill 47 MB. Fresh memory of that size costs more than
-the arithmetic, so in prediction on a CPU the blocks work through their rows in pieces, with one small buffer for all.
+the arithmetic, so here each half of a block (norm, layer, residual) runs piece by piece, with one small buffer for all.
 """
 
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from saunet.layers.window_attention import WindowAttention
+from saunet.layers.window_plan import window_groups, window_order
 
 _CACHED_ELEMENTS = 1_500_000
 """Elements of the widest intermediate result of a piece: a few MB, about the cache of two cores."""
 
 
-def streams(tokens: Tensor, *layers: nn.Module) -> bool:
-    """Return whether to work in pieces: on a CPU, in prediction, while nobody is watching the layers.
+def streams(tokens: Tensor, block: nn.Module) -> bool:
+    """Return whether a block may work in pieces: on a CPU, in prediction, while nobody is watching its layers.
 
     Gradients, autocast, a compiler or exporter, hooks and layers that somebody replaced (quantised, adapted) get the
     plain way through the layers' own ``forward``.
@@ -25,8 +29,14 @@ def streams(tokens: Tensor, *layers: nn.Module) -> bool:
         and not torch.is_grad_enabled()
         and not torch.compiler.is_compiling()
         and not torch.is_autocast_enabled("cpu")
-        and all(type(layer) is nn.Linear and not layer._forward_hooks | layer._forward_pre_hooks for layer in layers)
+        and not block.training
+        and all(_untouched(module) for module in block.children() for module in module.modules())
     )
+
+
+def _untouched(module: nn.Module) -> bool:
+    known = type(module) in (nn.Linear, nn.LayerNorm) or type(module).__module__.startswith("saunet.layers.")
+    return known and not (module._forward_hooks or module._forward_pre_hooks)
 
 
 def rows_per_piece(width: int) -> int:
@@ -34,6 +44,44 @@ def rows_per_piece(width: int) -> int:
     return max(64, _CACHED_ELEMENTS // width)
 
 
-def linear_into(layer: nn.Linear, rows: Float[Tensor, "n i"], out: Float[Tensor, "n o"]) -> Float[Tensor, "n o"]:
-    """Write ``layer(rows)`` (with a bias) into ``out`` and return it."""
+def add_attention(
+    x: Float[Tensor, "b h w c"], norm: nn.LayerNorm, attention: WindowAttention
+) -> Float[Tensor, "b h w c"]:
+    """Return ``x + attention(norm(x))`` for a map that needs no padding."""
+    batch, height, width, dim = x.shape
+    window, shift = attention.window, attention.shift
+    order, inverse = window_order(batch, height, width, window, shift, x.device)
+    rows = x.reshape(-1, dim)
+    out, start, size = torch.empty_like(rows), 0, rows_per_piece(3 * dim)
+    buffer = rows.new_empty(min(max(size, window**2), len(rows)), 3 * dim)
+    for group in window_groups(height, width, window, shift):
+        stop, step = start + batch * group.windows * group.area, max(1, size // group.area) * group.area
+        bias = attention.bias(group, x.dtype)
+        for first in range(start, stop, step):
+            last = min(first + step, stop)
+            tokens = F.embedding(order[first:last], rows)
+            qkv = _into(buffer[: last - first], attention.qkv, norm(tokens))
+            _add(out[first:last], tokens, attention.proj, attention.attend(qkv, group, bias))
+        start = stop
+    return F.embedding(inverse, out).view(x.shape)
+
+
+def add_mlp(x: Float[Tensor, "*n c"], norm: nn.LayerNorm, fc1: nn.Linear, fc2: nn.Linear) -> Float[Tensor, "*n c"]:
+    """Return ``x + fc2(gelu(fc1(norm(x))))``."""
+    rows = x.reshape(-1, x.shape[-1])
+    out, size = torch.empty_like(rows), rows_per_piece(fc1.out_features)
+    buffer = rows.new_empty(min(size, len(rows)), fc1.out_features)
+    for piece, target in zip(torch.split(rows, size), torch.split(out, size), strict=True):
+        hidden = _into(buffer[: len(piece)], fc1, norm(piece))
+        _add(target, piece, fc2, torch.ops.aten.gelu_(hidden))
+    return out.view(x.shape)
+
+
+def _into(out: Tensor, layer: nn.Linear, rows: Tensor) -> Tensor:
+    """Write ``layer(rows)`` to ``out``."""
     return torch.addmm(layer.bias, rows, layer.weight.t(), out=out)
+
+
+def _add(out: Tensor, residual: Tensor, layer: nn.Linear, rows: Tensor) -> Tensor:
+    """Write ``residual + layer(rows)`` to ``out``."""
+    return torch.add(residual, layer.bias, out=out).addmm_(rows, layer.weight.t())
