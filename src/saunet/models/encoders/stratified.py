@@ -12,7 +12,7 @@ from saunet.models.window_encoder import WindowEncoder
 from saunet.registry import encoders
 
 
-@encoders.register("stratified_nano", dim=32, depths=(2, 2, 2, 2), heads=(2, 4, 8, 16), drop_path=0.0)
+@encoders.register("stratified_nano", dim=32, depths=(2, 2, 2, 2), heads=(1, 2, 4, 8), mlp_ratio=3.0, drop_path=0.0)
 @encoders.register("stratified_tiny")
 @encoders.register("stratified_small", depths=(2, 2, 18, 2), drop_path=0.2)
 class StratifiedTransformer(WindowEncoder):
