@@ -41,12 +41,8 @@ def test_order_by_hand() -> None:
 
 def test_shifted_map_has_four_window_sizes() -> None:
     groups = window_groups(96, 320, 8, 4)
-    assert [(group.height, group.width, group.windows) for group in groups] == [
-        (8, 8, 11 * 39),
-        (4, 8, 2 * 39),
-        (8, 4, 2 * 11),
-        (4, 4, 4),
-    ]
+    assert set(groups) == {(8, 8, 11 * 39), (4, 8, 2 * 39), (8, 4, 2 * 11), (4, 4, 4)}
+    assert len(groups) == 4
 
 
 def test_relative_index_by_hand() -> None:

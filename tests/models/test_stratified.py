@@ -96,8 +96,8 @@ from saunet.models.encoders.stratified import StratifiedTransformer
 torch.manual_seed(0)
 encoder = StratifiedTransformer(dim=8, depths=(2,), heads=(1,), window=(5,)).eval()
 compiled = torch.compile(encoder, fullgraph=True, backend="aot_eager")
-for batch in (1, 3):
-    image = torch.rand(batch, 3, 16, 24)
+for shape in ((1, 3, 16, 24), (3, 3, 16, 24), (1, 3, 16, 32)):
+    image = torch.rand(shape)
     for grad in (False, True):
         with torch.set_grad_enabled(grad):
             maps = compiled(image)
@@ -108,7 +108,7 @@ for batch in (1, 3):
 """
 
 
-def test_compiles_as_one_graph_for_any_batch() -> None:
+def test_compiles_as_one_graph_for_any_batch_and_size() -> None:
     # in a process of its own: the shape checks that run under pytest cannot be traced
     done = subprocess.run([sys.executable, "-c", COMPILE], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -47,13 +47,12 @@ def axis_windows(size: int, window: int, shift: int) -> list[tuple[int, int]]:
 
 
 def window_groups(height: int, width: int, window: int, shift: int) -> list[WindowGroup]:
-    """Return the window sizes of a map, largest first, and how many there are of each."""
+    """Return the window sizes of a map and how many there are of each, in the order in which they first appear."""
     counts: dict[tuple[int, int], int] = {}
     for _, tall in axis_windows(height, window, shift):
         for _, wide in axis_windows(width, window, shift):
             counts[tall, wide] = counts.get((tall, wide), 0) + 1
-    sizes = sorted(counts, key=lambda size: (-size[0] * size[1], size))
-    return [WindowGroup(tall, wide, counts[tall, wide]) for tall, wide in sizes]
+    return [WindowGroup(tall, wide, windows) for (tall, wide), windows in counts.items()]
 
 
 def window_order(

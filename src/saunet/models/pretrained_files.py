@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import pickle
+import sys
 import urllib.error
 import urllib.parse
 from pathlib import Path
@@ -82,7 +83,7 @@ def _fetch(public: PublicWeights, url: str | None = None) -> Path:
     if not path.is_file():
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            torch.hub.download_url_to_file(url or public.url, str(path), progress=False)
+            torch.hub.download_url_to_file(url or public.url, str(path), progress=sys.stderr.isatty())
         except (OSError, urllib.error.URLError, ValueError) as reason:
             raise CheckpointError(
                 f"cannot fetch {url or public.url} ({reason}); fetch it where there is a network and put it at {path}, "
