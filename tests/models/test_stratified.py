@@ -98,17 +98,23 @@ encoder = StratifiedTransformer(dim=8, depths=(2,), heads=(1,), window=(5,)).eva
 compiled = torch.compile(encoder, fullgraph=True, backend="aot_eager")
 for shape in ((1, 3, 16, 24), (3, 3, 16, 24), (1, 3, 16, 32)):
     image = torch.rand(shape)
-    for grad in (False, True):
+    for grad in (False, True) if shape == (1, 3, 16, 24) else (False,):
         with torch.set_grad_enabled(grad):
             maps = compiled(image)
             for one, other in zip(maps, encoder(image)):
                 torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
-    maps[-1].sum().backward()
+    if grad:
+        maps[-1].sum().backward()
     assert encoder.stem["conv"].weight.grad is not None
+with torch.no_grad():
+    traced = torch.jit.trace(encoder, image)
+    assert "addmm_" not in str(traced.inlined_graph)  # the plain way, without writing into buffers
+    for one, other in zip(traced(image), encoder(image)):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
 """
 
 
-def test_compiles_as_one_graph_for_any_batch_and_size() -> None:
+def test_compiles_as_one_graph_for_any_batch_and_size_and_traces() -> None:
     # in a process of its own: the shape checks that run under pytest cannot be traced
     done = subprocess.run([sys.executable, "-c", COMPILE], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -29,6 +29,8 @@ class _Reorder(torch.autograd.Function):
 
 def reorder(rows: Float[Tensor, "n c"], order: Int[Tensor, " n"], inverse: Int[Tensor, " n"]) -> Float[Tensor, "n c"]:
     """Return ``rows[order]`` for a permutation whose inverse is known."""
+    if not torch.is_grad_enabled():
+        return F.embedding(order, rows)
     out: Tensor = _Reorder.apply(rows, order, inverse)  # type: ignore[no-untyped-call]
     return out
 
