@@ -21,14 +21,14 @@ _CACHED_ELEMENTS = 1_500_000
 def streams(tokens: Tensor, block: nn.Module) -> bool:
     """Return whether a block may work in pieces: on a CPU, in prediction, while nobody is watching its layers.
 
-    Gradients, autocast, a compiler, exporter or tracer, hooks and layers that somebody replaced (quantised, adapted) get
-    the plain way through the layers' own ``forward``.
+    Gradients, autocast, a compiler, exporter or tracer, hooks and layers that somebody replaced (quantised, adapted)
+    get the plain way through the layers' own ``forward``.
     """
     return (
         tokens.device.type == "cpu"
         and not torch.is_grad_enabled()
         and not torch.compiler.is_compiling()
-        and not torch.jit.is_tracing()  # type: ignore[no-untyped-call]
+        and not torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
         and not torch.is_autocast_enabled("cpu")
         and not block.training
         and all(_untouched(module) for module in block.children() for module in module.modules())
