@@ -100,7 +100,7 @@ def test_instantiate_refuses_what_is_not_registered() -> None:
 def test_instantiate_refuses_unknown_keys() -> None:
     node = OmegaConf.to_container(OmegaConf.structured(encoders.node("resnet18")))
     assert isinstance(node, dict)
-    with pytest.raises(ConfigError, match="'ResNetEncoder' has no parameter 'depht'"):
+    with pytest.raises(ConfigError, match="'ResNet' has no parameter 'depht'"):
         instantiate({**node, "depht": 3})
 
 

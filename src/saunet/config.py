@@ -145,11 +145,12 @@ def check(cfg: DictConfig) -> None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
-    strategy = str(cfg.trainer.get("strategy", "auto"))
-    multirun = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
-    if multirun and strategy.startswith("ddp") and "spawn" not in strategy and "fork" not in strategy:
+    strategy = str(cfg.trainer.get("strategy", "auto")).lower()  # a name, or a node with a _target_
+    replays = any(kind in strategy for kind in ("ddp", "fsdp", "deepspeed"))
+    replays = replays and "spawn" not in strategy and "fork" not in strategy
+    if replays and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise ConfigError(
-            f"--multirun with trainer.strategy={strategy} would replay the whole sweep on every process; "
+            "--multirun with several processes per job would replay the whole sweep on every process; "
             "use trainer=ddp_spawn, or one process per job through a Hydra launcher"
         )
     objective = plain(cfg.objective)

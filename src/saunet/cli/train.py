@@ -16,17 +16,19 @@ def train(cfg: DictConfig) -> Any:
     """Build every part from the config, train, print where the results are, and return the data module."""
     from lightning import seed_everything
 
-    from saunet.checkpoint import read_checkpoint
+    from saunet.checkpoint import load_weights, read_checkpoint
     from saunet.lit.assemble import assemble
     from saunet.registry import instantiate
 
     config.check(cfg)
-    resume = str(Path(cfg.resume).expanduser().resolve()) if cfg.resume else None
-    if resume:
-        read_checkpoint(resume)  # fail with one sentence now rather than deep inside the trainer
     seed_everything(cfg.seed, workers=True, verbose=False)
     data = instantiate(config.plain(cfg.data))
     model = assemble(config.plain(cfg), data)
+    resume = str(Path(cfg.resume).expanduser().resolve()) if cfg.resume else None
+    if resume:  # what does not fit fails here in one sentence rather than deep inside the trainer
+        checkpoint = read_checkpoint(resume)
+        load_weights(model.depth, checkpoint.weights("depth"), "depth network")
+        load_weights(model.pose, checkpoint.weights("pose"), "pose network")
     trainer = hydra_instantiate(
         cfg.trainer,
         callbacks=[hydra_instantiate(callback) for callback in cfg.callbacks.values() if callback],

@@ -66,6 +66,7 @@ class SelfSupervisedDepth(LightningModule):
         """Return the loss of one batch, eq. (14)."""
         terms = self.step(batch)[-1]
         self.log_dict(terms.named("train"), prog_bar=False, batch_size=len(batch["name"]))
+        self.log("train/lr", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=len(batch["name"]))
         self.log("loss", terms.total.detach(), prog_bar=True, logger=False, batch_size=len(batch["name"]))
         return terms.total
 

@@ -1,0 +1,80 @@
+"""Running the command-line tools inside the test process, and one small training that several tests look at."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from saunet import config
+from saunet.cli._app import run
+from saunet.cli.evaluate import evaluate
+from saunet.cli.predict import predict
+from saunet.cli.train import train
+from saunet.data.synthetic import SyntheticDrive
+from saunet.data.synthetic.kitti_writer import write_raw
+
+TASKS = {"train": train, "evaluate": evaluate, "predict": predict}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a tool said and how it ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+Tool = Callable[..., Outcome]
+
+
+def run_tool(name: str, *overrides: str, folder: Path) -> Outcome:
+    """Run ``saunet-<name>`` in ``folder``."""
+    config.register_training_configs()
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    before, arguments = Path.cwd(), sys.argv
+    os.chdir(folder)
+    sys.argv = [f"saunet-{name}", *overrides]
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            run(name, TASKS[name])
+    except SystemExit as exit_:
+        code = int(exit_.code or 0)
+    finally:
+        os.chdir(before)
+        sys.argv = arguments
+    return Outcome(code, out.getvalue(), err.getvalue())
+
+
+@pytest.fixture
+def tool(tmp_path: Path) -> Tool:
+    """Run a tool in an empty folder: ``tool("train", "experiment=smoke").code``."""
+
+    def run_here(name: str, *overrides: str) -> Outcome:
+        return run_tool(name, *overrides, folder=tmp_path)
+
+    return run_here
+
+
+@pytest.fixture(scope="session")
+def smoke_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of one finished smoke experiment."""
+    folder = tmp_path_factory.mktemp("smoke")
+    outcome = run_tool("train", "experiment=smoke", folder=folder)
+    assert outcome.code == 0, outcome.err
+    return next((folder / "outputs" / "smoke").iterdir())
+
+
+@pytest.fixture
+def raw_root(tmp_path: Path) -> Path:
+    """Two short synthetic drives on disk in KITTI's raw layout."""
+    drives = [SyntheticDrive(seed=seed, frames=6, height=64, width=96) for seed in (1, 2)]
+    write_raw(tmp_path / "raw", drives)
+    return tmp_path / "raw"

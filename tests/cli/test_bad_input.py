@@ -1,0 +1,135 @@
+"""Everything that users get wrong ends in one sentence and a non-zero exit, with nothing half-written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+Tool = Callable[..., Any]
+KITTI = (
+    "experiment=selfsup",
+    "model=sau_net_nano",
+    "trainer=smoke",
+    "data=kitti",
+    "data.split=all",
+    "data.cameras=[left]",
+    "data.val_drives=[2011_09_26_drive_0002_sync]",
+    "data.workers=0",
+    "data.batch_size=1",
+    "data.height=64",
+    "data.width=96",
+)
+
+
+def _says(outcome: Any, *words: str) -> None:
+    assert outcome.code == 1
+    assert "Traceback" not in outcome.err
+    sentence = outcome.err.strip().splitlines()[-1]
+    assert sentence.startswith("saunet-")
+    for word in words:
+        assert word in sentence
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("model.encoder.dephts=[2,2]", ("unknown key 'model.encoder.dephts'", "did you mean 'depths'?")),
+        ("sead=3", ("unknown key 'sead'", "did you mean 'seed'?")),
+        ("objective.alpha=much", ("objective.alpha", "'much'", "Float")),
+        ("model/encoder=resnet19", ("unknown model/encoder 'resnet19'", "did you mean 'resnet18'?", "stratified_tiny")),
+        ("experiment=nope", ("unknown experiment 'nope'", "available: demo")),
+        ("data=kitti data.root=/nowhere/at/all", ("no data root at /nowhere/at/all", "set data.root")),
+        ("experiment=smoke data.height=90", ("90x96", "nearest valid size is 96x96")),
+        ("experiment=smoke optim.lr=-1", ("optim.lr is -1.0; it must be greater than 0",)),
+        ("experiment=smoke objective.gradient.target=lidar", ("set data.target_depth=true",)),
+        ("experiment=smoke data.batch_size=99", ("batch_size is 99 but there are only 4 training samples",)),
+        ("experiment=smoke resume=/nowhere/last.ckpt", ("no checkpoint at /nowhere/last.ckpt",)),
+        ("experiment=smoke hydra.run.dir=/proc/nowhere/run", ("/proc/nowhere", "check the path and its rights")),
+    ],
+)
+def test_train(tool: Tool, override: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    _says(tool("train", *override.split()), *words)
+    assert not list(tmp_path.rglob("*.ckpt*"))
+
+
+def test_a_missing_value_is_asked_for(tool: Tool) -> None:
+    _says(tool("predict", "input=x"), "checkpoint is not set; add checkpoint=... output=... to the command line")
+
+
+@pytest.mark.parametrize("name", ["evaluate", "predict"])
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", ("damaged or truncated",)),
+        (b"not a checkpoint", ("is not a checkpoint, or is damaged",)),
+        (None, ("is not a saunet checkpoint",)),
+    ],
+)
+def test_an_unreadable_checkpoint(
+    tool: Tool, tmp_path: Path, name: str, content: bytes | None, words: tuple[str, ...]
+) -> None:
+    path = tmp_path / "x.ckpt"
+    if content is None:
+        torch.save({"state_dict": {}}, path)
+    else:
+        path.write_bytes(content)
+    overrides = ("input=x", "output=out") if name == "predict" else ()
+    outcome = tool(name, f"checkpoint={path}", *overrides)
+    _says(outcome, "x.ckpt")
+    assert any(word in outcome.err for word in (*words, "is not a checkpoint", "damaged"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_checkpoint_of_another_model_cannot_be_resumed(tool: Tool, smoke_run: Path) -> None:
+    last = smoke_run / "checkpoints" / "last.ckpt"
+    outcome = tool("train", "experiment=smoke", "model/encoder=resnet18", f"resume={last}")
+    _says(outcome, "checkpoint of another model, the depth network does not fit")
+
+
+def test_an_empty_drive(tool: Tool, raw_root: Path) -> None:
+    for path in raw_root.rglob("image_02/data/*.png"):
+        path.unlink()
+    undivided = [key for key in KITTI if "val_drives" not in key]
+    _says(tool("train", *undivided, f"data.root={raw_root}"), "hold no images")
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", "half"])
+def test_a_broken_image(tool: Tool, raw_root: Path, content: bytes | str) -> None:
+    for path in raw_root.rglob("image_02/data/*.png"):
+        whole = path.read_bytes()
+        path.write_bytes(whole[: len(whole) // 2] if isinstance(content, str) else content)
+    outcome = tool("train", *KITTI, f"data.root={raw_root}")
+    _says(outcome, ".png")
+
+
+def test_a_malformed_calibration_line(tool: Tool, raw_root: Path) -> None:
+    path = next(raw_root.rglob("calib_cam_to_cam.txt"))
+    path.write_text(path.read_text().replace("P_rect_02: ", "P_rect_02: 7.2e+02 oops "))
+    _says(tool("train", *KITTI, f"data.root={raw_root}"), "calib_cam_to_cam.txt", "P_rect_02")
+
+
+def test_predicting_what_is_no_image(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    checkpoint = f"checkpoint={smoke_run / 'checkpoints' / 'best.ckpt'}"
+    (tmp_path / "bad.png").write_bytes(b"not an image")
+    _says(tool("predict", checkpoint, "input=bad.png", "output=out"), "bad.png")
+    _says(tool("predict", checkpoint, "input=nothing.png", "output=out"), "nothing.png")
+    assert not list(tmp_path.glob("out/*_disparity.png"))
+
+
+def test_writing_where_nothing_can_be_written(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 90, 3), 99, np.uint8))
+    checkpoint = f"checkpoint={smoke_run / 'checkpoints' / 'best.ckpt'}"
+    _says(tool("predict", checkpoint, "input=a.png", "output=file/out"), "cannot write")
+    _says(tool("train", "experiment=smoke", "output_dir=file/run"), "file")
+
+
+def test_an_unknown_device(tool: Tool, smoke_run: Path) -> None:
+    checkpoint = f"checkpoint={smoke_run / 'checkpoints' / 'best.ckpt'}"
+    _says(tool("predict", checkpoint, "input=a.png", "output=out", "device=tpux"), "device 'tpux'", "available: cpu")

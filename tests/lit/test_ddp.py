@@ -1,0 +1,66 @@
+"""Two processes on the CPU: training runs, and validation says exactly what one process says."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.ddp
+
+TWO = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2")
+SMOKE = (
+    "experiment=smoke",
+    "data.frames_per_drive=7",
+    "trainer.max_epochs=1",
+    "trainer.limit_train_batches=2",
+    "trainer.limit_val_batches=1.0",
+    "trainer.log_every_n_steps=1",
+)
+
+
+def _run(tool: str, folder: Path, *overrides: str) -> None:
+    command = [sys.executable, "-m", f"saunet.cli.{tool}", *overrides, f"hydra.run.dir={folder}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def _logged(folder: Path) -> dict[str, float]:
+    values: dict[str, float] = {}
+    with (folder / "csv" / "metrics.csv").open() as file:
+        for row in csv.DictReader(file):
+            values.update({key: float(value) for key, value in row.items() if value})
+    return values
+
+
+def test_two_processes_validate_exactly_like_one(tmp_path: Path) -> None:
+    # Five validation frames that two processes share unevenly; the pose network's batch norm is there on purpose: its
+    # buffers are what processes could wait for each other over.
+    _run("train", tmp_path / "two", *SMOKE, *TWO)
+    two = _logged(tmp_path / "two")
+    checkpoint = f"checkpoint={tmp_path / 'two' / 'checkpoints' / 'last.ckpt'}"
+    data = ("data.frames_per_drive=7", "data.workers=0", "split=val", "baselines=false")
+    _run("evaluate", tmp_path / "one", checkpoint, *data)
+    (one,) = json.loads((tmp_path / "one" / "metrics.json").read_text())["results"]
+    assert one["images"] == two["val/images"] == 5
+    for name in ("abs_rel", "sq_rel", "rmse", "rmse_log", "a1", "a2", "a3", "scale"):
+        assert two[f"val/{name}"] == pytest.approx(one[name], rel=1e-6), name
+
+
+def test_spawned_processes_train_too(tmp_path: Path) -> None:
+    _run("train", tmp_path / "run", *SMOKE, "trainer=ddp_spawn", "trainer.accelerator=cpu", "trainer.devices=2")
+    assert _logged(tmp_path / "run")["train/loss"] > 0
+
+
+def test_a_sweep_over_processes_is_refused_with_the_ways_out(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "saunet.cli.train", "--multirun", *SMOKE, *TWO, "seed=1,2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path, check=False)
+    assert done.returncode == 1
+    assert "trainer=ddp_spawn, or one process per job through a Hydra launcher" in done.stderr
+    assert "Traceback" not in done.stderr
