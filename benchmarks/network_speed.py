@@ -2,6 +2,7 @@
 
 All networks are timed in turn, round after round, so that whatever else the machine does falls on all of them alike.
 The ratio is that of the medians; beside it stands that of the fastest rounds, which other processes disturb least.
+On a busy machine, waiting for threads drowns everything; ``--threads 1 --clock cpu`` then still gives a usable ratio.
 """
 
 from __future__ import annotations
@@ -45,21 +46,25 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--size", type=int, nargs=2, default=(192, 640), metavar=("HEIGHT", "WIDTH"))
+    parser.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="what to read")
     parser.add_argument("--compiled", action="store_true", help="also time compiled networks")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
+    clock = {"wall": time.perf_counter, "cpu": time.process_time}[arguments.clock]
     cases = CASES + (COMPILED if arguments.compiled else [])
     calls = {case[:3]: network(*case[:3], *arguments.size) for case in cases}
     times: dict[tuple[str, str, str], list[float]] = {case: [] for case in calls}
     with torch.inference_mode():
         for _ in range(arguments.rounds + 2):  # the first two warm up
             for case, call in calls.items():
-                start = time.perf_counter()
+                start = clock()
                 call()
-                times[case].append(time.perf_counter() - start)
+                times[case].append(clock() - start)
     times = {case: values[2:] for case, values in times.items()}
     base = times[BASELINE]
-    print(f"batch 1, {arguments.size[0]}x{arguments.size[1]}, {arguments.threads} threads, {arguments.rounds} rounds")
+    print(
+        f"batch 1, {arguments.size[0]}x{arguments.size[1]}, {arguments.threads} threads, {arguments.rounds} rounds, {arguments.clock} clock"
+    )
     print(f"{'model':24} {'':5} {'':9} {'median':>9} {'fastest':>9} {'ratio':>7} {'fastest':>8} {'wanted':>7}")
     for model, precision, mode, wanted in cases:
         own = times[model, precision, mode]
