@@ -62,9 +62,8 @@ def main() -> None:
                 times[case].append(clock() - start)
     times = {case: values[2:] for case, values in times.items()}
     base = times[BASELINE]
-    print(
-        f"batch 1, {arguments.size[0]}x{arguments.size[1]}, {arguments.threads} threads, {arguments.rounds} rounds, {arguments.clock} clock"
-    )
+    size = f"{arguments.size[0]}x{arguments.size[1]}"
+    print(f"batch 1, {size}, threads {arguments.threads}, {arguments.rounds} rounds, {arguments.clock} clock")
     print(f"{'model':24} {'':5} {'':9} {'median':>9} {'fastest':>9} {'ratio':>7} {'fastest':>8} {'wanted':>7}")
     for model, precision, mode, wanted in cases:
         own = times[model, precision, mode]
