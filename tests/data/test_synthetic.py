@@ -258,3 +258,11 @@ def test_impossible_settings_are_one_sentence(changes: dict[str, Any], message: 
 def test_a_frame_that_does_not_exist_is_one_sentence() -> None:
     with pytest.raises(DataError, match="has no frame 99; it has 0 to 3"):
         drive(3).image(99)
+
+
+@pytest.mark.parametrize("length", [0.0, 3.0, 17.3, 58.9, 150.0])
+def test_streets_of_any_length_are_built(length: float) -> None:
+    world = World(int(length), length, moving_cars=3)
+    assert world.road.along[-1] > length + 150
+    assert world.polygons.count > 100
+    assert np.isfinite(world.polygons.corners).all()

@@ -17,7 +17,7 @@ from saunet.data.synthetic.noise import SIZE, Canvas, blank, coloured_noise, rec
 
 def _asphalt(rng: np.random.Generator) -> Canvas:
     canvas = blank()
-    canvas[0] += 0.11 * coloured_noise(rng, 24, 128, 0.0) + 0.10 * coloured_noise(rng, 2, 24, 0.8)
+    canvas[0] += 0.12 * coloured_noise(rng, 24, 128, 0.0) + 0.15 * coloured_noise(rng, 2, 24, 0.6)
     canvas[1] = np.clip(0.35 + 0.35 * coloured_noise(rng, 2, 40, 0.5), 0, 1)
     return canvas
 
@@ -120,7 +120,10 @@ def _paint(rng: np.random.Generator) -> Canvas:
 
 def _glass(rng: np.random.Generator) -> Canvas:
     canvas = blank()
-    canvas[0] = 1.25 - 0.6 * np.linspace(0, 1, SIZE)[:, None] + 0.15 * coloured_noise(rng, 1, 12, 0.6)
+    canvas[0] = 1.25 - 0.6 * np.linspace(0, 1, SIZE)[:, None] + 0.2 * coloured_noise(rng, 1, 24, 0.5)
+    for x in (0.0, 0.49):  # pillars and what is behind the window
+        rectangle(canvas, x, x + 0.05, 0, 1, 0.3, 0.8)
+        rectangle(canvas, x + 0.14, x + 0.28, 0.3, 1.0, 0.45, 0.3)
     return canvas
 
 

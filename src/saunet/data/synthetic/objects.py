@@ -86,15 +86,15 @@ def _gable(mesh: Mesh, outline: list[np.ndarray], top: float, rise: float, tiles
 def car(rng: np.random.Generator) -> Polygons:
     """Return a car or van standing on the origin, heading along z, with its contact shadow."""
     mesh = Mesh(rng)
-    van = rng.uniform() < 0.2
+    van = rng.uniform() < 0.12
     length, width = (5.0, 1.95) if van else (float(rng.uniform(3.7, 4.7)), float(rng.uniform(1.68, 1.85)))
     waist, top = (1.1, 2.2) if van else (float(rng.uniform(0.82, 0.95)), float(rng.uniform(1.38, 1.62)))
     paint, half, sill = _pick(rng, _PAINTS), width / 2, 0.22
     dark = (0.05, 0.05, 0.06)
-    flank = Surface("car_side", paint, dark, grain=0.03)
+    flank = Surface("car_side", paint, dark, grain=0.06)
     front = Surface("car_front", paint, (0.8, 0.8, 0.75), grain=0.03)
     rear = Surface("car_rear", paint, (0.6, 0.06, 0.05), grain=0.03)
-    plain, glass = Surface("paint", paint, dark, grain=0.03), Surface("glass", (0.16, 0.19, 0.23), dark, grain=0.05)
+    plain, glass = Surface("paint", paint, dark, grain=0.08), Surface("glass", (0.22, 0.26, 0.31), dark, grain=0.08)
     outline = footprint((0.0, 0.0), (width, length), 0.0)
     for wall, surface in enumerate((rear, flank, front, flank)):
         span = width if wall % 2 == 0 else length

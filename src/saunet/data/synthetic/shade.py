@@ -24,7 +24,7 @@ I64 = NDArray[np.int64]
 
 _GRAIN_PERIOD = 13.0  # metres
 _GROUND = {  # material, metres a period, grain
-    ROAD: ("asphalt", 3.1, 0.16),
+    ROAD: ("asphalt", 3.1, 0.20),
     KERB_FACE: ("kerb", 4.0, 0.08),
     KERB_TOP: ("kerb", 4.0, 0.08),
     PAVEMENT: ("paving", 3.2, 0.12),

@@ -38,7 +38,7 @@ class Travel:
 def travel(seed: int, frames: int) -> Travel:
     """Draw the motion of a drive of 10 frames a second."""
     rng = np.random.default_rng([3, seed])
-    base = rng.uniform(0.72, 1.08)
+    base = rng.uniform(0.78, 1.08)
     steps = np.clip(base + 0.10 * _smooth(rng, frames, 12.0), SLOWEST, FASTEST)
     along = np.concatenate([[0.0], np.cumsum(steps[1:])])
     wander = 0.15 * _smooth(rng, frames, 15.0)

@@ -122,9 +122,9 @@ class World:
 
 def _section(rng: np.random.Generator) -> Section:
     parking = bool(rng.uniform() < 0.65)
-    half = float(rng.uniform(5.0, 6.3)) if parking else float(rng.uniform(3.4, 6.0))
+    half = float(rng.uniform(5.4, 6.8)) if parking else float(rng.uniform(3.4, 6.0))
     drivable = half - 2.1 if parking else min(half, 4.4)
-    return Section(half, float(rng.uniform(1.2, 4.0)), drivable / 2, parking)
+    return Section(half, float(rng.uniform(1.2, 4.0)), 0.45 * drivable, parking)
 
 
 def _light(rng: np.random.Generator) -> Light:
@@ -155,12 +155,12 @@ def _side(mesh: Mesh, cars: list[Polygons], rng: np.random.Generator, road: Road
     """Fill one side of the street with zones of 25 to 70 m, each of one character."""
     start, end = float(road.along[0]), float(road.along[-1])
     along = start
-    while along < end:
+    while along < end - 10:
         length = min(float(rng.uniform(25, 70)), end - along)
         zone = ("town", "suburb", "park", "open")[int(rng.choice(4, p=(0.35, 0.3, 0.2, 0.15)))]
         _ZONES[zone](mesh, rng, road, section, side, along, along + length)
         if section.parking:
-            _park_cars(cars, rng, road, section, side, along, along + length, float(rng.uniform(0.0, 0.85)))
+            _park_cars(cars, rng, road, section, side, along, along + length, float(rng.uniform(0.0, 0.55)))
         along += length
     inner = section.half_width
     for at in np.arange(start + rng.uniform(5, 20), end, float(rng.uniform(16, 32))):
