@@ -17,9 +17,9 @@ from torch import Tensor
 
 from saunet.checkpoint import ModelRecord, Scale, atomic_save, build_networks
 from saunet.checks import CheckpointError, ConfigError
+from saunet.images import write_image
 from saunet.infer import export
 from saunet.infer.export import export_model, export_onnx, export_program
-from saunet.infer.images import write_image
 from saunet.infer.onnx import OnnxPredictor
 from saunet.infer.parity import Parity
 from saunet.infer.predictor import Predictor

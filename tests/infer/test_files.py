@@ -12,9 +12,9 @@ import pytest
 from numpy.typing import NDArray
 
 from saunet.checks import ConfigError, DataError
+from saunet.images import read_image, write_image
 from saunet.infer.colour import png16_to_depth
 from saunet.infer.files import MANIFEST, predict_files
-from saunet.infer.images import read_image, write_image
 from saunet.infer.pointcloud import Camera
 from saunet.infer.predictor import Predictor
 from saunet.infer.sources import find_sources

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import saunet
 from saunet.checkpoint import ModelRecord, atomic_save, build_networks
 from saunet.checks import CheckpointError, ConfigError, DataError
-from saunet.infer.images import write_image
+from saunet.images import write_image
 from saunet.infer.predictor import Predictor
 from saunet.models.depth import DepthNet
 from saunet.record import Scale
@@ -100,7 +100,7 @@ class TestRefused:
             (torch.full((3, 4, 4), float("nan")), "values from nan"),
             (None, "got NoneType"),
             (b"abc", "got bytes"),
-            ("absent.png", "no image at absent.png"),
+            ("absent.png", "no file at absent.png"),
         ],
     )
     def test_images(self, predictor: Predictor, image: Any, message: str) -> None:

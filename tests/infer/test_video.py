@@ -15,8 +15,8 @@ import pytest
 from numpy.typing import NDArray
 
 from saunet.checks import ConfigError, DataError
+from saunet.images import write_image
 from saunet.infer.clips import VideoReader, VideoWriter, open_clip
-from saunet.infer.images import write_image
 from saunet.infer.predictor import Predictor
 from saunet.infer.video import RunningRange, compose, render_video
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 import saunet
 from saunet.checks import ConfigError, SaunetError
 from saunet.data.module import DepthDataModule
-from saunet.infer.images import read_image
+from saunet.images import read_image
 from saunet.lit.assemble import assemble
 from saunet.lit.callbacks import PicturePanel, StopOnNonFinite
 from saunet.lit.module import SelfSupervisedDepth

@@ -40,7 +40,7 @@ def demo(cfg: DictConfig) -> None:
 
 def draw(predictor: Any, drive: Any, folder: Path) -> None:
     """Write ``depth.png`` (a few frames with truth and error) and ``depth.mp4`` (the whole drive)."""
-    from saunet.infer.images import write_image
+    from saunet.images import write_image
     from saunet.infer.panel import depth_panel
     from saunet.infer.video import render_video
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from saunet.checks import DataError, one_of
 from saunet.data.calibration import KittiCalibration, read_calibration
-from saunet.data.images import image_size, read_depth, read_image
 from saunet.data.lidar import lidar_depth, read_scan
 from saunet.data.static import oxts_speed
 from saunet.geometry.camera import scale_intrinsics
+from saunet.images import image_size, read_depth, read_image
 
 DepthKind = Literal["camera_z", "lidar_x", "improved"]
 DEPTH_KINDS = ("camera_z", "lidar_x", "improved")

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saunet.checks import DataError, one_of
-from saunet.data.images import read_bytes
 from saunet.data.resize import nearest_map
+from saunet.images import read_bytes
 
 LidarDepth = Literal["camera_z", "lidar_x"]
 KINDS = ("camera_z", "lidar_x")

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from saunet.checks import DataError, one_of
 from saunet.data.calibration import read_matrices, zero_based
-from saunet.data.images import read_image
 from saunet.data.kitti import frame_files
+from saunet.images import read_image
 
 CAMERAS = {"grey_left": (0, "l"), "grey_right": (1, "r"), "colour_left": (2, "l"), "colour_right": (3, "r")}
 """Camera name -> its number on disk and its letter in names."""

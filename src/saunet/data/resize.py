@@ -1,4 +1,4 @@
-"""Images and depth maps at another size: colours are averaged, depths never are."""
+"""Depth maps at another size: measurements move or are sampled, never mixed (colours, which are: `saunet.images`)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-
-def resize_image(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """Resize an image with pixel areas averaged (bilinear where it grows); u maps to (u + 0.5) * s - 0.5."""
-    if image.shape[:2] == (height, width):
-        return image
-    shrinks = height <= image.shape[0] and width <= image.shape[1]
-    resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return np.asarray(resized, dtype=np.uint8)
 
 
 def resize_depth(depth: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:

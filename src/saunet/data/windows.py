@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from saunet.checks import ConfigError, DataError
-from saunet.data.resize import resize_depth, resize_image
+from saunet.data.resize import resize_depth
 from saunet.data.sequences import Drive
 from saunet.geometry.camera import scale_intrinsics
+from saunet.images import resize
 from saunet.types import FrameBatch
 
 DRAWS = 8
@@ -161,7 +162,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
                     f"where its neighbour {frame} has {tuple(native)}; frames of a drive share one size"
                 )
         height, width = self.size
-        frames = np.stack([resize_image(image, height, width).transpose(2, 0, 1) for image in images])
+        frames = np.stack([resize(image, height, width).transpose(2, 0, 1) for image in images])
         K = torch.from_numpy(np.asarray(drive.intrinsics(frame), dtype=np.float64))
         sample: dict[str, Any] = {
             "frames": torch.from_numpy(frames),

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from saunet.atomic import replacing
 from saunet.checks import DataError, one_of, positive
-from saunet.infer.images import IMAGE_SUFFIXES, read_image
+from saunet.images import IMAGE_SUFFIXES, read_image
 from saunet.infer.sources import image_paths
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ts"})

@@ -22,8 +22,8 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from saunet.atomic import replacing, write_bytes
 from saunet.checkpoint import read_checkpoint
 from saunet.checks import CheckpointError, ConfigError, one_of
+from saunet.images import network_input, read_image
 from saunet.infer.card import model_card
-from saunet.infer.images import network_input, read_image
 from saunet.infer.onnx import INPUT, METADATA, OUTPUT, open_session
 from saunet.infer.parity import Parity, Run, compare
 from saunet.models.depth import DepthNet

@@ -12,8 +12,8 @@ import numpy as np
 
 from saunet.atomic import write_bytes
 from saunet.checks import ConfigError, DataError, one_of, positive
+from saunet.images import read_image, write_image
 from saunet.infer.colour import PALETTES, depth_to_png16
-from saunet.infer.images import read_image, write_image
 from saunet.infer.pipeline import ImagePredictor
 from saunet.infer.pointcloud import Camera, point_cloud, write_ply
 from saunet.infer.prediction import Prediction

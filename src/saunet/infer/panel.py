@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from saunet.checks import ConfigError, positive
+from saunet.images import resize
 from saunet.infer.colour import colourise, value_range
-from saunet.infer.images import resize
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _INK, _PAPER = (245, 245, 245), (24, 24, 24)

@@ -14,7 +14,7 @@ from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from saunet.checks import CheckpointError, DataError, divisible, positive
-from saunet.infer.images import as_rgb_bytes, network_input, read_image
+from saunet.images import as_rgb_bytes, network_input, read_image
 from saunet.infer.prediction import Prediction, unit_of
 from saunet.record import Scale
 

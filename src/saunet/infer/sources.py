@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from saunet.checks import ConfigError, DataError
-from saunet.infer.images import IMAGE_SUFFIXES
+from saunet.images import IMAGE_SUFFIXES
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from jaxtyping import Float32, UInt16
 
 from saunet.atomic import replacing
 from saunet.checks import ConfigError, DataError, positive
-from saunet.infer.images import resize
+from saunet.images import resize
 from saunet.infer.pointcloud import Camera, jumps
 from saunet.infer.prediction import Prediction
 

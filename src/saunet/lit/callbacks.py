@@ -14,7 +14,7 @@ from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
 from torch import Tensor
 
 from saunet.checks import SaunetError
-from saunet.infer.images import write_image
+from saunet.images import write_image
 from saunet.lit.pictures import training_panel
 from saunet.types import EvalBatch
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,25 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from saunet.checks import ConfigError, DataError
-from saunet.infer.images import as_rgb_bytes, network_input, read_image, resize, write_image
+from saunet.data.windows import WindowDataset
+from saunet.images import (
+    as_rgb_bytes,
+    image_size,
+    network_input,
+    read_bytes,
+    read_depth,
+    read_image,
+    resize,
+    write_image,
+)
+
+
+@pytest.fixture(scope="module")
+def picture() -> NDArray[np.uint8]:
+    """A smooth colour picture, 40 x 90, with different corners."""
+    y, x = np.mgrid[0:40, 0:90]
+    return np.stack([x * 255 // 89, y * 255 // 39, 255 - x * 255 // 89], axis=-1).astype(np.uint8)
+
 
 needs_rights = pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 
@@ -64,7 +83,7 @@ def test_one_pixel(tmp_path: Path) -> None:
 
 class TestBroken:
     @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".webp", ".tiff"])
-    @pytest.mark.parametrize("keep", [0.3, 0.9])
+    @pytest.mark.parametrize("keep", [0.3, 0.9, 0.99])
     def test_truncated(self, tmp_path: Path, suffix: str, keep: float) -> None:
         noise = np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8)
         path = tmp_path / f"x{suffix}"
@@ -85,7 +104,7 @@ class TestBroken:
             read_image(tmp_path / "x.png")
 
     def test_missing_and_folder(self, tmp_path: Path) -> None:
-        with pytest.raises(DataError, match="no image at"):
+        with pytest.raises(DataError, match="no file at"):
             read_image(tmp_path / "x.png")
         with pytest.raises(DataError, match="is a folder"):
             read_image(tmp_path)
@@ -140,6 +159,7 @@ class TestWrite:
 def test_resize_follows_the_pixel_convention() -> None:
     """A ramp keeps its slope: pixel u of the result lies at (u + 0.5) * s - 0.5 of the source."""
     ramp = np.tile(np.arange(64, dtype=np.float32), (16, 1))
+    assert resize(ramp, 16, 64) is ramp
     half = resize(ramp, 8, 32)
     assert np.allclose(half[4], (np.arange(32) + 0.5) * 2 - 0.5)
     double = resize(half, 16, 64)
@@ -166,3 +186,76 @@ def test_jpeg_with_a_thumbnail_is_still_found_truncated(tmp_path: Path, picture:
     (tmp_path / "part.jpg").write_bytes(whole.getvalue()[:-200])
     with pytest.raises(DataError, match=r"part\.jpg is truncated"):
         read_image(tmp_path / "part.jpg")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_data_after_the_end_of_an_image_is_no_damage(tmp_path: Path, picture: NDArray[np.uint8], suffix: str) -> None:
+    path = tmp_path / f"x{suffix}"
+    write_image(path, picture)
+    expected = read_image(path)
+    path.write_bytes(path.read_bytes() + bytes(9000))
+    assert np.array_equal(read_image(path), expected)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_size_without_decoding(tmp_path: Path, picture: NDArray[np.uint8], suffix: str) -> None:
+    write_image(tmp_path / f"ünï 中{suffix}", picture)
+    assert image_size(tmp_path / f"ünï 中{suffix}") == (40, 90)
+
+
+class TestDepth:
+    def test_it_is_a_256th_of_a_metre(self, tmp_path: Path) -> None:
+        write_image(tmp_path / "depth.png", np.array([[0, 256], [2560, 65535]], np.uint16))
+        assert read_depth(tmp_path / "depth.png").tolist() == [[0, 1], [10, 65535 / 256]]
+
+    def test_8_bits_are_refused(self, tmp_path: Path) -> None:
+        write_image(tmp_path / "depth.png", np.zeros((2, 2), np.uint8))
+        with pytest.raises(DataError, match="holds uint8"):
+            read_depth(tmp_path / "depth.png")
+
+
+@pytest.mark.parametrize("read", [read_depth, image_size, read_image, read_bytes])
+def test_every_reader_names_what_is_missing_or_empty(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    with pytest.raises(DataError, match=r"no file at .*gone\.png"):
+        read(tmp_path / "gone.png")
+    (tmp_path / "empty.png").touch()
+    with pytest.raises(DataError, match=r"empty\.png is empty \(0 bytes\)"):
+        read(tmp_path / "empty.png")
+    with pytest.raises(DataError, match="is a folder"):
+        read(tmp_path)
+    if read is not read_bytes:
+        (tmp_path / "text.png").write_text("not an image")
+        with pytest.raises(DataError, match=r"text\.png is not an image"):
+            read(tmp_path / "text.png")
+
+
+class PictureDrive:
+    """One frame that is an image file."""
+
+    name = "drive"
+    indices = (0,)
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        return read_image(self.path)
+
+    def intrinsics(self, index: int) -> NDArray[np.float64]:
+        return np.eye(3)
+
+    def depth(self, index: int) -> None:
+        return None
+
+    def pose(self, index: int) -> None:
+        return None
+
+
+@pytest.mark.parametrize("size", [(16, 24), (40, 90), (64, 128), (20, 128)])
+def test_training_and_prediction_see_the_same_pixels(tmp_path: Path, size: tuple[int, int]) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (40, 90, 3), dtype=np.uint8)
+    write_image(tmp_path / "x.png", noise)
+    dataset = WindowDataset([PictureDrive(tmp_path / "x.png")], [(0, 0)], offsets=(), height=size[0], width=size[1])
+    trained = dataset[0]["frames"][0].numpy()
+    used = network_input(read_image(tmp_path / "x.png"), *size)
+    assert np.array_equal(trained.astype(np.float32) / np.float32(255), used)
