@@ -100,6 +100,18 @@ def test_broken_images_are_reported_and_the_rest_is_done(predictor: Predictor, f
     assert "0_broken.png is not an image" in summary.failures[0]
     with pytest.raises(DataError, match=r"0_broken\.png is not an image"):
         predict_files(predictor, folder / "0_broken.png", tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_camera_numbers_belong_to_the_first_image_that_can_be_read(
+    predictor: Predictor, folder: Path, tmp_path: Path
+) -> None:
+    (folder / "0_broken.png").write_bytes(b"nothing")
+    numbers = (80.0, 80.0, 44.5, 19.5)
+    assert len(predict_files(predictor, folder, tmp_path / "out", ["ply"], camera=numbers).written) == 3
+    with pytest.raises(DataError, match=r"0_broken\.png is not an image"):
+        predict_files(predictor, folder / "0_broken.png", tmp_path / "other", ["ply"], camera=numbers)
+    assert not (tmp_path / "other").exists()
 
 
 def test_single_image_glob_and_several(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
@@ -131,6 +143,11 @@ def test_point_clouds(predictor: Predictor, folder: Path, tmp_path: Path) -> Non
     summary = predict_files(predictor, folder / "a.png", tmp_path / "out", ["ply"], camera=camera)
     assert [path.name for path in summary.written] == ["a_points.ply"]
     assert b"comment unit: relative" in summary.written[0].read_bytes()
+    numbers = predict_files(predictor, folder, tmp_path / "2", ["ply"], camera=(80.0, 80.0, 44.5, 19.5))
+    assert numbers.written[0].read_bytes() == summary.written[0].read_bytes()
+    with pytest.raises(ConfigError, match="intrinsics have 3 numbers"):
+        predict_files(predictor, folder, tmp_path / "3", ["ply"], camera=(80.0, 80.0, 44.5))
+    assert not (tmp_path / "3").exists()
     other = Camera.from_numbers((90.0, 80.0, 44.5, 19.5), 40, 90)
     with pytest.raises(ConfigError, match="made with another camera"):
         predict_files(predictor, folder / "a.png", tmp_path / "out", ["ply"], camera=other)
@@ -144,6 +161,23 @@ class TestRefused:
             with pytest.raises(ConfigError, match="holds the originals"):
                 predict_files(predictor, str(folder / "*.png"), output)
         assert names(folder) == ["a.png", "b.jpg", "deep/c.png"]
+
+    def test_output_folder_that_is_the_input_folder(self, predictor: Predictor, folder: Path) -> None:
+        """Results would lie among the originals of a deeper folder, and be predicted by the next run."""
+        for original in ("a.png", "b.jpg"):
+            (folder / original).unlink()
+        for given in (folder, str(folder / "*" / "*.png"), [folder / "deep", folder]):
+            with pytest.raises(ConfigError, match=r"holds the originals \(.*c\.png\); choose another, such as .*depth"):
+                predict_files(predictor, given, folder)
+        assert names(folder) == ["deep/c.png"]
+
+    def test_results_that_would_lie_beside_an_original(
+        self, predictor: Predictor, tmp_path: Path, picture: NDArray[np.uint8]
+    ) -> None:
+        for name in ("a/x.png", "a/a/y.png"):
+            write_image(tmp_path / name, picture)
+        with pytest.raises(ConfigError, match="holds the originals"):
+            predict_files(predictor, tmp_path / "a", tmp_path)
 
     def test_output_that_is_a_file(self, predictor: Predictor, folder: Path) -> None:
         with pytest.raises(ConfigError, match=r"a\.png is a file"):

@@ -12,7 +12,7 @@ import numpy as np
 
 from saunet.atomic import write_bytes
 from saunet.checks import ConfigError, DataError, one_of, positive
-from saunet.images import read_image, write_image
+from saunet.images import image_size, read_image, write_image
 from saunet.infer.colour import PALETTES, depth_to_png16
 from saunet.infer.pipeline import ImagePredictor
 from saunet.infer.pointcloud import Camera, point_cloud, write_ply
@@ -62,7 +62,7 @@ def predict_files(
     *,
     palette: str = "magma",
     limits: tuple[float, float] | None = None,
-    camera: Camera | None = None,
+    camera: Camera | Sequence[float] | None = None,
     max_depth: float | None = None,
     batch_size: int = 1,
     overwrite: bool = False,
@@ -78,7 +78,8 @@ def predict_files(
             ``*_depth.png``), ``"npy"`` (depth in float32, ``*_depth.npy``) and ``"ply"`` (``*_points.ply``).
         palette: Colour map of ``"colour"``.
         limits: Disparities of the darkest and brightest colour; each image's own range by default.
-        camera: True intrinsics of the camera that took the images; ``"ply"`` needs them.
+        camera: True intrinsics of the camera that took the images, which ``"ply"`` needs: a `Camera`, or
+            ``fx, fy, cx, cy`` in pixels of the first image (scaled for images of another size).
         max_depth: Leave points out of ``"ply"`` that are farther, in the unit of depth.
         batch_size: Images that go through the network together.
         overwrite: Predict again what is already there, and allow a folder that another model wrote.
@@ -100,11 +101,14 @@ def predict_files(
         raise ConfigError(f"outputs is empty; allowed: {', '.join(OUTPUTS)}")
     if "ply" in outputs and camera is None:
         raise ConfigError("outputs has 'ply', which needs the camera's true intrinsics; give camera fx, fy, cx, cy")
-    style = _Style(palette, limits, camera, max_depth)
     folder = Path(output_dir)
     sources = find_sources(inputs, folder)
     _check_folder(folder, sources)
-    _claim(folder, {"model": predictor.fingerprint, "unit": predictor.unit, **style.plain()}, overwrite)
+    if camera is not None and not isinstance(camera, Camera):
+        camera = Camera.from_numbers(camera, *_first_size(sources))
+    style = _Style(palette, limits, camera, max_depth)
+    settings = {"model": predictor.fingerprint, "unit": predictor.unit, **style.plain()}
+    claimed = _claimed(folder, settings, overwrite)
     todo = [source for source in sources if overwrite or _missing(source, folder, outputs)]
     written: list[Path] = []
     failures: list[str] = []
@@ -123,6 +127,9 @@ def predict_files(
                     path = folder / f"{source.stem}{_ENDINGS[output]}"
                     _WRITERS[output](path, result, style)
                     written.append(path)
+                    if not claimed:
+                        write_bytes(folder / MANIFEST, (json.dumps(settings, indent=2) + "\n").encode())
+                        claimed = True
             shown.advance(task, len(readable))
     if failures and len(failures) == len(sources):
         more = f" (and {len(failures) - 1} more images cannot be read)" if len(failures) > 1 else ""
@@ -134,31 +141,44 @@ def _check_folder(folder: Path, sources: Sequence[Source]) -> None:
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"the output folder {folder} is a file; choose another name")
     own = folder.resolve()
-    for source in sources:
-        if source.path.resolve().parent == own:
+    targets = {own} | {(own / source.stem).resolve().parent for source in sources}
+    for source in sources:  # results among the originals would be read as images by the next run
+        if source.path.resolve().parent in targets:
             raise ConfigError(
-                f"the output folder {folder} holds the originals ({source.path.name}); choose another, such as "
+                f"the output folder {folder} holds the originals ({source.path}); choose another, such as "
                 f"{folder / 'depth'}"
             )
 
 
-def _claim(folder: Path, settings: Mapping[str, object], overwrite: bool) -> None:
-    """Write down what makes the files of this folder, and refuse to mix two models' results in it."""
-    path = folder / MANIFEST
-    current = json.loads(json.dumps(settings))
-    if path.exists() and not overwrite:
+def _first_size(sources: Sequence[Source]) -> tuple[int, int]:
+    """Return (height, width) of the first image that can be read."""
+    problem: DataError | None = None
+    for source in sources:
         try:
-            previous = json.loads(path.read_text())
-        except (OSError, ValueError) as reason:
-            raise DataError(f"{path} cannot be read ({reason}); delete it, or choose another output folder") from reason
-        changed = [key for key in current if not isinstance(previous, dict) or previous.get(key) != current[key]]
-        if changed:
-            raise ConfigError(
-                f"{folder} holds predictions made with another {', '.join(changed)}; "
-                "choose another output folder, or set overwrite=true"
-            )
-        return
-    write_bytes(path, (json.dumps(current, indent=2) + "\n").encode())
+            return image_size(source.path)
+        except DataError as error:
+            problem = problem or error
+    assert problem is not None  # there is a source
+    raise problem
+
+
+def _claimed(folder: Path, settings: Mapping[str, object], overwrite: bool) -> bool:
+    """Tell whether it is written down that these settings make the folder's files; refuse to mix others' results."""
+    path = folder / MANIFEST
+    if overwrite or not path.exists():
+        return False
+    try:
+        previous = json.loads(path.read_text())
+    except (OSError, ValueError) as reason:
+        raise DataError(f"{path} cannot be read ({reason}); delete it, or choose another output folder") from reason
+    current = json.loads(json.dumps(settings))
+    changed = [key for key in current if not isinstance(previous, dict) or previous.get(key) != current[key]]
+    if changed:
+        raise ConfigError(
+            f"{folder} holds predictions made with another {', '.join(changed)}; "
+            "choose another output folder, or set overwrite=true"
+        )
+    return True
 
 
 def _missing(source: Source, folder: Path, outputs: Sequence[str]) -> list[str]:

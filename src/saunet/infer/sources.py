@@ -25,7 +25,7 @@ def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Pa
 
     Raises:
         DataError: if an input does not exist or holds no image.
-        ConfigError: if two images would get the same results.
+        ConfigError: if two images would get the same results, or an input is the output folder.
     """
     several = [inputs] if isinstance(inputs, str | Path) else list(inputs)
     if not several:
@@ -38,6 +38,11 @@ def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Pa
         kept = [path for path in paths if not (below and own in path.resolve().parents)]
         if not kept:
             raise _nothing(item)
+        if base.resolve() == own:  # the next run would predict this one's results
+            raise ConfigError(
+                f"the output folder {output_dir} holds the originals ({kept[0]}); choose another, such as "
+                f"{Path(output_dir) / 'depth'}"
+            )
         for path in kept:
             found.setdefault(path, path.relative_to(base))
     stems = Counter(str(relative.with_suffix("")) for relative in found.values())
