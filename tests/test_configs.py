@@ -105,6 +105,17 @@ def test_an_unknown_choice_lists_the_known_ones(group: str) -> None:
         _compose(f"{group}=nonsense")
 
 
+@pytest.mark.parametrize("experiment", ["smoke", "selfsup"])
+@pytest.mark.parametrize("data", REGISTRIES["data"].names())
+@pytest.mark.parametrize("objective", REGISTRIES["objective"].names())
+def test_experiments_go_with_any_data_and_objective(experiment: str, data: str, objective: str) -> None:
+    assert _compose(f"experiment={experiment}", f"data={data}", f"objective={objective}")
+
+
+def test_one_seed_decides_everything() -> None:
+    assert _resolved("seed=7")["data"]["seed"] == 7  # type: ignore[index]
+
+
 def test_pose_offsets_follow_the_data() -> None:
     model = _resolved("data.offsets=[-2,2]")["model"]
     assert model["pose"]["offsets"] == [-2, 2]  # type: ignore[index]

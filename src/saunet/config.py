@@ -10,7 +10,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from saunet import schema
-from saunet.checks import ConfigError
+from saunet.checks import ConfigError, positive
 from saunet.registry import REGISTRIES
 
 
@@ -145,10 +145,12 @@ def check(cfg: DictConfig) -> None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
-    strategy = str(cfg.trainer.get("strategy", "auto")).lower()  # a name, or a node with a _target_
-    replays = any(kind in strategy for kind in ("ddp", "fsdp", "deepspeed"))
-    replays = replays and "spawn" not in strategy and "fork" not in strategy
-    if replays and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
+    positive("seed", cfg.seed, allow_zero=True)
+    if cfg.trainer.max_epochs == -1 and cfg.trainer.max_steps == -1:
+        raise ConfigError(
+            "trainer.max_epochs is -1: a training without end has no schedule; set it, or trainer.max_steps"
+        )
+    if _replays_command_line(cfg) and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise ConfigError(
             "--multirun with several processes per job would replay the whole sweep on every process; "
             "use trainer=ddp_spawn, or one process per job through a Hydra launcher"
@@ -160,3 +162,12 @@ def check(cfg: DictConfig) -> None:
             "objective.gradient.target=lidar needs LiDAR depth in the training batches; "
             "set data.target_depth=true, or use objective.gradient.target=image"
         )
+
+
+def _replays_command_line(cfg: DictConfig) -> bool:
+    """Tell whether the trainer will start further processes by running this command again."""
+    strategy = str(cfg.trainer.strategy).lower()  # a name, or a node with a _target_
+    if "spawn" in strategy or "fork" in strategy:
+        return False
+    several = str(cfg.trainer.devices) not in ("1", "[0]", "auto") or cfg.trainer.num_nodes > 1
+    return several or any(kind in strategy for kind in ("ddp", "fsdp", "deepspeed"))

@@ -124,6 +124,24 @@ class ModelRecord:
             version=_get(plain, "version", str),
         )
 
+    def check_same_training(self, plain: Mapping[str, Any]) -> None:
+        """Check that a training about to resume from this record's checkpoint sees the same images and depths.
+
+        Args:
+            plain: The new training's record.
+
+        Raises:
+            CheckpointError: naming the first setting that differs.
+        """
+        new = ModelRecord.from_plain(plain)
+        for name in ("height", "width", "offsets", "min_depth", "max_depth"):
+            before, now = getattr(self, name), getattr(new, name)
+            if before != now:
+                raise CheckpointError(
+                    f"the checkpoint was trained with {name} {before} and this run has {now}; "
+                    "a resumed run continues the same training, so give the same settings"
+                )
+
     def check_registered(self) -> None:
         """Check that every component is registered, in the place of its kind.
 
@@ -181,7 +199,7 @@ def _get(plain: Mapping[str, Any], key: str, kind: Any) -> Any:
 
 
 def _node(model: Mapping[str, Any], slot: str) -> Mapping[str, Any]:
-    node = _get(model, slot, Mapping)
+    node: Mapping[str, Any] = _get(model, slot, Mapping)
     _get(node, "_target_", str)
     return node
 

@@ -46,6 +46,9 @@ def _says(outcome: Any, *words: str) -> None:
         ("experiment=nope", ("unknown experiment 'nope'", "available: demo")),
         ("data=kitti data.root=/nowhere/at/all", ("no data root at /nowhere/at/all", "set data.root")),
         ("experiment=smoke data.height=90", ("90x96", "nearest valid size is 96x96")),
+        ("experiment=smoke seed=-1", ("seed is -1; it must be at least 0",)),
+        ("experiment=smoke trainer.max_epochs=-1", ("trainer.max_epochs is -1",)),
+        ("experiment=smoke protocol=eigen_lidar_x", ("protocol 'eigen_lidar_x' is defined on 'lidar_x'", "'exact'")),
         ("experiment=smoke optim.lr=-1", ("optim.lr is -1.0; it must be greater than 0",)),
         ("experiment=smoke objective.gradient.target=lidar", ("set data.target_depth=true",)),
         ("experiment=smoke data.batch_size=99", ("batch_size is 99 but there are only 4 training samples",)),
@@ -55,7 +58,7 @@ def _says(outcome: Any, *words: str) -> None:
 )
 def test_train(tool: Tool, override: str, words: tuple[str, ...], tmp_path: Path) -> None:
     _says(tool("train", *override.split()), *words)
-    assert not list(tmp_path.rglob("*.ckpt*"))
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []  # nothing half-written is left
 
 
 def test_a_missing_value_is_asked_for(tool: Tool) -> None:
@@ -90,6 +93,11 @@ def test_a_checkpoint_of_another_model_cannot_be_resumed(tool: Tool, smoke_run: 
     last = smoke_run / "checkpoints" / "last.ckpt"
     outcome = tool("train", "experiment=smoke", "model/encoder=resnet18", f"resume={last}")
     _says(outcome, "checkpoint of another model, the depth network does not fit")
+
+
+def test_a_resumed_run_with_other_settings(tool: Tool, smoke_run: Path) -> None:
+    last = smoke_run / "checkpoints" / "last.ckpt"
+    _says(tool("train", "experiment=smoke", "data.width=128", f"resume={last}"), "width 96 and this run has 128")
 
 
 def test_an_empty_drive(tool: Tool, raw_root: Path) -> None:

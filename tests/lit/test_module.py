@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,12 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor, nn
 
 import saunet
+from saunet.checkpoint import read_checkpoint
 from saunet.checks import ConfigError, SaunetError
 from saunet.data.module import DepthDataModule
 from saunet.images import read_image
 from saunet.lit.assemble import assemble
-from saunet.lit.callbacks import PicturePanel, StopOnNonFinite
+from saunet.lit.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel, StopOnNonFinite
 from saunet.lit.module import SelfSupervisedDepth
 from saunet.types import EvalBatch
 
@@ -111,6 +113,37 @@ def test_a_non_finite_loss_ends_the_run_with_one_sentence(
     trainer = make_trainer(max_epochs=1, callbacks=[StopOnNonFinite(every_n_steps=1)])
     with pytest.raises(SaunetError, match=r"the loss became NaN or infinite at or before step 1 \(last batch: train"):
         trainer.fit(model, walls)
+
+
+def test_last_is_the_last_and_best_is_the_best(
+    config: dict[str, Any], walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    class Worsening(Callback):
+        def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+            pl_module.log("score", {0: 0.5, 1: 0.1, 2: 0.3}.get(trainer.current_epoch, 0.2))
+
+    def fit(folder: Path, epochs: int, resume: Path | None = None) -> None:
+        callbacks = [Worsening(), LastCheckpoint(str(folder)), BestCheckpoint(str(folder), "score")]
+        trainer = make_trainer(max_epochs=epochs, limit_train_batches=1, limit_val_batches=1, callbacks=callbacks)
+        trainer.fit(assemble(config, walls), copy.deepcopy(walls), ckpt_path=resume, weights_only=True)
+
+    make_trainer = partial(make_trainer, enable_checkpointing=True)
+    fit(tmp_path / "a", 3)
+    assert read_checkpoint(tmp_path / "a" / "last.ckpt").epoch == 2
+    assert read_checkpoint(tmp_path / "a" / "best.ckpt").epoch == 1
+    fit(tmp_path / "b", 4, resume=tmp_path / "a" / "last.ckpt")  # scores 0.2: not better than the 0.1 of before
+    assert read_checkpoint(tmp_path / "b" / "last.ckpt").epoch == 3
+    assert read_checkpoint(tmp_path / "b" / "best.ckpt").epoch == 1
+
+
+def test_best_falls_back_to_the_loss_where_nothing_has_ground_truth(
+    config: dict[str, Any], walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    best = BestCheckpoint(str(tmp_path), "val/nothing")
+    trainer = make_trainer(max_epochs=1, limit_train_batches=1, callbacks=[best], enable_checkpointing=True)
+    trainer.fit(assemble(config, walls), walls)
+    assert best.monitor == "val/loss"
+    assert (tmp_path / "best.ckpt").is_file()
 
 
 def test_a_picture_is_written_after_every_epoch(

@@ -5,14 +5,17 @@ from __future__ import annotations
 import logging
 import os
 import re
+import shutil
 import sys
 import warnings
 from collections.abc import Callable
 from functools import wraps
+from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -36,8 +39,11 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
     register_configs()
     _quieten()
 
+    folders: list[Path] = []  # Hydra's run folder, once it exists
+
     @wraps(task)
     def required(cfg: DictConfig) -> None:
+        folders.append(Path(HydraConfig.get().runtime.output_dir))
         missing = sorted(OmegaConf.missing_keys(cfg))
         if missing:
             needed = " ".join(f"{key}=..." for key in missing)
@@ -48,10 +54,13 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
         hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(required)()
     except KeyboardInterrupt:
         _fail(name, "interrupted", code=130)
-    except (SaunetError, HydraException, OmegaConfBaseException, OSError) as error:
-        if debug:
+    except Exception as error:
+        sentence = _sentence(error)
+        if debug or sentence is None:
             raise
-        _fail(name, _sentence(error))
+        for folder in folders:
+            _remove_if_bare(folder)
+        _fail(name, sentence)
     finally:
         if before is None:
             del os.environ["HYDRA_FULL_ERROR"]
@@ -80,15 +89,33 @@ def _fail(name: str, message: str, code: int = 1) -> NoReturn:
     raise SystemExit(code)
 
 
-def _sentence(error: Exception) -> str:
-    """Say in one sentence what Hydra, OmegaConf or the system say in many lines."""
+def _remove_if_bare(folder: Path) -> None:
+    """Remove a run folder that holds nothing but its config and empty logs: the run never began."""
+    if folder == Path.cwd() or not (folder / ".hydra").is_dir():
+        return
+    started = ("hparams.yaml", "events.out.tfevents")
+    files = [path for path in folder.rglob("*") if path.is_file() and path.parent.name != ".hydra"]
+    if all(path.suffix == ".log" or path.name.startswith(started) for path in files):
+        logging.shutdown()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _sentence(error: Exception) -> str | None:
+    """Say in one sentence what a user can mend; None for a defect of the program."""
+    if isinstance(error, SaunetError):
+        return str(error)
+    raised_elsewhere = re.search(r"^saunet\.checks\.\w+: (.*)", str(error), re.MULTILINE)
+    if raised_elsewhere:  # in a process that was spawned: only its traceback's text arrives here
+        return raised_elsewhere[1]
+    if type(error).__name__ == "MisconfigurationException":  # Lightning's word for a user's error
+        return " ".join(str(error).split())
     text = f"{error}\n{error.__cause__ or ''}"
     if isinstance(error, MissingConfigException):  # which is an OSError too
         return _unknown_choice(text)
     if isinstance(error, OSError):
         return f"cannot use {error.filename or 'a file'}: {error.strerror or error}; check the path and its rights"
-    if isinstance(error, SaunetError):
-        return str(error)
+    if not isinstance(error, HydraException | OmegaConfBaseException):
+        return None
     full_key = re.search(r"full_key: (\S+)", text)
     unknown = re.search(r"Key '(\w+)' (?:is )?not in '(\w+)'", text)
     if unknown and full_key:

@@ -27,6 +27,7 @@ def train(cfg: DictConfig) -> Any:
     resume = str(Path(cfg.resume).expanduser().resolve()) if cfg.resume else None
     if resume:  # what does not fit fails here in one sentence rather than deep inside the trainer
         checkpoint = read_checkpoint(resume)
+        checkpoint.record.check_same_training(model.record)
         load_weights(model.depth, checkpoint.weights("depth"), "depth network")
         load_weights(model.pose, checkpoint.weights("pose"), "pose network")
     trainer = hydra_instantiate(

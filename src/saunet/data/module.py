@@ -162,10 +162,17 @@ class DepthDataModule(LightningDataModule):
         for batch in self._eval_loader(split):
             yield self.prepare(move_data_to_device(batch, torch.device(device)))
 
-    def ground_truths(self, split: str) -> Iterator[Float[torch.Tensor, "1 h w"]]:
-        """Yield the true depth of a split's frames at native size, metres, 0 where unknown; skips those without any."""
+    def ground_truths(self, split: str, most: int = 500) -> Iterator[Float[torch.Tensor, "1 h w"]]:
+        """Yield the true depth of a split's frames at native size, metres, 0 where unknown; skips those without any.
+
+        Args:
+            split: ``train``, ``val`` or ``test``, set up.
+            most: Of more frames, only so many are read, evenly spread.
+        """
         dataset = self._set_up(split)
-        for position, frame in dataset.windows:
+        windows = dataset.windows
+        chosen = np.linspace(0, len(windows) - 1, min(most, len(windows))).round().astype(int)
+        for position, frame in (windows[place] for place in chosen):
             depth = dataset.drives[position].depth(frame)
             if depth is not None:
                 yield torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32))[None]

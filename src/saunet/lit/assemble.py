@@ -42,12 +42,18 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule) -> SelfSupervisedDep
     depth, pose = build_networks(record)
     assert pose is not None, "the record has a pose node, see above"
     divisible(data.height, data.width, depth.size_divisor, what="data.height x data.width", by="the encoder's stride")
+    rules = protocol(cfg.get("protocol") or data.protocol)
+    if not rules.accepts(data.ground_truth):
+        raise ConfigError(
+            f"protocol '{rules.name}' is defined on '{rules.ground_truth}' ground truth and the data give "
+            f"'{data.ground_truth}'; leave protocol unset, or choose the matching ground truth"
+        )
     return SelfSupervisedDepth(
         depth=depth,
         pose=pose,
         objective=instantiate(cfg["objective"]),
         recipe=Recipe(**{key: value for key, value in cfg["optim"].items() if not key.startswith("_")}),
-        metrics=DepthMetrics(protocol(cfg.get("protocol") or data.protocol)),
+        metrics=DepthMetrics(rules),
         seed=cfg["seed"],
         record=record.to_plain(),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,11 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
-from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
+from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 
-from saunet.checks import SaunetError
+from saunet.atomic import replacing
+from saunet.checks import CheckpointError, SaunetError, positive
 from saunet.images import write_image
 from saunet.lit.pictures import training_panel
 from saunet.types import EvalBatch
@@ -29,8 +31,9 @@ class StopOnNonFinite(Callback):
     """
 
     def __init__(self, every_n_steps: int = 10) -> None:
-        self.every_n_steps = every_n_steps
+        self.every_n_steps = int(positive("every_n_steps", every_n_steps))
         self._bad: Tensor | None = None
+        self._names: list[str] = []
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -39,29 +42,71 @@ class StopOnNonFinite(Callback):
         loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
         bad = ~torch.isfinite(loss.detach())
         self._bad = bad if self._bad is None else self._bad | bad
-        if trainer.global_step % self.every_n_steps == 0 and bool(self._bad):
+        self._names = batch["name"][:4]
+        if trainer.global_step % self.every_n_steps == 0:
+            self._look(trainer)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Look before broken weights are scored and saved."""
+        self._look(trainer)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Look before broken weights are saved."""
+        self._look(trainer)
+
+    def _look(self, trainer: Trainer) -> None:
+        if self._bad is not None and bool(self._bad):
             raise SaunetError(
                 f"the loss became NaN or infinite at or before step {trainer.global_step} "
-                f"(last batch: {', '.join(batch['name'][:4])}); lower optim.lr, or train with trainer.precision=32"
+                f"(last batch: {', '.join(self._names)}); lower optim.lr, or train with trainer.precision=32"
             )
 
 
-class Checkpoints(ModelCheckpoint):
-    """The best and the last state, also where no validation frame has ground truth.
+class LastCheckpoint(ModelCheckpoint):
+    """``last.ckpt``, after every epoch: what to resume from.
 
     Args:
-        folder: Where ``best.ckpt`` and ``last.ckpt`` go.
-        monitor: Decides what is best (smaller is better); where it is not measured, ``val/loss`` does, else
-            ``train/loss``.
+        folder: Where it goes.
+    """
+
+    def __init__(self, folder: str) -> None:
+        super().__init__(folder, "last", enable_version_counter=False)
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """``best.ckpt``: the state with the smallest monitored value.
+
+    Args:
+        folder: Where it goes.
+        monitor: What decides; where it is not measured (no validation frame has ground truth), ``val/loss`` does, and
+            without validation ``train/loss``.
     """
 
     def __init__(self, folder: str, monitor: str = "val/abs_rel") -> None:
-        super().__init__(folder, "best", monitor, mode="min", save_last=True, enable_version_counter=False)
+        super().__init__(folder, "best", monitor, mode="min", enable_version_counter=False)
+        self.wanted = monitor
 
     @property
     def state_key(self) -> str:
         """Name in the checkpoint; without the monitor, which may have fallen back."""
-        return "Checkpoints"
+        return "BestCheckpoint"
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over the best so far from the run that is resumed, with its file: a new run has its own folder."""
+        best, folder = Path(state_dict["best_model_path"]), Path(str(self.dirpath))
+        if best.is_file() and best.parent != folder:
+            folder.mkdir(parents=True, exist_ok=True)
+            with replacing(folder / best.name, CheckpointError) as temporary:
+                shutil.copyfile(best, temporary)
+            moved = str(folder / best.name)
+            state_dict = {
+                **state_dict,
+                "dirpath": str(folder),
+                "best_model_path": moved,
+                "kth_best_model_path": moved,
+                "best_k_models": {moved: state_dict["best_model_score"]},
+            }
+        super().load_state_dict(state_dict)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Choose what to monitor, then save."""
@@ -74,10 +119,8 @@ class Checkpoints(ModelCheckpoint):
         super().on_train_epoch_end(trainer, pl_module)
 
     def _choose(self, trainer: Trainer) -> None:
-        measured = [name for name in (self.monitor, "val/loss", "train/loss") if name in trainer.callback_metrics]
-        if measured and measured[0] != self.monitor:
-            rank_zero_warn(f"{self.monitor} is not measured on these data; the best checkpoint is by {measured[0]}")
-            self.monitor = measured[0]
+        measured = [name for name in (self.wanted, "val/loss", "train/loss") if name in trainer.callback_metrics]
+        self.monitor = measured[0] if measured else self.wanted
 
 
 class PicturePanel(Callback):

@@ -44,6 +44,7 @@ class Recipe:
         one_of("optim.optimizer", self.optimizer, ("adam", "adamw"))
         one_of("optim.schedule", self.schedule, ("step", "cosine", "constant"))
         positive("optim.lr", self.lr)
+        positive("optim.gamma", self.gamma)
         positive("optim.weight_decay", self.weight_decay, allow_zero=True)
         if len(self.betas) != 2 or not all(0 <= beta < 1 for beta in self.betas):
             raise ConfigError(

@@ -19,6 +19,9 @@ _SPLITS = ("train", "val", "test")
 
 
 @datamodules.register("synthetic")
+@datamodules.register(
+    "synthetic_tiny", width=96, batch_size=2, train_drives=1, val_drives=1, test_drives=1, frames_per_drive=6
+)
 class SyntheticDataModule(DepthDataModule):
     """Procedurally generated streets with exact ground truth; train, val and test drives are different streets.
 
