@@ -78,8 +78,11 @@ class PredictConfig:
     checkpoint: str = MISSING
     input: str = MISSING
     output: str = MISSING
-    outputs: list[str] = field(default_factory=lambda: ["colour"])
+    outputs: list[str] = field(default_factory=lambda: ["colour", "png16"])
+    palette: str = "magma"
+    camera: list[float] | None = None
     flip: bool = False
+    keep_aspect: bool = False
     overwrite: bool = False
     batch_size: int = 1
     device: str = "auto"
