@@ -127,9 +127,43 @@ def test_bad_data():
     with pytest.raises(DataError, match="no image to evaluate"):
         evaluate(predictors, [], PROTOCOLS, progress=False)
     batch = next(batches())
-    del batch["depth"]
-    with pytest.raises(DataError, match="'drive 000' comes without ground-truth depth"):
+    del batch["depth_size"]
+    with pytest.raises(DataError, match="'drive 000' comes with depth but without depth_size"):
         evaluate(predictors, [batch], PROTOCOLS, progress=False)
+
+
+def without_truth(batch):
+    return {key: value for key, value in batch.items() if not key.startswith("depth")}
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_batch_without_truth_is_counted_and_not_scored(place):
+    """Wherever it comes; and each predictor is still asked for it, since one that reads a file must not fall behind."""
+    data = list(batches())
+    asked = []
+
+    def predictor(batch):
+        asked.append(batch["name"][0])
+        return batch["target"][:, :1] + 0.1
+
+    others = [batch for position, batch in enumerate(data) if position != place]
+    expected = evaluate({"m": predictor}, others, PROTOCOLS, buckets=Buckets(), progress=False)
+    data[place] = without_truth(data[place])
+    asked.clear()
+    result = evaluate({"m": predictor}, data, PROTOCOLS, buckets=Buckets(), progress=False)
+    assert asked == ["drive 000", "drive 002", "drive 004"]
+    for got, wanted in zip(result.summaries(), expected.summaries(), strict=True):
+        assert got == dataclasses.replace(wanted, images_without_truth=2)
+    assert result.buckets == expected.buckets
+
+
+def test_no_truth_at_all_is_refused():
+    predictors = {"m": NetworkPredictor(ConstantDepth())}
+    absent = [without_truth(batch) for batch in batches()]
+    empty = [{**batch, "depth": batch["depth"] * 0} for batch in batches()]
+    for data in (absent, empty, absent[:1] + empty[1:]):
+        with pytest.raises(DataError, match="none of the 6 images has ground-truth depth to compare; evaluate on"):
+            evaluate(predictors, data, PROTOCOLS, progress=False)
 
 
 def test_bad_predictions():

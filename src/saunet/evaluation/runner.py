@@ -62,7 +62,7 @@ def evaluate(
 
     Args:
         predictors: By the name that tables show.
-        batches: Images with ``depth`` and ``depth_size``.
+        batches: Images with ``depth`` and ``depth_size``; a batch in which no image has any may come without.
         protocols: Rules to score under, all of which must accept ``ground_truth``.
         ground_truth: What the batches' depth is, one of `GROUND_TRUTHS`.
         buckets: Also sum the errors by these buckets of pixels.
@@ -70,11 +70,11 @@ def evaluate(
         progress: Show a progress bar on standard error.
 
     Returns:
-        One row for each predictor, protocol and image.
+        One row for each predictor, protocol and image, also for images without ground truth.
 
     Raises:
         ConfigError: if there is no predictor or protocol, two protocols share a name, or one needs other ground truth.
-        DataError: if there is no image, a batch has no ground truth, or a prediction does not fit or is not finite.
+        DataError: if there is no image, none has ground truth, or a prediction does not fit or is not finite.
     """
     _check_request(predictors, protocols, ground_truth)
     rows: list[ImageRow] = []
@@ -94,6 +94,9 @@ def evaluate(
             bar.advance(task, len(batch["name"]))
     if not rows:
         raise DataError("there is no image to evaluate; check the split and the data root")
+    if not any(row.pixels for row in rows):
+        count = len({row.name for row in rows})
+        raise DataError(f"none of the {count} images has ground-truth depth to compare; evaluate on data that have it")
     found = tuple(row for (predictor, name), bucket in sums.items() for row in bucket.rows(predictor, name))
     return EvaluationResult(tuple(protocols), tuple(predictors), tuple(rows), found)
 
@@ -121,13 +124,12 @@ def _score_batch(
     buckets: Buckets | None,
 ) -> list[ImageRow]:
     names = batch["name"]
-    if "depth" not in batch or "depth_size" not in batch:
-        raise DataError(f"image '{names[0]}' comes without ground-truth depth; evaluate on data that have it")
-    truths = native_depths(batch["depth"], batch["depth_size"], len(names))
+    depth, depth_size = _truth(batch)
+    truths = native_depths(depth, depth_size, len(names))
     maps = [buckets.maps(truth) if buckets else None for truth in truths]
     rows = []
     for predictor, predict in predictors.items():
-        disparity = predict(batch).to(batch["depth"].device)
+        disparity = predict(batch).to(depth.device)
         if disparity.ndim != 4 or disparity.shape[:2] != (len(names), 1):
             raise DataError(
                 f"predictor '{predictor}' returned shape {tuple(disparity.shape)} for {len(names)} images; "
@@ -145,3 +147,13 @@ def _score_batch(
                 errors = tuple(found.errors.tolist())
                 rows.append(ImageRow(predictor, protocol.name, name, found.pixels, found.ratio.item(), errors))
     return rows
+
+
+def _truth(batch: EvalBatch) -> tuple[Tensor, Tensor]:
+    """Return depth and native sizes; images without either get one unknown pixel, as beside images that have truth."""
+    if "depth" not in batch:
+        images = len(batch["name"])
+        return batch["target"].new_zeros(images, 1, 1, 1), torch.ones(images, 2, dtype=torch.int64)
+    if "depth_size" not in batch:
+        raise DataError(f"image '{batch['name'][0]}' comes with depth but without depth_size; give its (height, width)")
+    return batch["depth"], batch["depth_size"]
