@@ -41,6 +41,7 @@ ALLOWED: dict[str, set[str]] = {
         "registry",
         "types",
         "checks",
+        "atomic",
         "record",
         "checkpoint",
         "geometry",
