@@ -95,9 +95,7 @@ def test_the_kitti_path_from_disk(tool: Tool, raw_root: Path, tmp_path: Path) ->
         "output_dir=results",
     )
     assert outcome.code == 0, outcome.err
-    protocols = {
-        row["protocol"] for row in json.loads((tmp_path / "results" / "metrics.json").read_text())["results"]
-    }
+    protocols = {row["protocol"] for row in json.loads((tmp_path / "results" / "metrics.json").read_text())["results"]}
     assert protocols == {"eigen_camera_z", "metric"}
 
 

@@ -18,6 +18,7 @@ def train(cfg: DictConfig) -> Any:
 
     from saunet.checkpoint import load_weights, read_checkpoint
     from saunet.lit.assemble import assemble
+    from saunet.lit.storage import AtomicCheckpointIO
     from saunet.registry import instantiate
 
     config.check(cfg)
@@ -34,6 +35,7 @@ def train(cfg: DictConfig) -> Any:
         cfg.trainer,
         callbacks=[hydra_instantiate(callback) for callback in cfg.callbacks.values() if callback],
         logger=[hydra_instantiate(logger) for logger in cfg.logger.values() if logger] or False,
+        plugins=[AtomicCheckpointIO()],
         default_root_dir=cfg.output_dir,
     )
     trainer.fit(model, datamodule=data, ckpt_path=resume, weights_only=True)
