@@ -111,7 +111,8 @@ def _config_type(annotation: Any) -> Any:
         item = items.pop() if len(items) == 1 else Any
         return list[item]  # type: ignore[valid-type]
     if origin in (dict, Mapping):
-        return dict[str, _config_type(arguments[1])]
+        value = _config_type(arguments[1])
+        return dict[str, value]  # type: ignore[valid-type]
     return Any
 
 

@@ -14,7 +14,7 @@ from saunet.types import FeatureSpec
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-_PUBLIC = {
+_PUBLIC: dict[tuple[int, tuple[int, ...], tuple[int, ...]], str] = {
     (96, (2, 2, 6, 2), (3, 6, 12, 24)): "swin_tiny",
     (96, (2, 2, 18, 2), (3, 6, 12, 24)): "swin_small",
 }
