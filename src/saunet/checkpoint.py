@@ -64,24 +64,30 @@ class Checkpoint:
         return depth, pose
 
 
-def build_networks(record: ModelRecord) -> tuple[DepthNet, nn.Module | None]:
-    """Build the networks that a record describes, with fresh weights; the global random state is left as it was.
+def build_networks(record: ModelRecord, pretrained: bool = False) -> tuple[DepthNet, nn.Module | None]:
+    """Build the networks that a record describes; the global random state is left as it was.
+
+    Args:
+        record: The description.
+        pretrained: Start from the public weights that the record names, which may have to be fetched. False draws all
+            weights at random: enough where a checkpoint's are loaded next.
 
     Returns:
         The depth network, and the pose network where the record has one.
 
     Raises:
-        CheckpointError: if a component is not registered.
+        CheckpointError: if a component is not registered, or public weights cannot be had.
         ConfigError: if a component refuses its recorded parameters.
     """
     record.check_registered()
     with torch.random.fork_rng(devices=[]):
         try:
-            encoder = instantiate(_without_pretraining(record.encoder))
+            encoder = instantiate(record.encoder if pretrained else _without_pretraining(record.encoder))
             decoder = instantiate({**record.decoder, "_partial_": True})
             depth = DepthNet(encoder, decoder, record.min_depth, record.max_depth)
-            pose = instantiate(_without_pretraining(record.pose)) if record.pose is not None else None
-        except ConfigError:
+            node = record.pose if pretrained or record.pose is None else _without_pretraining(record.pose)
+            pose = instantiate(node) if node is not None else None
+        except (CheckpointError, ConfigError):
             raise
         except (TypeError, ValueError, RuntimeError) as reason:
             raise ConfigError(f"the architecture cannot be built from its record: {reason}") from reason

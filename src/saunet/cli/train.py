@@ -24,8 +24,8 @@ def train(cfg: DictConfig) -> Any:
     config.check(cfg)
     seed_everything(cfg.seed, workers=True, verbose=False)
     data = instantiate(config.plain(cfg.data))
-    model = assemble(config.plain(cfg), data)
     resume = str(Path(cfg.resume).expanduser().resolve()) if cfg.resume else None
+    model = assemble(config.plain(cfg), data, pretrained=resume is None)
     if resume:  # what does not fit fails here in one sentence rather than deep inside the trainer
         checkpoint = read_checkpoint(resume)
         checkpoint.record.check_same_training(model.record)

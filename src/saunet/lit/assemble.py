@@ -16,15 +16,17 @@ from saunet.record import ModelRecord
 from saunet.registry import instantiate
 
 
-def assemble(cfg: Mapping[str, Any], data: DepthDataModule) -> SelfSupervisedDepth:
+def assemble(cfg: Mapping[str, Any], data: DepthDataModule, pretrained: bool = True) -> SelfSupervisedDepth:
     """Build networks, objective, recipe and metrics from a resolved training config.
 
     Args:
         cfg: Plain containers with the keys of `saunet.config.TrainConfig`.
         data: What the model will be trained on; it names the validation protocol if the config does not.
+        pretrained: Whether to start from the public weights that the config names; a resumed training has its own.
 
     Raises:
         ConfigError: if a part cannot be built, or the parts do not fit together.
+        CheckpointError: if public weights cannot be fetched, read or fitted.
     """
     record = ModelRecord(
         **cfg["model"],
@@ -39,7 +41,7 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule) -> SelfSupervisedDep
             f"model.pose.offsets is {list(offsets)} but the data give frames at {list(data.offsets)}; "
             "set data.offsets only, the pose network follows"
         )
-    depth, pose = build_networks(record)
+    depth, pose = build_networks(record, pretrained)
     assert pose is not None, "the record has a pose node, see above"
     divisible(data.height, data.width, depth.size_divisor, what="data.height x data.width", by="the encoder's stride")
     rules = protocol(cfg.get("protocol") or data.protocol)
