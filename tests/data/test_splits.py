@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import json
 
 import pytest
@@ -121,3 +122,14 @@ def test_missing_and_empty_files_are_named(tmp_path):
     (tmp_path / "empty.txt").write_text("\n")
     with pytest.raises(DataError, match=r"empty.txt lists no frames"):
         splits.read_split(tmp_path / "empty.txt")
+
+
+def test_test_frames_come_in_the_published_order():
+    """Other systems' arrays of predictions follow it; inside a drive it is not ascending."""
+    frames = splits.eigen_test()
+    assert [frame.number for frame in frames[:5]] == [69, 54, 42, 57, 30]
+    assert (frames[-1].drive, frames[-1].number) == ("2011_10_03/2011_10_03_drive_0047_sync", 768)
+    lines = "\n".join(map(str, frames)) + "\n"
+    assert hashlib.sha256(lines.encode()).hexdigest().startswith("e226d4ca16e0e6e9")
+    kept = set(splits.eigen_benchmark_test())
+    assert [frame for frame in frames if frame in kept] == splits.eigen_benchmark_test()
