@@ -18,7 +18,8 @@ class FrameBatch(TypedDict):
     """What the data loader yields: decoded frames as bytes, before anything happened to them on the device."""
 
     frames: UInt8[Tensor, "b 1+s 3 h w"]
-    """RGB frames; index 0 is the target, then the sources in the order of the data module's ``offsets``."""
+    """RGB frames; index 0 is the target, then the sources in the order of the data module's ``offsets``, and last the
+    stereo partner, if ``T_stereo_tgt`` says that there is one."""
     K: Float[Tensor, "b 3 3"]
     """Intrinsics in pixels of ``frames`` (integer coordinates are pixel centres)."""
     name: list[str]
@@ -31,6 +32,11 @@ class FrameBatch(TypedDict):
     """Native (height, width) of each ground truth inside the padding."""
     T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
     """True motion, where the data set knows it: a target point times it is a source point, in metres."""
+    T_stereo_tgt: NotRequired[Float[Tensor, "b 4 4"]]
+    """Where the stereo partner is, from the calibration: a target point times it is a partner's point, in metres.
+    Where it is given, the partner's image is the last source."""
+    distance: NotRequired[Float[Tensor, "b s"]]
+    """Metres the camera travelled between the target and each source; NaN where unknown and for the stereo partner."""
     draws: NotRequired[Float[Tensor, "b n"]]
     """Uniform random numbers in [0, 1) that augmentation uses; training samples only."""
 
@@ -55,11 +61,13 @@ class TrainBatch(TypedDict):
     target_teacher: NotRequired[Float[Tensor, "b 1 h w"]]
     """Depth of the target as another model predicts it, up to scale, 0 where unknown."""
     distance: NotRequired[Float[Tensor, "b s"]]
-    """Metres the camera travelled between the target and each source (speed times time), NaN where unknown."""
+    """See `FrameBatch`."""
     source_depth: NotRequired[Float[Tensor, "b s 1 h w"]]
     """Predicted depth of the sources, with its graph; the training step adds it if `Objective.needs_source_depth`."""
     T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
     """See `FrameBatch`; follows flips."""
+    T_stereo_tgt: NotRequired[Float[Tensor, "b 4 4"]]
+    """See `FrameBatch`; follows flips, which put the partner on the other side."""
 
 
 class EvalBatch(TrainBatch):

@@ -30,7 +30,8 @@ def train(cfg: DictConfig) -> Any:
         checkpoint = read_checkpoint(resume)
         checkpoint.record.check_same_training(model.record)
         load_weights(model.depth, checkpoint.weights("depth"), "depth network")
-        load_weights(model.pose, checkpoint.weights("pose"), "pose network")
+        if model.pose is not None:
+            load_weights(model.pose, checkpoint.weights("pose"), "pose network")
     trainer = hydra_instantiate(
         cfg.trainer,
         callbacks=[hydra_instantiate(callback) for callback in cfg.callbacks.values() if callback],

@@ -93,6 +93,19 @@ class KittiCalibration:
     T_cam_velo: Array | None
     """Laser scanner to unrectified camera 0, 4 x 4; None without ``calib_velo_to_cam.txt``."""
 
+    def T_cam_cam(self, to: int, source: int) -> Array:  # noqa: N802 (frames in names)
+        """Return the motion between rectified cameras, 4 x 4, metres: a point of ``source`` times it is one of ``to``.
+
+        Raises:
+            DataError: if the calibration does not know one of them, or its K cannot be right.
+        """
+        T = np.eye(4)
+        for camera, sign in ((to, 1), (source, -1)):
+            self.intrinsics(camera)  # P = K [I | t] is solved for t: K must be one
+            P = self.projections[camera]
+            T[:3, 3] += sign * np.linalg.solve(P[:, :3], P[:, 3])
+        return T
+
     def intrinsics(self, camera: int) -> Array:
         """Return K of a camera, 3 x 3, in pixels of its rectified image counted from zero.
 

@@ -24,6 +24,8 @@ DepthKind = Literal["camera_z", "lidar_x", "improved"]
 DEPTH_KINDS = ("camera_z", "lidar_x", "improved")
 CAMERAS = {"left": (2, "l"), "right": (3, "r")}
 """Camera name -> its number on disk and its letter in names."""
+FRAME_SECONDS = 0.1
+"""Time between frames: the scanner turns ten times a second and triggers the cameras."""
 
 _DATE = re.compile(r"\d{4}_\d{2}_\d{2}")
 _DRIVE = re.compile(r"(\d{4}_\d{2}_\d{2})_drive_\d{4}_sync")
@@ -51,7 +53,8 @@ class KittiDrive:
         depth_kind: DepthKind = "camera_z",
     ) -> None:
         self.number, side = CAMERAS[one_of("camera", camera, CAMERAS)]
-        self.depth_kind = one_of("depth kind", depth_kind, DEPTH_KINDS)
+        one_of("depth kind", depth_kind, DEPTH_KINDS)
+        self.depth_kind: DepthKind = depth_kind
         self.folder, self.calibration = folder, calibration
         self.name = f"{folder.parent.name}/{folder.name} {side}"
         self._files = frame_files(folder / f"image_{self.number:02d}" / "data")
@@ -134,6 +137,28 @@ class KittiDrive:
         """
         record = self.folder / "oxts" / "data" / f"{index:010d}.txt"
         return oxts_speed(record) if record.is_file() else None
+
+    def distance(self, first: int, second: int) -> float | None:
+        """Return the metres travelled between two frames: OXTS speed times time; None where a record is missing."""
+        passed = range(min(first, second), max(first, second) + 1)
+        speeds = [speed for speed in map(self.speed, passed) if speed is not None]
+        if len(speeds) != len(passed):
+            return None
+        return FRAME_SECONDS * (sum(speeds) - (speeds[0] + speeds[-1]) / 2)  # the trapezoidal rule
+
+    def partner(self) -> KittiDrive:
+        """Return the other colour camera's recording; it has no frames where its images are missing."""
+        return self._partner
+
+    @functools.cached_property
+    def _partner(self) -> KittiDrive:
+        other = "right" if self.number == CAMERAS["left"][0] else "left"
+        return KittiDrive(self.folder, self.calibration, other, self.depth_kind)
+
+    @functools.cached_property
+    def T_partner_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
+        """Where the other colour camera is, 4 x 4, metres, by the calibration of the date."""
+        return self.calibration.T_cam_cam(self._partner.number, self.number)
 
     def _depth_file(self, index: int) -> Path:
         if self.depth_kind == "improved":

@@ -40,6 +40,7 @@ class DepthDataModule(LightningDataModule):
         seed: Decides order and augmentation.
         target_depth: Training batches carry the depth of the target, for losses that use it.
         with_pose: Batches carry the true motion.
+        stereo: Training and validation batches carry the stereo partner as one more source, which makes depth metric.
 
     Raises:
         ConfigError: if a parameter is out of range.
@@ -66,6 +67,7 @@ class DepthDataModule(LightningDataModule):
         seed: int = 0,
         target_depth: bool = False,
         with_pose: bool = False,
+        stereo: bool = False,
     ) -> None:
         super().__init__()
         check_offsets(offsets)
@@ -75,7 +77,7 @@ class DepthDataModule(LightningDataModule):
         self.workers = int(positive("workers", workers, allow_zero=True))
         self.translate = in_range("translate", translate, 0, 1)
         self.seed = int(positive("seed", seed, allow_zero=True))
-        self.target_depth, self.with_pose = target_depth, with_pose
+        self.target_depth, self.with_pose, self.stereo = target_depth, with_pose, stereo
         self.augment = Augment(self.height, self.width, flip, colour)
         self.prepare = Prepare(self.height, self.width)
         self.usage: dict[str, list[Usage]] = {}
@@ -119,12 +121,14 @@ class DepthDataModule(LightningDataModule):
 
     def _dataset(self, split: str, selections: Sequence[Selection]) -> WindowDataset:
         offsets = self.offsets if split in self.neighbours else ()
-        windows, usage = find_windows(selections, offsets)
+        stereo = self.stereo and split in self.neighbours
+        windows, usage = find_windows(selections, offsets, stereo)
         if not windows:
             found = "; ".join(str(drive) for drive in usage[:3]) or "no drives"
+            partner = " and a stereo partner" if stereo else ""
             raise DataError(
                 f"split '{split}' has no usable frame ({found}); "
-                f"frames need neighbours at {list(offsets)}: check the data root, the split and the offsets"
+                f"frames need neighbours at {list(offsets)}{partner}: check the data root, the split and the offsets"
             )
         self.usage[split] = usage
         margin = (round(self.height * self.translate), round(self.width * self.translate))
@@ -138,6 +142,7 @@ class DepthDataModule(LightningDataModule):
             with_depth=split in ("val", "test"),
             with_target_depth=self.target_depth and split in self.neighbours,
             with_pose=self.with_pose and split in self.neighbours,
+            stereo=stereo,
         )
 
     def train_dataloader(self) -> DataLoader[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from saunet.checks import DataError, one_of
 from saunet.data.calibration import read_matrices, zero_based
 from saunet.data.kitti import frame_files
+from saunet.data.partners import distance_between
 from saunet.images import read_image
 
 CAMERAS = {"grey_left": (0, "l"), "grey_right": (1, "r"), "colour_left": (2, "l"), "colour_right": (3, "r")}
@@ -32,6 +34,7 @@ class OdometrySequence:
 
     def __init__(self, root: Path, sequence: str, camera: str = "colour_left") -> None:
         number, side = CAMERAS[one_of("camera", camera, CAMERAS)]
+        self._given = (root, sequence, camera)
         folder = root / "sequences" / sequence
         if not folder.is_dir():
             there = ", ".join(sequences(root)) or "none"
@@ -77,6 +80,31 @@ class OdometrySequence:
             return None
         pose: NDArray[np.float64] = self._poses[index] @ np.linalg.inv(self._T_cam_cam0)
         return pose
+
+    def distance(self, first: int, second: int) -> float | None:
+        """Return the metres between the poses of two frames; None where one is unknown."""
+        poses = self.pose(first), self.pose(second)
+        return None if poses[0] is None or poses[1] is None else distance_between(poses[0], poses[1])
+
+    def partner(self) -> OdometrySequence:
+        """Return the other camera's recording of this sequence, of the same colour.
+
+        Raises:
+            DataError: if its images or its calibration are missing.
+        """
+        return self._partner
+
+    @functools.cached_property
+    def _partner(self) -> OdometrySequence:
+        root, sequence, camera = self._given
+        other = camera.replace("left", "right") if "left" in camera else camera.replace("right", "left")
+        return OdometrySequence(root, sequence, other)
+
+    @functools.cached_property
+    def T_partner_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
+        """Where the partner is, 4 x 4, metres, by the sequence's calibration."""
+        T: NDArray[np.float64] = self._partner._T_cam_cam0 @ np.linalg.inv(self._T_cam_cam0)
+        return T
 
 
 def find_root(root: str | Path) -> Path:

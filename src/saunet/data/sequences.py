@@ -34,3 +34,23 @@ class Drive(Protocol):
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """Return T_world_cam, 4 x 4, metres (x right, y down, z forward); None where unknown."""
+
+
+@runtime_checkable
+class StereoDrive(Drive, Protocol):
+    """A recording with a second camera beside it; both share one rectified image plane and one K."""
+
+    def partner(self) -> Drive:
+        """Return the other camera's recording of the same drive, with the same frame numbers."""
+
+    @property
+    def T_partner_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
+        """Where the partner is, 4 x 4, metres: a point of this camera times it is a point of the partner."""
+
+
+@runtime_checkable
+class MeasuredDrive(Drive, Protocol):
+    """A recording that knows how far the car went, from its speed or its poses."""
+
+    def distance(self, first: int, second: int) -> float | None:
+        """Return the metres travelled between two frames, at least 0; None where unknown."""

@@ -152,6 +152,10 @@ class Augment(nn.Module):
             out["target_depth"] = flip_some(depth, mirrored)[:, 0]
         if "T_src_tgt" in batch:
             out["T_src_tgt"] = flip_motion(batch["T_src_tgt"], mirrored)
+        if "T_stereo_tgt" in batch:  # the partner of a mirrored image is on the other side
+            out["T_stereo_tgt"] = flip_motion(batch["T_stereo_tgt"][:, None], mirrored)[:, 0]
+        if "distance" in batch:
+            out["distance"] = batch["distance"]
         return out  # type: ignore[return-value]
 
 
@@ -181,7 +185,7 @@ class Prepare(nn.Module):
         out = _split(frames, frames, crop_intrinsics(batch["K"], left, top), batch["name"])
         if "target_depth" in batch:
             out["target_depth"] = batch["target_depth"][window].contiguous()
-        for key in ("T_src_tgt", "depth", "depth_size"):
+        for key in ("T_src_tgt", "T_stereo_tgt", "distance", "depth", "depth_size"):
             if key in batch:
                 out[key] = batch[key]
         return out  # type: ignore[return-value]

@@ -6,6 +6,7 @@ A window is usable when the frames at all offsets exist. What is left out is cou
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from saunet.checks import ConfigError, DataError
+from saunet.data.partners import Odometer, partner_frames, partner_image
 from saunet.data.resize import resize_depth
 from saunet.data.sequences import Drive
 from saunet.geometry.camera import scale_intrinsics
@@ -58,20 +60,27 @@ class Usage:
         return f"{self.drive}: {self.used} frames used" + (f"; left out: {reasons}" if reasons else "")
 
 
-def find_windows(selections: Sequence[Selection], offsets: Sequence[int]) -> tuple[list[tuple[int, int]], list[Usage]]:
+def find_windows(
+    selections: Sequence[Selection], offsets: Sequence[int], stereo: bool = False
+) -> tuple[list[tuple[int, int]], list[Usage]]:
     """Find the frames whose neighbours at all offsets exist.
 
     Args:
         selections: Drives with the frames wanted of each.
         offsets: Time offsets of the source frames; empty for single frames.
+        stereo: Ask for the stereo partner of each frame too.
 
     Returns:
         The windows as (position in ``selections``, frame number), and one `Usage` a drive.
+
+    Raises:
+        DataError: if a drive has no stereo partner and one is asked for.
     """
     windows, usage = [], []
     for position, selection in enumerate(selections):
         drive = selection.drive
         existing = set(drive.indices)
+        paired = partner_frames(drive) if stereo else existing
         left_out = dict(selection.left_out)
         used = 0
         for frame in selection.frames:
@@ -79,6 +88,8 @@ def find_windows(selections: Sequence[Selection], offsets: Sequence[int]) -> tup
                 left_out["missing"] = left_out.get("missing", 0) + 1
             elif any(frame + offset not in existing for offset in offsets):
                 left_out["without neighbour"] = left_out.get("without neighbour", 0) + 1
+            elif frame not in paired:
+                left_out["without stereo partner"] = left_out.get("without stereo partner", 0) + 1
             else:
                 windows.append((position, frame))
                 used += 1
@@ -103,6 +114,8 @@ class WindowDataset(Dataset[dict[str, Any]]):
         with_depth: Yield ground truth at its native size where the drive has it.
         with_target_depth: Yield depth at the size of the frames (zeros where the drive has none).
         with_pose: Yield true motion; every drive must know it.
+        stereo: Yield the stereo partner as the last source, and where it is.
+        odometer: Gives the distance travelled; None yields none.
 
     Raises:
         ConfigError: if an offset is 0 or given twice.
@@ -120,6 +133,8 @@ class WindowDataset(Dataset[dict[str, Any]]):
         with_depth: bool = False,
         with_target_depth: bool = False,
         with_pose: bool = False,
+        stereo: bool = False,
+        odometer: Odometer | None = None,
     ) -> None:
         check_offsets(offsets)
         self.drives = list(drives)
@@ -129,6 +144,8 @@ class WindowDataset(Dataset[dict[str, Any]]):
         self.with_depth = with_depth
         self.with_target_depth = with_target_depth
         self.with_pose = with_pose
+        self.stereo = stereo
+        self.odometer = odometer
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -153,12 +170,15 @@ class WindowDataset(Dataset[dict[str, Any]]):
     def _sample(self, index: int) -> dict[str, Any]:
         position, frame = self.windows[index]
         drive = self.drives[position]
-        images = [drive.image(frame + offset) for offset in (0, *self.offsets)]
+        named = {f"frame {frame + offset}": drive.image(frame + offset) for offset in (0, *self.offsets)}
+        if self.stereo:
+            named[f"the stereo partner of frame {frame}"], T_stereo_tgt = partner_image(drive, frame)
+        images = list(named.values())
         native = images[0].shape
-        for offset, image in zip((0, *self.offsets), images, strict=True):
+        for what, image in named.items():
             if image.ndim != 3 or image.shape != native:
                 raise DataError(
-                    f"frame {frame + offset} of '{drive.name}' has shape {tuple(image.shape)} "
+                    f"{what} of '{drive.name}' has shape {tuple(image.shape)} "
                     f"where its neighbour {frame} has {tuple(native)}; frames of a drive share one size"
                 )
         height, width = self.size
@@ -176,8 +196,15 @@ class WindowDataset(Dataset[dict[str, Any]]):
                 sample["target_depth"] = torch.from_numpy(resized)[None]
             if self.with_depth and depth is not None:
                 sample["depth"] = torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32))[None]
+        if self.stereo:
+            sample["T_stereo_tgt"] = torch.from_numpy(np.asarray(T_stereo_tgt, np.float64)).float()
         if self.with_pose:
-            sample["T_src_tgt"] = torch.from_numpy(self._motion(drive, frame)).float()
+            known = self._motion(drive, frame)
+            motion = np.concatenate([known, T_stereo_tgt[None]]) if self.stereo else known
+            sample["T_src_tgt"] = torch.from_numpy(motion).float()
+        if self.odometer is not None:
+            ways = [self.odometer(drive, frame, frame + offset) for offset in self.offsets]
+            sample["distance"] = torch.tensor([*ways, *[math.nan] * self.stereo], dtype=torch.float32)
         return sample
 
     def _motion(self, drive: Drive, frame: int) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from saunet.lit.module import SelfSupervisedDepth
 from saunet.lit.optim import Recipe
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.protocols import protocol
-from saunet.record import ModelRecord
+from saunet.record import ModelRecord, Scale
 from saunet.registry import instantiate
 
 
@@ -28,21 +28,17 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule, pretrained: bool = T
         ConfigError: if a part cannot be built, or the parts do not fit together.
         CheckpointError: if public weights cannot be fetched, read or fitted.
     """
+    _check_sources(cfg, data)
+    model = cfg["model"] if data.offsets else {**cfg["model"], "pose": None}  # the stereo rig's motion is known
     record = ModelRecord(
-        **cfg["model"],
+        **model,
         height=data.height,
         width=data.width,
         offsets=tuple(data.offsets),
+        scale=Scale(1.0, "stereo training") if data.stereo else None,
         data={"name": cfg["name"], **cfg["data"]},
     )
-    offsets = cfg["model"]["pose"]["offsets"]
-    if list(offsets) != list(data.offsets):
-        raise ConfigError(
-            f"model.pose.offsets is {list(offsets)} but the data give frames at {list(data.offsets)}; "
-            "set data.offsets only, the pose network follows"
-        )
     depth, pose = build_networks(record, pretrained)
-    assert pose is not None, "the record has a pose node, see above"
     divisible(data.height, data.width, depth.size_divisor, what="data.height x data.width", by="the encoder's stride")
     rules = protocol(cfg.get("protocol") or data.protocol)
     if not rules.accepts(data.ground_truth):
@@ -59,3 +55,22 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule, pretrained: bool = T
         seed=cfg["seed"],
         record=record.to_plain(),
     )
+
+
+def _check_sources(cfg: Mapping[str, Any], data: DepthDataModule) -> None:
+    """Check that there is something to synthesise the target from, and that the pose network expects it.
+
+    Raises:
+        ConfigError: otherwise.
+    """
+    if not data.offsets and not data.stereo:
+        raise ConfigError(
+            "data.offsets is empty and data.stereo is false, so there is no source image to learn from; "
+            "set data.offsets=[-1,1] for video, data.stereo=true for a stereo pair, or both"
+        )
+    offsets = cfg["model"]["pose"]["offsets"]
+    if list(offsets) != list(data.offsets):
+        raise ConfigError(
+            f"model.pose.offsets is {list(offsets)} but the data give frames at {list(data.offsets)}; "
+            "set data.offsets only, the pose network follows"
+        )

@@ -12,6 +12,7 @@ from lightning import LightningModule
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from saunet.checks import ConfigError
 from saunet.geometry import warp
 from saunet.geometry.depth import disparity_to_depth
 from saunet.lit.optim import Recipe
@@ -25,7 +26,8 @@ class SelfSupervisedDepth(LightningModule):
 
     Args:
         depth: Image -> `DepthPyramid`.
-        pose: (target, sources) -> ``T_src_tgt``.
+        pose: (target, sources) -> ``T_src_tgt`` of the neighbours in time; None where the stereo partner is the only
+            source.
         objective: (batch, pyramid, poses, views) -> `LossTerms`.
         recipe: Optimiser and schedule.
         metrics: Scores validation batches that have ground truth.
@@ -36,7 +38,7 @@ class SelfSupervisedDepth(LightningModule):
     def __init__(
         self,
         depth: nn.Module,
-        pose: nn.Module,
+        pose: nn.Module | None,
         objective: Objective,
         recipe: Recipe | None = None,
         metrics: DepthMetrics | None = None,
@@ -73,12 +75,32 @@ class SelfSupervisedDepth(LightningModule):
     def step(self, batch: TrainBatch) -> tuple[DepthPyramid, tuple[View, ...], LossTerms]:
         """Predict depth and motion, synthesise the target from its neighbours, and compare."""
         pyramid: DepthPyramid = self.depth(batch["target"])  # Z_t
-        poses = self.pose(batch["target"], batch["sources"])  # D_{t->t'}
+        poses = self.motion(batch)  # D_{t->t'}
         views = self.synthesize(batch, pyramid, poses)  # H_{t'->t}, eq. (7)
         if self.objective.needs_source_depth:
             batch = {**batch, "source_depth": self._source_depth(batch)}
         terms: LossTerms = self.objective(batch, pyramid, poses, views)  # alpha L1 + beta L2, eq. (14)
         return pyramid, views, terms
+
+    def motion(self, batch: TrainBatch) -> Float[Tensor, "b s 4 4"]:
+        """Return T_src_tgt of each source: predicted for neighbours in time, known for a stereo partner, the last."""
+        target, sources = batch["target"], batch["sources"]
+        if "T_stereo_tgt" not in batch:
+            predicted: Tensor = self._pose(target, sources)
+            return predicted
+        known = batch["T_stereo_tgt"][:, None]
+        if sources.shape[1] == 1:
+            return known
+        return torch.cat([self._pose(target, sources[:, :-1]), known], 1)
+
+    def _pose(self, target: Tensor, sources: Tensor) -> Tensor:
+        if self.pose is None:
+            raise ConfigError(
+                "the model has no pose network and the batch has neighbours in time; build one, or use data with a "
+                "stereo partner only"
+            )
+        poses: Tensor = self.pose(target, sources)
+        return poses
 
     def _source_depth(self, batch: TrainBatch) -> Float[Tensor, "b s 1 h w"]:
         """Return the depth of the source images, for terms that compare it with the target's."""

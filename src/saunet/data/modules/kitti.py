@@ -52,6 +52,8 @@ class KittiDataModule(DepthDataModule):
         colour: Probability of colour jitter in training.
         seed: Decides order, augmentation, and what is held out at random.
         target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
+        stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
+            ``offsets: []`` it is the only one.
 
     Raises:
         ConfigError: if a parameter is out of range or a word unknown.
@@ -78,6 +80,7 @@ class KittiDataModule(DepthDataModule):
         colour: float = 0.5,
         seed: int = 0,
         target_depth: bool = False,
+        stereo: bool = False,
     ) -> None:
         super().__init__(
             height=height,
@@ -90,6 +93,7 @@ class KittiDataModule(DepthDataModule):
             colour=colour,
             seed=seed,
             target_depth=target_depth,
+            stereo=stereo,
         )
         self.root = root
         self.split = _known(split, "split", (*splits.TRAINING, "all"))

@@ -34,6 +34,8 @@ class KittiOdometryDataModule(DepthDataModule):
         colour: Probability of colour jitter in training.
         seed: Decides order and augmentation.
         with_pose: Batches carry the true motion.
+        stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
+            ``offsets: []`` it is the only one.
 
     Raises:
         ConfigError: if a parameter is out of range or a word unknown.
@@ -59,6 +61,7 @@ class KittiOdometryDataModule(DepthDataModule):
         colour: float = 0.5,
         seed: int = 0,
         with_pose: bool = False,
+        stereo: bool = False,
     ) -> None:
         super().__init__(
             height=height,
@@ -71,6 +74,7 @@ class KittiOdometryDataModule(DepthDataModule):
             colour=colour,
             seed=seed,
             with_pose=with_pose,
+            stereo=stereo,
         )
         self.root = root
         self.train_sequences, self.test_sequences = tuple(train_sequences), tuple(test_sequences)

@@ -44,6 +44,8 @@ class SyntheticDataModule(DepthDataModule):
         moving_cars: Cars that move in each drive, by turns ahead and oncoming.
         camera_height: Metres above the road.
         cache: Folder in which rendered drives are kept between runs; None renders them each time.
+        stereo: Batches carry the right camera's image, 0.54 m to the right, as one more source; with ``offsets: []`` it
+            is the only one.
 
     Raises:
         ConfigError: if a parameter is out of range.
@@ -72,6 +74,7 @@ class SyntheticDataModule(DepthDataModule):
         moving_cars: int = 0,
         camera_height: float = 1.65,
         cache: str | None = None,
+        stereo: bool = False,
     ) -> None:
         super().__init__(
             height=height,
@@ -85,6 +88,7 @@ class SyntheticDataModule(DepthDataModule):
             seed=seed,
             target_depth=target_depth,
             with_pose=with_pose,
+            stereo=stereo,
         )
         self.counts = {"train": train_drives, "val": val_drives, "test": test_drives}
         for split, count in self.counts.items():
@@ -115,7 +119,8 @@ class SyntheticDataModule(DepthDataModule):
                 )
                 for number in range(self.counts[name])
             ]
-            _render(self._drives[name], name, show=self._place()[0] == 0)
+            pairs = [drive.partner() for drive in self._drives[name]] if self.stereo and name in self.neighbours else []
+            _render([*self._drives[name], *pairs], name, show=self._place()[0] == 0)
         return self._drives[name]
 
     def select(self, split: str) -> Sequence[Selection]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from saunet.atomic import replacing
 from saunet.checks import ConfigError, DataError, one_of, positive
+from saunet.data.partners import distance_between
 from saunet.data.synthetic.render import Camera, cast
 from saunet.data.synthetic.shade import shade
 from saunet.data.synthetic.travel import Travel, pose, travel
@@ -136,7 +137,31 @@ class SyntheticDrive:
 
     def right(self) -> SyntheticDrive:
         """Return the right camera's recording of the same drive."""
-        twin = SyntheticDrive(**{**asdict(self.settings), "camera": "right"}, cache=self._cache)
+        return self._seen_by("right")
+
+    def partner(self) -> SyntheticDrive:
+        """Return the other camera's recording of the same drive: always the same object, so it is rendered once."""
+        return self._partner
+
+    @functools.cached_property
+    def _partner(self) -> SyntheticDrive:
+        twin = self._seen_by("right" if self.settings.camera == "left" else "left")
+        twin.__dict__["_partner"] = self
+        return twin
+
+    @property
+    def T_partner_cam(self) -> F64:  # noqa: N802 (frames in names)
+        """Where the other camera is, 4 x 4, metres: ``baseline`` to the side."""
+        T = np.eye(4)
+        T[0, 3] = -self.settings.baseline if self.settings.camera == "left" else self.settings.baseline
+        return T
+
+    def distance(self, first: int, second: int) -> float:
+        """Return the metres between the poses of two frames."""
+        return distance_between(self.pose(first), self.pose(second))
+
+    def _seen_by(self, camera: str) -> SyntheticDrive:
+        twin = SyntheticDrive(**{**asdict(self.settings), "camera": camera}, cache=self._cache)
         twin.__dict__.update({name: self.__dict__[name] for name in ("world", "travel") if name in self.__dict__})
         return twin
 

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from saunet.checks import ConfigError
 from saunet.losses.base import Term, TermResult, require
 from saunet.losses.functional import masked_mean
 from saunet.registry import terms
@@ -19,10 +20,11 @@ class Velocity(Term):
     """Difference between predicted and true distance travelled, | ||t|| - speed * dt |, in metres (PackNet).
 
     The distance comes from ``batch["distance"]`` (NaN where unknown) or, where that is missing, from the true motion
-    ``batch["T_src_tgt"]``. It makes depth metric; PackNet's weight is 0.1.
+    ``batch["T_src_tgt"]``. It makes depth metric; PackNet's weight is 0.1. A stereo partner, whose motion is known,
+    does not count.
 
     Raises:
-        ConfigError: in `forward`, if the batch has neither.
+        ConfigError: in `forward`, if the batch has neither, or no motion is predicted.
     """
 
     def __init__(self) -> None:
@@ -36,6 +38,12 @@ class Velocity(Term):
         views: Sequence[View],
     ) -> TermResult:
         """Return the mean over samples and sources whose distance is known."""
+        predictions = poses.shape[1] - ("T_stereo_tgt" in batch)
+        if predictions == 0:
+            raise ConfigError(
+                "the velocity term compares predicted motion and the stereo partner is the only source; "
+                "drop the term, or set data.offsets=[-1,1]"
+            )
         if "distance" not in batch and "T_src_tgt" in batch:
             distance = torch.linalg.vector_norm(batch["T_src_tgt"][..., :3, 3], dim=-1)
         else:
@@ -43,6 +51,7 @@ class Velocity(Term):
                 batch, "distance", "the velocity term", "use data with speed or true motion, or drop the term"
             )
         # The norm's gradient at zero motion is 0, not NaN.
-        predicted = torch.linalg.vector_norm(poses[..., :3, 3], dim=-1)
+        predicted = torch.linalg.vector_norm(poses[:, :predictions, :3, 3], dim=-1)
+        distance = distance[:, :predictions]
         known = distance.isfinite()
         return TermResult(value=masked_mean((predicted - distance.where(known, 0.0)).abs(), known))
