@@ -26,7 +26,7 @@ ALLOWED: dict[str, set[str]] = {
     "videos": {"checks"},
     "record": {"registry", "checks"},
     "checkpoint": {"registry", "types", "checks", "models", "atomic", "record"},
-    "evaluation": {"types", "checks", "metrics", "atomic"},
+    "evaluation": {"types", "checks", "metrics", "atomic", "images", "geometry", "losses.functional", "infer.colour"},
     "infer": {
         "types",
         "checks",

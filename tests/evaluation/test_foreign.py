@@ -11,7 +11,7 @@ import torch
 
 from saunet.checks import ConfigError, DataError
 from saunet.evaluation import evaluate
-from saunet.evaluation.foreign import ForeignArray, ForeignFolder, file_stem
+from saunet.evaluation.foreign import ForeignArray, ForeignFolder, file_stem, foreign_predictor
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import protocol
 
@@ -50,12 +50,12 @@ def in_memory():
 @pytest.mark.parametrize("shape", [(5, 6, 10), (5, 1, 6, 10)])
 def test_array_of_disparities(tmp_path, shape):
     np.save(tmp_path / "disps.npy", DISPARITY.reshape(shape))
-    np.testing.assert_array_equal(score(ForeignArray(tmp_path / "disps.npy", images=5)), in_memory())
+    np.testing.assert_array_equal(score(ForeignArray(tmp_path / "disps.npy", NAMES)), in_memory())
 
 
 def test_array_of_depths(tmp_path):
     np.save(tmp_path / "depth.npy", 1 / DISPARITY.astype(np.float64))
-    np.testing.assert_allclose(score(ForeignArray(tmp_path / "depth.npy", "depth")), in_memory(), rtol=1e-5)
+    np.testing.assert_allclose(score(ForeignArray(tmp_path / "depth.npy", NAMES, "depth")), in_memory(), rtol=1e-5)
 
 
 def test_reference_array_gives_the_published_loop(tmp_path, reference):
@@ -64,7 +64,7 @@ def test_reference_array_gives_the_published_loop(tmp_path, reference):
     truth = torch.from_numpy(data["eigen_gt"])[:, None]
     batch = {"name": ["a", "b"], "target": None, "depth": truth, "depth_size": torch.tensor([[375, 1242]] * 2)}
     result = evaluate(
-        {"m": ForeignArray(tmp_path / "disps.npy")}, [batch], [protocol("eigen_camera_z")], progress=False
+        {"m": ForeignArray(tmp_path / "disps.npy", ["a", "b"])}, [batch], [protocol("eigen_camera_z")], progress=False
     )
     expected = data["eigen_metrics_median_scaled"].mean(0)
     np.testing.assert_allclose(result.summaries()[0].errors[:4], expected[:4], rtol=1e-5)
@@ -81,10 +81,34 @@ def test_folder(tmp_path, match, kind):
         else:
             cv2.imwrite(str(tmp_path / f"{stem}.png"), np.round(256 / disparity).astype(np.uint16))
     (tmp_path / "notes.txt").write_text("not a prediction")
-    found = score(ForeignFolder(tmp_path, "disparity", match, images=5))
+    found = score(ForeignFolder(tmp_path, NAMES, "disparity", match))
     np.testing.assert_allclose(
         found, in_memory(), **({"atol": 0.0} if kind == "npy" else {"rtol": 0.01, "atol": 0.005})
     )
+
+
+def test_an_array_may_hold_images_that_are_not_evaluated_and_in_another_order(tmp_path):
+    order = [NAMES[3], "no truth", *NAMES[:3], NAMES[4]]
+    array = np.stack([DISPARITY[3], np.full((6, 10), 9.0), *DISPARITY[:3], DISPARITY[4]]).astype(np.float32)
+    np.save(tmp_path / "disps.npy", array)
+    np.testing.assert_array_equal(score(ForeignArray(tmp_path / "disps.npy", order)), in_memory())
+
+
+def test_a_path_says_what_it_is(tmp_path):
+    np.save(tmp_path / "disps.npy", DISPARITY)
+    array = foreign_predictor(tmp_path / "disps.npy", NAMES)
+    assert isinstance(array, ForeignArray)
+    assert array.values == "disparity"
+    (tmp_path / "depth").mkdir()
+    for name, disparity in zip(NAMES, DISPARITY, strict=True):
+        np.save(tmp_path / "depth" / f"{file_stem(name)}.npy", 1 / disparity)
+    np.testing.assert_allclose(score(foreign_predictor(tmp_path / "depth", (), match="name")), in_memory(), rtol=1e-5)
+    with pytest.raises(DataError, match="no predictions at"):
+        foreign_predictor(tmp_path / "nothing", NAMES)
+    with pytest.raises(ConfigError, match="match is 'nam'"):
+        foreign_predictor(tmp_path / "depth", NAMES, match="nam")
+    with pytest.raises(ConfigError, match="values is 'depths'"):
+        foreign_predictor(tmp_path / "depth", NAMES, "depths")
 
 
 def test_file_stem():
@@ -93,17 +117,14 @@ def test_file_stem():
 
 def test_wrong_count(tmp_path):
     np.save(tmp_path / "disps.npy", DISPARITY)
-    with pytest.raises(DataError, match="holds 5 predictions for 697 images"):
-        ForeignArray(tmp_path / "disps.npy", images=697)
-    np.save(tmp_path / "disps.npy", DISPARITY[:4])
-    with pytest.raises(DataError, match="holds 4 predictions and more images are evaluated"):
-        score(ForeignArray(tmp_path / "disps.npy"))
+    with pytest.raises(DataError, match="holds 5 predictions for 6 images"):
+        ForeignArray(tmp_path / "disps.npy", [*NAMES, "one more"])
+    with pytest.raises(DataError, match=f"no prediction for image '{NAMES[0]}'; it belongs to another split"):
+        score(ForeignArray(tmp_path / "disps.npy", [f"other {i}" for i in range(5)]))
     (tmp_path / "folder").mkdir()
     np.save(tmp_path / "folder" / "0.npy", DISPARITY[0])
     with pytest.raises(DataError, match="holds 1 predictions for 2 images"):
-        ForeignFolder(tmp_path / "folder", images=2)
-    with pytest.raises(DataError, match="holds 1 predictions and more images"):
-        score(ForeignFolder(tmp_path / "folder"))
+        ForeignFolder(tmp_path / "folder", NAMES[:2], match="order")
     with pytest.raises(DataError, match=r"has no file 'day_drive_0_0000000000_l\.npy'"):
         score(ForeignFolder(tmp_path / "folder", match="name"))
 
@@ -123,12 +144,12 @@ def test_broken_arrays(tmp_path, content, message):
     else:
         np.save(path, content)
     with pytest.raises(DataError, match=message):
-        ForeignArray(path)
+        ForeignArray(path, NAMES)
 
 
 def read_all(folder):
-    predictor = ForeignFolder(folder)
-    return predictor({"name": NAMES[: len(list(folder.iterdir()))]})
+    names = NAMES[: len(list(folder.iterdir()))]
+    return ForeignFolder(folder, names, match="order")({"name": names})
 
 
 def test_broken_files_of_a_folder(tmp_path):
@@ -161,6 +182,6 @@ def test_broken_files_of_a_folder(tmp_path):
 def test_unknown_words(tmp_path):
     np.save(tmp_path / "a.npy", DISPARITY)
     with pytest.raises(ConfigError, match="did you mean 'depth'"):
-        inspect.unwrap(ForeignArray.__init__)(ForeignArray.__new__(ForeignArray), tmp_path / "a.npy", "depths")
+        inspect.unwrap(ForeignArray.__init__)(ForeignArray.__new__(ForeignArray), tmp_path / "a.npy", NAMES, "depths")
     with pytest.raises(ConfigError, match="match is 'names'"):
-        inspect.unwrap(ForeignFolder.__init__)(ForeignFolder.__new__(ForeignFolder), tmp_path, "depth", "names")
+        inspect.unwrap(ForeignFolder.__init__)(ForeignFolder.__new__(ForeignFolder), tmp_path, NAMES, "depth", "names")

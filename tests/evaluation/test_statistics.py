@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
 from saunet.checks import ConfigError, DataError
-from saunet.evaluation.result import ImageRow
-from saunet.evaluation.statistics import bootstrap_mean, compare, drive_of
+from saunet.evaluation.result import EvaluationResult, ImageRow
+from saunet.evaluation.statistics import bootstrap_mean, compare, drive_of, spreads
+from saunet.metrics.protocols import protocol
 
 
 def rows(errors, predictor="m", drives=10, blank=()):
@@ -62,7 +64,10 @@ def test_a_real_difference_is_found():
     better = base.copy()
     better[:, :4] -= 0.01 + 0.001 * rng.normal(size=(200, 4))
     better[:, 4:] += 0.01
-    found = compare(rows(base), rows(better, "other"))
+    comparison = compare(rows(base), rows(better, "other"), names=("a", "b"))
+    assert (comparison.protocol, comparison.first, comparison.second) == ("metric", "a", "b")
+    assert (comparison.images, comparison.by, comparison.groups) == (200, "drive", 10)
+    found = comparison.differences
     for row in found[:4]:
         assert row.high < 0
         assert row.better == 1.0
@@ -77,14 +82,14 @@ def test_a_real_difference_is_found():
 def test_noise_is_not_a_difference():
     rng = np.random.default_rng(6)
     base = rng.random((200, 7))
-    found = compare(rows(base), rows(base + 0.01 * rng.normal(size=base.shape)), by_drive=False)
+    found = compare(rows(base, drives=2), rows(base + 0.01 * rng.normal(size=base.shape), drives=2)).differences
     assert sum(row.low <= 0 <= row.high for row in found) >= 6
     assert np.median([row.p_value for row in found]) > 0.05
 
 
 def test_equal_results_tie():
     base = np.random.default_rng(7).random((20, 7))
-    for row in compare(rows(base), rows(base)):
+    for row in compare(rows(base), rows(base)).differences:
         assert (row.difference, row.better, row.p_value) == (0.0, 0.5, 1.0)
 
 
@@ -92,7 +97,7 @@ def test_pairs_by_name_in_any_order_and_skips_images_without_truth():
     base = np.random.default_rng(8).random((20, 7))
     other = base + 0.5
     other[3] = math.nan
-    found = compare(rows(base), rows(other, blank=(3,))[::-1])
+    found = compare(rows(base), rows(other, blank=(3,))[::-1]).differences
     assert found[0].difference == pytest.approx(0.5)
     assert found[0].first == pytest.approx(np.delete(base, 3, 0)[:, 0].mean())
 
@@ -111,5 +116,27 @@ def test_what_cannot_be_compared():
         bootstrap_mean(base, level=1.5)
 
 
+def test_rows_of_two_protocols_are_not_compared():
+    base = rows(np.ones((5, 7)))
+    with pytest.raises(DataError, match="protocols eigen_lidar_x, metric; compare under one"):
+        compare(base, [dataclasses.replace(row, protocol="eigen_lidar_x") for row in base])
+
+
+def test_spreads_resample_drives_where_there_are_enough_and_say_what_they_did():
+    values = np.random.default_rng(9).random((60, 7))
+    for drives, by, groups in ((6, "drive", 6), (2, "image", 60)):
+        result = EvaluationResult((protocol("metric"),), ("m",), tuple(rows(values, drives=drives)))
+        (found,) = spreads(result, resamples=500)
+        assert (found.by, found.groups, found.predictor, found.protocol) == (by, groups, "m", "metric")
+        mean = values.mean(0)
+        assert all(low < value < high for low, value, high in zip(found.low, mean, found.high, strict=True))
+
+
+def test_no_spread_where_no_image_has_truth():
+    blank = tuple(rows(np.full((3, 7), math.nan), blank=range(3)))
+    assert spreads(EvaluationResult((protocol("metric"),), ("m",), blank)) == ()
+
+
 def test_drive_of():
+    assert drive_of("synthetic 7 0000000005") == "synthetic 7"
     assert drive_of("2011_09_26/2011_09_26_drive_0001_sync 0000000005 l") == "2011_09_26/2011_09_26_drive_0001_sync"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -22,12 +22,12 @@ SUFFIXES: tuple[str, ...] = (".npy", ".png")
 
 
 class ForeignArray:
-    """One array of predictions in the order of evaluation, such as Monodepth2's ``disps_eigen_split.npy``.
+    """One array of predictions in a known order, such as Monodepth2's ``disps_eigen_split.npy``.
 
     Args:
         path: A ``.npy`` file, images x height x width (a channel of 1 is accepted); it is read as needed, never whole.
+        names: The image of each entry; some of them need not be evaluated (for want of ground truth).
         values: ``disparity`` (up to scale), or ``depth``.
-        images: Number of images that will be evaluated, checked at once; not checked if None.
 
     Raises:
         ConfigError: for other ``values``.
@@ -35,7 +35,7 @@ class ForeignArray:
     """
 
     def __init__(
-        self, path: Path, values: Literal["disparity", "depth"] = "disparity", images: int | None = None
+        self, path: Path, names: Sequence[str], values: Literal["disparity", "depth"] = "disparity"
     ) -> None:
         self.path, self.values = path, one_of("values", values, ("disparity", "depth"))
         array = _load_array(path)
@@ -43,19 +43,16 @@ class ForeignArray:
             array = array[:, 0]
         if array.ndim != 3:
             raise DataError(f"'{path}' holds shape {array.shape}; predictions are images x height x width")
-        _check_count(path, len(array), images)
-        self._array, self._next = array, 0
+        self._array, self._place = array, _places(path, len(array), names)
 
     def __call__(self, batch: EvalBatch) -> Float[Tensor, "b 1 h w"]:
-        """Return the disparity of the next images.
+        """Return the disparity of the batch's images.
 
         Raises:
-            DataError: if there are not enough predictions, or a depth is not positive.
+            DataError: if one is not among the names, or a depth is not positive.
         """
-        first, self._next = self._next, self._next + len(batch["name"])
-        if self._next > len(self._array):
-            raise DataError(f"'{self.path}' holds {len(self._array)} predictions and more images are evaluated")
-        maps = [np.array(one, dtype=np.float32) for one in self._array[first : self._next]]
+        places = [_place(self._place, name, self.path) for name in batch["name"]]
+        maps = [np.array(self._array[place], dtype=np.float32) for place in places]
         return torch.stack([_disparity(one, self.values, self.path) for one in maps])
 
 
@@ -64,10 +61,9 @@ class ForeignFolder:
 
     Args:
         folder: The folder.
+        names: The images in the order of the files sorted by name, for ``match="order"``.
         values: What ``.npy`` files hold; ``.png`` always holds depth.
-        match: ``order`` takes the files sorted by name in the order of evaluation; ``name`` looks for the `file_stem`
-            of each image's name.
-        images: Number of images that will be evaluated, checked at once; not checked if None.
+        match: ``order``, or ``name``: look for the `file_stem` of each image's name.
 
     Raises:
         ConfigError: for another word.
@@ -77,9 +73,9 @@ class ForeignFolder:
     def __init__(
         self,
         folder: Path,
+        names: Sequence[str] = (),
         values: Literal["disparity", "depth"] = "depth",
-        match: Literal["order", "name"] = "order",
-        images: int | None = None,
+        match: Literal["order", "name"] = "name",
     ) -> None:
         self.folder, self.values = folder, one_of("values", values, ("disparity", "depth"))
         self.match = one_of("match", match, ("order", "name"))
@@ -88,10 +84,8 @@ class ForeignFolder:
         self._files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
         if not self._files:
             raise DataError(f"'{folder}' holds no prediction; its files must end in {' or '.join(SUFFIXES)}")
-        if match == "order":
-            _check_count(folder, len(self._files), images)
         self._stems = {file.stem: file for file in self._files}
-        self._next = 0
+        self._place = _places(folder, len(self._files), names) if match == "order" else {}
 
     def __call__(self, batch: EvalBatch) -> Float[Tensor, "b 1 h w"]:
         """Return the disparity of the batch's images; they must be of one size.
@@ -106,13 +100,13 @@ class ForeignFolder:
 
     def _choose(self, names: Sequence[str]) -> list[Path]:
         if self.match == "order":
-            first, self._next = self._next, self._next + len(names)
-            if self._next > len(self._files):
-                raise DataError(f"'{self.folder}' holds {len(self._files)} predictions and more images are evaluated")
-            return self._files[first : self._next]
+            return [self._files[_place(self._place, name, self.folder)] for name in names]
         for name in names:
             if file_stem(name) not in self._stems:
-                raise DataError(f"'{self.folder}' has no file '{file_stem(name)}.npy' or '.png' for image '{name}'")
+                raise DataError(
+                    f"'{self.folder}' has no file '{file_stem(name)}.npy' or '.png' for image '{name}'; "
+                    "name the files so, or let them follow the order of the images (match=order)"
+                )
         return [self._stems[file_stem(name)] for name in names]
 
     def _read(self, file: Path) -> Float[Tensor, "1 h w"]:
@@ -151,6 +145,40 @@ def _disparity(values: ndarray, kind: str, path: Path) -> Float[Tensor, "1 h w"]
     return torch.from_numpy(1 / values)[None]
 
 
-def _check_count(path: Path, found: int, images: int | None) -> None:
-    if images is not None and found != images:
-        raise DataError(f"'{path}' holds {found} predictions for {images} images; give one for each, in the same order")
+def _places(path: Path, found: int, names: Sequence[str]) -> dict[str, int]:
+    if found != len(names):
+        raise DataError(
+            f"'{path}' holds {found} predictions for {len(names)} images; give one for each, in the same order"
+        )
+    return {name: place for place, name in enumerate(names)}
+
+
+def _place(places: Mapping[str, int], name: str, path: Path) -> int:
+    if name not in places:
+        raise DataError(f"'{path}' has no prediction for image '{name}'; it belongs to another split")
+    return places[name]
+
+
+def foreign_predictor(
+    path: Path, names: Sequence[str], values: str | None = None, match: str = "order"
+) -> ForeignArray | ForeignFolder:
+    """Return the predictor that belongs to a path: an array for a ``.npy`` file, else a folder.
+
+    Args:
+        path: File or folder.
+        names: The images in the order of the predictions.
+        values: ``disparity`` or ``depth``; by default disparity in an array and depth in a folder.
+        match: How files of a folder find their image, ``order`` or ``name``.
+
+    Raises:
+        ConfigError: for another word.
+        DataError: if there is nothing at the path, or it does not fit the images.
+    """
+    one_of("match", match, ("order", "name"))
+    if values is not None:
+        one_of("values", values, ("disparity", "depth"))
+    if path.is_dir():
+        return ForeignFolder(path, names, values or "depth", match)  # type: ignore[arg-type]
+    if not path.exists():
+        raise DataError(f"no predictions at '{path}'; give a .npy array or a folder of .npy or .png files")
+    return ForeignArray(path, names, values or "disparity")  # type: ignore[arg-type]

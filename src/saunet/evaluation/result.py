@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,81 @@ class Summary:
     images_without_truth: int
 
 
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """How sure the means of one predictor under one protocol are: bootstrap intervals."""
+
+    predictor: str
+    protocol: str
+    level: float
+    """Share of resampled means inside."""
+    by: str
+    """What was resampled: whole ``drive``s, or single ``image``s where there are too few drives."""
+    groups: int
+    """How many of them there are."""
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    """In the order of `saunet.metrics.functional.ERROR_NAMES`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One error of two predictors on the same images."""
+
+    name: str
+    """One of `saunet.metrics.functional.ERROR_NAMES`."""
+    first: float
+    second: float
+    """Means over the images."""
+    difference: float
+    """``second - first``."""
+    low: float
+    high: float
+    """Bootstrap interval of the difference; with zero outside it, the predictors differ."""
+    better: float
+    """Share of images on which the second is better, ties counted half."""
+    p_value: float
+    """Chance of a difference at least this large if the labels were exchanged at random (sign-flip test, two-sided)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two predictors on the same images under one protocol."""
+
+    protocol: str
+    first: str
+    second: str
+    """What the tables call them."""
+    images: int
+    level: float
+    """Of the intervals."""
+    by: str
+    """What was resampled, ``drive`` or ``image``."""
+    groups: int
+    """How many of them there are."""
+    differences: tuple[Difference, ...]
+    """One for each of the seven errors."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewRow:
+    """How well a prediction explains the neighbouring frames of one image, where no depth is known."""
+
+    predictor: str
+    protocol: str
+    name: str
+    group: str
+    """The condition or the recording that the image belongs to."""
+    warped: float
+    """Photometric error after warping the neighbours by depth and motion, SAU-Net eqs. (8) to (10)."""
+    unwarped: float
+    """The same without warping: what a network that has learnt nothing reaches."""
+    explained: float
+    """Share of pixels that warping brings closer, SAU-Net eq. (11)."""
+    visible: float
+    """Share of pixels that any neighbour sees."""
+
+
 @dataclass(frozen=True)
 class EvaluationResult:
     """All rows of an evaluation, with the protocols that they were computed under."""
@@ -55,6 +130,14 @@ class EvaluationResult:
     rows: tuple[ImageRow, ...]
     buckets: tuple[BucketRow, ...] = ()
     """Errors by distance, region and edges, where they were asked for."""
+    views: tuple[ViewRow, ...] = ()
+    """Rows under protocols that need no ground truth."""
+    spreads: tuple[Spread, ...] = ()
+    """Intervals of the means, where they were asked for."""
+    comparisons: tuple[Comparison, ...] = ()
+    """Differences to another run, where they were asked for."""
+    settings: Mapping[str, object] = field(default_factory=dict)
+    """What else the numbers depend on, such as post-processing; plain data."""
 
     def select(self, predictor: str, protocol: str) -> tuple[ImageRow, ...]:
         """Return the rows of one predictor under one protocol, in the order they were computed.
@@ -109,7 +192,14 @@ class EvaluationResult:
                 )
         predictors = tuple(dict.fromkeys((*self.predictors, *other.predictors)))
         return EvaluationResult(
-            tuple(rules.values()), predictors, (*self.rows, *other.rows), (*self.buckets, *other.buckets)
+            tuple(rules.values()),
+            predictors,
+            (*self.rows, *other.rows),
+            (*self.buckets, *other.buckets),
+            (*self.views, *other.views),
+            (*self.spreads, *other.spreads),
+            (*self.comparisons, *other.comparisons),
+            {**self.settings, **other.settings},
         )
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.checks import ConfigError, DataError, one_of
 from saunet.evaluation.breakdown import Buckets, BucketSums
+from saunet.evaluation.progress import bar
 from saunet.evaluation.result import EvaluationResult, ImageRow
 from saunet.metrics.depth import native_depths
 from saunet.metrics.functional import flip_blend
@@ -79,19 +79,11 @@ def evaluate(
     _check_request(predictors, protocols, ground_truth)
     rows: list[ImageRow] = []
     sums = {(p, q.name): BucketSums(buckets) for p in predictors for q in protocols} if buckets else {}
-    columns = (
-        TextColumn("evaluate"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("images"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), disable=not progress, transient=True) as bar:
-        task = bar.add_task("evaluate", total=total)
+    with bar(progress) as shown:
+        task = shown.add_task("evaluate", total=total)
         for batch in batches:
             rows += _score_batch(predictors, batch, protocols, sums, buckets)
-            bar.advance(task, len(batch["name"]))
+            shown.advance(task, len(batch["name"]))
     if not rows:
         raise DataError("there is no image to evaluate; check the split and the data root")
     if not any(row.pixels for row in rows):
@@ -124,12 +116,11 @@ def _score_batch(
     buckets: Buckets | None,
 ) -> list[ImageRow]:
     names = batch["name"]
-    depth, depth_size = _truth(batch)
-    truths = native_depths(depth, depth_size, len(names))
+    truths = truths_of(batch)
     maps = [buckets.maps(truth) if buckets else None for truth in truths]
     rows = []
     for predictor, predict in predictors.items():
-        disparity = predict(batch).to(depth.device)
+        disparity = predict(batch).to(truths[0].device)
         if disparity.ndim != 4 or disparity.shape[:2] != (len(names), 1):
             raise DataError(
                 f"predictor '{predictor}' returned shape {tuple(disparity.shape)} for {len(names)} images; "
@@ -149,11 +140,14 @@ def _score_batch(
     return rows
 
 
-def _truth(batch: EvalBatch) -> tuple[Tensor, Tensor]:
-    """Return depth and native sizes; images without either get one unknown pixel, as beside images that have truth."""
+def truths_of(batch: EvalBatch) -> list[Float[Tensor, "_ _"]]:
+    """Return the ground truth of each image at its native size, metres, 0 where unknown; one such pixel without any.
+
+    Raises:
+        DataError: if the batch has depth without its sizes, or they do not fit.
+    """
     if "depth" not in batch:
-        images = len(batch["name"])
-        return batch["target"].new_zeros(images, 1, 1, 1), torch.ones(images, 2, dtype=torch.int64)
+        return [batch["target"].new_zeros(1, 1) for _ in batch["name"]]
     if "depth_size" not in batch:
         raise DataError(f"image '{batch['name'][0]}' comes with depth but without depth_size; give its (height, width)")
-    return batch["depth"], batch["depth_size"]
+    return native_depths(batch["depth"], batch["depth_size"], len(batch["name"]))

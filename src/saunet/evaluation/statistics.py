@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from saunet.checks import DataError, in_range, positive
-from saunet.evaluation.result import ImageRow
+from saunet.evaluation.result import Comparison, Difference, EvaluationResult, ImageRow, Spread
 from saunet.metrics.functional import ERROR_NAMES, HIGHER_IS_BETTER
 
 
@@ -22,29 +23,44 @@ class Interval:
     high: Float64[ndarray, " k"]
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """One error of two predictors on the same images."""
-
-    name: str
-    """One of `ERROR_NAMES`."""
-    first: float
-    second: float
-    """Means over the images."""
-    difference: float
-    """``second - first``."""
-    low: float
-    high: float
-    """Bootstrap interval of the difference; with zero outside it, the predictors differ."""
-    better: float
-    """Share of images on which the second is better, ties counted half."""
-    p_value: float
-    """Chance of a difference at least this large if the labels were exchanged at random (sign-flip test, two-sided)."""
+FEWEST_DRIVES = 5
+"""With fewer drives than this, resampling them says nothing: images are resampled, and the result says so."""
 
 
 def drive_of(name: str) -> str:
-    """Return the drive in an image's name: all before the first space, such as ``2011_09_26/..._sync``."""
-    return name.partition(" ")[0]
+    """Return the drive in an image's name: all before the frame's number, such as ``2011_09_26/..._sync``."""
+    return re.sub(r" \d+( [lr])?$", "", name)
+
+
+def groups_of(names: Sequence[str]) -> tuple[str, int, list[str] | None]:
+    """Choose what to resample for these images: drives where there are `FEWEST_DRIVES`, else images.
+
+    Returns:
+        ``drive`` or ``image``, how many there are, and the group of each image (None for images).
+    """
+    drives = [drive_of(name) for name in names]
+    count = len(set(drives))
+    return ("drive", count, drives) if count >= FEWEST_DRIVES else ("image", len(names), None)
+
+
+def spreads(result: EvaluationResult, level: float = 0.95, resamples: int = 2000, seed: int = 0) -> tuple[Spread, ...]:
+    """Compute bootstrap intervals of all means of a result that rest on at least one image.
+
+    Raises:
+        ConfigError: as `bootstrap_mean`.
+    """
+    found = []
+    for protocol in result.protocols:
+        for predictor in result.predictors:
+            rows = [row for row in result.select(predictor, protocol.name) if row.pixels]
+            if not rows:
+                continue
+            by, count, groups = groups_of([row.name for row in rows])
+            values = np.array([row.errors for row in rows], dtype=np.float64)
+            interval = bootstrap_mean(values, groups, level=level, resamples=resamples, seed=seed)
+            low, high = tuple(interval.low.tolist()), tuple(interval.high.tolist())
+            found.append(Spread(predictor, protocol.name, level, by, count, low, high))
+    return tuple(found)
 
 
 def bootstrap_mean(
@@ -84,27 +100,27 @@ def compare(
     first: Sequence[ImageRow],
     second: Sequence[ImageRow],
     *,
-    by_drive: bool = True,
+    names: tuple[str, str] = ("first", "second"),
     level: float = 0.95,
     resamples: int = 2000,
     seed: int = 0,
-) -> tuple[Difference, ...]:
+) -> Comparison:
     """Compare two predictors image by image, paired by name.
+
+    Whole drives are resampled and flipped, since frames of a drive are alike; single images where there are fewer than
+    `FEWEST_DRIVES` drives, and then intervals are too narrow.
 
     Args:
         first: Rows of one predictor under one protocol.
-        second: Rows of the other, for the same images.
-        by_drive: Resample and flip whole drives, since frames of a drive are alike.
+        second: Rows of the other under the same one, for the same images.
+        names: What to call them.
         level: Of the intervals.
         resamples: How often to resample and to flip.
         seed: Of both.
 
-    Returns:
-        One difference for each of the seven errors.
-
     Raises:
         ConfigError: as `bootstrap_mean`.
-        DataError: if the images are not the same, a name occurs twice, or none has ground truth.
+        DataError: if the images or protocols are not the same, a name occurs twice, or none has ground truth.
     """
     one, other = ({row.name: row for row in rows} for rows in (first, second))
     if one.keys() != other.keys() or len(one) != len(first) or len(other) != len(second):
@@ -113,17 +129,20 @@ def compare(
         raise DataError(
             f"{len(first)} and {len(second)} rows do not pair up: {hint}; compare results on the same images"
         )
-    names = [name for name, row in one.items() if row.pixels and other[name].pixels]
+    protocols = sorted({row.protocol for row in (*first, *second)})
+    if len(protocols) != 1:
+        raise DataError(f"the rows come from protocols {', '.join(protocols) or 'without a row'}; compare under one")
+    images = [name for name, row in one.items() if row.pixels and other[name].pixels]
     ours, theirs = (
-        np.array([rows[name].errors for name in names], dtype=np.float64).reshape(-1, 7) for rows in (one, other)
+        np.array([rows[name].errors for name in images], dtype=np.float64).reshape(-1, 7) for rows in (one, other)
     )
     delta = theirs - ours
-    groups = [drive_of(name) for name in names] if by_drive else None
+    by, count, groups = groups_of(images)
     interval = bootstrap_mean(delta, groups, level=level, resamples=resamples, seed=seed)
     p_values = _sign_flip(delta, groups, resamples, seed)
     upwards = np.where(HIGHER_IS_BETTER, 1.0, -1.0)
     better = ((np.sign(delta) * upwards + 1) / 2).mean(0)
-    return tuple(
+    differences = tuple(
         Difference(
             name,
             float(ours[:, k].mean()),
@@ -136,6 +155,7 @@ def compare(
         )
         for k, name in enumerate(ERROR_NAMES)
     )
+    return Comparison(protocols[0], *names, len(images), level, by, count, differences)
 
 
 def _sign_flip(

@@ -14,8 +14,10 @@ from torch.nn.functional import interpolate
 from saunet.checks import ConfigError, one_of, positive
 from saunet.metrics.functional import depth_errors, garg_crop, median
 
-GROUND_TRUTHS: tuple[str, ...] = ("lidar_x", "camera_z", "improved", "exact")
-"""The LiDAR's own forward coordinate; the camera's z of the same points; KITTI's accumulated maps; a renderer's."""
+GROUND_TRUTHS: tuple[str, ...] = ("lidar_x", "camera_z", "improved", "exact", "none")
+"""The LiDAR's own forward coordinate; the camera's z of the same points; KITTI's accumulated maps; a renderer's; none.
+
+Without depth, predictions are scored by how well they explain the neighbouring frames (`saunet.evaluation.views`)."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Protocol:
 
     name: str
     summary: str = ""
-    ground_truth: Literal["lidar_x", "camera_z", "improved", "exact"] = "camera_z"
+    ground_truth: Literal["lidar_x", "camera_z", "improved", "exact", "none"] = "camera_z"
     min_depth: float = 1e-3
     max_depth: float = 80.0
     capped: bool = True
@@ -82,6 +84,9 @@ _PROTOCOLS = (
     ),
     Protocol("metric", "camera z, Garg crop, metres as predicted: no scaling", "camera_z", scaling="none"),
     Protocol("synthetic", "a renderer's dense depth, whole image, 0.1 to 80 m", "exact", min_depth=0.1, crop="none"),
+    Protocol(
+        "campus", "no ground truth: how well depth and motion explain the neighbours", "none", crop="none", scaling="none"
+    ),
 )
 PROTOCOLS: dict[str, Protocol] = {protocol.name: protocol for protocol in _PROTOCOLS}
 """The named protocols, each with its one-line summary."""
@@ -137,15 +142,24 @@ def sample_image(disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "h
     target = ground_truth[mask].double()
     if target.numel() == 0:  # nothing to compare, perhaps not even a size to resize to
         return Sample(target, target, mask, median(target))
-    single = disparity.to(torch.promote_types(disparity.dtype, torch.float32))[None, None]
-    size = (ground_truth.shape[0], ground_truth.shape[1])
-    resized = interpolate(single, size=size, mode="bilinear", align_corners=False)[0, 0]
-    # The floor lies far below any real disparity (a billion metres): it keeps medians and products finite.
-    prediction = protocol.factor / resized[mask].double().clamp(min=1e-9)
+    resized = resize_disparity(disparity, (ground_truth.shape[0], ground_truth.shape[1]))
+    prediction = protocol.factor / resized[mask].double()
     ratio = median(target) / median(prediction)
     if protocol.scaling == "median":
         prediction = prediction * ratio
     return Sample(prediction.clamp(protocol.min_depth, protocol.max_depth), target, mask, ratio)
+
+
+def resize_disparity(disparity: Float[Tensor, "h w"], size: tuple[int, int]) -> Float[Tensor, "_ _"]:
+    """Resize a disparity map bilinearly with half-pixel centres, in single precision or better, and keep it positive.
+
+    Args:
+        disparity: Inverse depth.
+        size: (height, width).
+    """
+    single = disparity.to(torch.promote_types(disparity.dtype, torch.float32))[None, None]
+    # The floor lies far below any real disparity (a billion metres): it keeps medians and products finite.
+    return interpolate(single, size=size, mode="bilinear", align_corners=False)[0, 0].clamp(min=1e-9)
 
 
 def evaluate_image(
