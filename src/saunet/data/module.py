@@ -182,6 +182,14 @@ class DepthDataModule(LightningDataModule):
             if depth is not None:
                 yield torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32))[None]
 
+    def listed(self, split: str) -> list[str]:
+        """Return the names of all images that a split lists, in its order, with or without ground truth.
+
+        Arrays of predictions made elsewhere follow this order.
+        """
+        dataset = self._set_up(split)
+        return [dataset.name(index) for index in range(len(dataset))]
+
     def on_after_batch_transfer(self, batch: FrameBatch, dataloader_idx: int) -> TrainBatch | EvalBatch:
         """Turn bytes into images on the device; samples that carry random numbers are augmented."""
         return self.augment(batch) if "draws" in batch else self.prepare(batch)  # type: ignore[no-any-return]

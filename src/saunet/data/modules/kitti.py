@@ -137,6 +137,12 @@ class KittiDataModule(DepthDataModule):
             )
         return selections
 
+    def listed(self, split: str) -> list[str]:
+        """Return the names of all images that a split lists, in its order, also of those that the root lacks."""
+        if split != "test":
+            return super().listed(split)
+        return [str(frame) for frame in self._test(self._raw or KittiRaw(self.root))]
+
     def _training(self, raw: KittiRaw) -> splits.Parts:
         gap = max(0, *self.offsets) - min(0, *self.offsets) if self.offsets else 0
         if self.split in splits.TRAINING:
