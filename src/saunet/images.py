@@ -124,6 +124,13 @@ def network_input(
     return np.ascontiguousarray(resized.transpose(2, 0, 1) / np.float32(255))
 
 
+def encode_jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int = 95) -> bytes:
+    """Return an RGB image as the bytes of a JPEG file; quality 1 to 100."""
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done, "an image in memory of a size that JPEG holds"
+    return bytes(data.tobytes())
+
+
 def write_image(path: str | Path, image: Shaped[np.ndarray, "..."]) -> None:
     """Write RGB or grey bytes, or 16-bit grey, in the format of the path's suffix, whole or not at all.
 

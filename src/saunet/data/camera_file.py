@@ -29,7 +29,7 @@ import yaml
 from numpy.typing import NDArray
 
 from saunet.atomic import write_bytes
-from saunet.checks import DataError, suggest
+from saunet.checks import DataError, SaunetError, suggest
 from saunet.geometry.camera import crop_intrinsics, scale_intrinsics
 
 FILE_NAME = "camera.yaml"
@@ -78,9 +78,9 @@ class CameraFile:
         Raises:
             DataError: if they have another shape, or K cannot be that of such an image.
         """
-        K = torch.from_numpy(self.K)
+        given = torch.from_numpy(self.K)
         if self.image_size is None:  # one pixel, whose centre is 0
-            K = scale_intrinsics(crop_intrinsics(K, 0.5, 0.5), width, height).numpy()
+            scaled = scale_intrinsics(crop_intrinsics(given, 0.5, 0.5), width, height)
         else:
             rows, columns = self.image_size
             if abs(height / rows * columns / width - 1) > _SAME_SHAPE:
@@ -88,7 +88,8 @@ class CameraFile:
                     f"{what} are {width}x{height} (width x height) but {self.path} is for {columns}x{rows}; "
                     "give frames of the calibrated shape (scaled as a whole, not cropped), or calibrate anew"
                 )
-            K = scale_intrinsics(K, width / columns, height / rows).numpy()
+            scaled = scale_intrinsics(given, width / columns, height / rows)
+        K: NDArray[np.float64] = scaled.numpy()
         check_intrinsics(K, height, width, str(self.path))
         return K
 
@@ -177,15 +178,15 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
     return camera
 
 
-def check_crop(crop: Sequence[float], what: str) -> None:
+def check_crop(crop: Sequence[float], what: str, error: type[SaunetError] = DataError) -> None:
     """Check the shares to cut off at the top, bottom, left and right.
 
     Raises:
-        DataError: if they are not four shares that leave something of the image.
+        SaunetError: of class ``error``, if they are not four shares that leave something of the image.
     """
     fits = len(crop) == 4 and all(0 <= share < 1 for share in crop)
     if not fits or crop[0] + crop[1] > 0.9 or crop[2] + crop[3] > 0.9:
-        raise DataError(
+        raise error(
             f"{what} is {list(crop)}; expected shares to cut off at the [top, bottom, left, right], each at least 0, "
             "that leave a tenth of the height and width"
         )

@@ -6,7 +6,7 @@ A data set subclasses `DepthDataModule`, names its own parameters beside the sha
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -16,9 +16,11 @@ from lightning.pytorch import LightningDataModule
 from lightning.pytorch.utilities import move_data_to_device, rank_zero_info
 from torch.utils.data import DataLoader
 
-from saunet.checks import ConfigError, DataError, in_range, positive
+from saunet.checks import ConfigError, DataError, in_range, one_of, positive
+from saunet.data.manifest import read_manifest
 from saunet.data.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, share
 from saunet.data.transforms import Augment, Prepare
+from saunet.data.unreadable import SkippingWindows, readable
 from saunet.data.windows import Selection, Usage, WindowDataset, check_offsets, collate, find_windows
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
 
@@ -41,9 +43,13 @@ class DepthDataModule(LightningDataModule):
         target_depth: Training batches carry the depth of the target, for losses that use it.
         with_pose: Batches carry the true motion.
         stereo: Training and validation batches carry the stereo partner as one more source, which makes depth metric.
+        manifest: File of frames to leave out of training and validation, as ``saunet-doctor`` writes it.
+        on_error: A file that cannot be read: ``raise`` stops and names it. ``skip`` names and counts it and goes on: in
+            training with another sample, while the frames of other splits are all read beforehand.
 
     Raises:
         ConfigError: if a parameter is out of range.
+        DataError: if the manifest cannot be read.
     """
 
     neighbours: Sequence[str] = ("train", "val")
@@ -68,6 +74,8 @@ class DepthDataModule(LightningDataModule):
         target_depth: bool = False,
         with_pose: bool = False,
         stereo: bool = False,
+        manifest: str | None = None,
+        on_error: Literal["raise", "skip"] = "raise",
     ) -> None:
         super().__init__()
         check_offsets(offsets)
@@ -78,6 +86,8 @@ class DepthDataModule(LightningDataModule):
         self.translate = in_range("translate", translate, 0, 1)
         self.seed = int(positive("seed", seed, allow_zero=True))
         self.target_depth, self.with_pose, self.stereo = target_depth, with_pose, stereo
+        self.manifest = read_manifest(manifest) if manifest else None
+        self.on_error = one_of("on_error", on_error, ("raise", "skip"))
         self.augment = Augment(self.height, self.width, flip, colour)
         self.prepare = Prepare(self.height, self.width)
         self.usage: dict[str, list[Usage]] = {}
@@ -99,8 +109,24 @@ class DepthDataModule(LightningDataModule):
         for split in STAGES[str(getattr(stage, "value", stage))] if stage else ("train", "val", "test", "predict"):
             selections = [] if split in self.datasets else [Selection(*each) for each in self.select(split)]
             if selections or (split != "val" and split not in self.datasets):
-                self.datasets[split] = self._dataset(split, selections)
+                self.datasets[split] = self._dataset(split, [self._usable(split, each) for each in selections])
                 rank_zero_info(self.summary(split))
+
+    def teardown(self, stage: str | None = None) -> None:
+        """Say what ``on_error=skip`` passed over."""
+        skipped = self.skipped()
+        if skipped:
+            more = ", ..." if len(skipped) > 5 else ""
+            rank_zero_info(f"{len(skipped)} training samples could not be read: {', '.join(skipped[:5])}{more}")
+
+    def skipped(self) -> list[str]:
+        """Return the names of the training samples that could not be read so far, with ``on_error=skip``."""
+        dataset = self.datasets.get("train")
+        return dataset.skipped() if isinstance(dataset, SkippingWindows) else []
+
+    def group(self, sample: str) -> str:
+        """Return which part of the data a sample's name belongs to, for numbers by part; empty where there is one."""
+        return ""
 
     def summary(self, split: str) -> str:
         """Return what a split uses and leaves out, readable, with the fingerprint of its frames."""
@@ -119,6 +145,15 @@ class DepthDataModule(LightningDataModule):
         """Return the SHA-256 of the sample names of each split that is set up."""
         return {split: dataset.fingerprint() for split, dataset in self.datasets.items()}
 
+    def _usable(self, split: str, selection: Selection) -> Selection:
+        """Leave out what the manifest names, and what cannot be read where that is to be skipped."""
+        offsets = self.offsets if split in self.neighbours else ()
+        if self.manifest is not None and split in ("train", "val"):
+            selection = self.manifest.apply(selection, offsets)
+        if self.on_error == "skip" and split != "train":
+            selection = readable(selection, offsets, with_depth=split in ("val", "test"))
+        return selection
+
     def _dataset(self, split: str, selections: Sequence[Selection]) -> WindowDataset:
         offsets = self.offsets if split in self.neighbours else ()
         stereo = self.stereo and split in self.neighbours
@@ -132,7 +167,8 @@ class DepthDataModule(LightningDataModule):
             )
         self.usage[split] = usage
         margin = (round(self.height * self.translate), round(self.width * self.translate))
-        return WindowDataset(
+        kind = SkippingWindows if self.on_error == "skip" and split == "train" else WindowDataset
+        return kind(
             [selection.drive for selection in selections],
             windows,
             offsets=offsets,

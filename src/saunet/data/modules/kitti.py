@@ -54,6 +54,8 @@ class KittiDataModule(DepthDataModule):
         target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
         stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
             ``offsets: []`` it is the only one.
+        manifest: Frames to leave out of training and validation, as ``saunet-doctor`` wrote them.
+        on_error: A file that cannot be read: ``raise`` stops and names it, ``skip`` names, counts and passes it over.
 
     Raises:
         ConfigError: if a parameter is out of range or a word unknown.
@@ -81,6 +83,8 @@ class KittiDataModule(DepthDataModule):
         seed: int = 0,
         target_depth: bool = False,
         stereo: bool = False,
+        manifest: str | None = None,
+        on_error: Literal["raise", "skip"] = "raise",
     ) -> None:
         super().__init__(
             height=height,
@@ -94,6 +98,8 @@ class KittiDataModule(DepthDataModule):
             seed=seed,
             target_depth=target_depth,
             stereo=stereo,
+            manifest=manifest,
+            on_error=on_error,
         )
         self.root = root
         self.split = _known(split, "split", (*splits.TRAINING, "all"))

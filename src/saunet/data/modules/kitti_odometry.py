@@ -36,6 +36,8 @@ class KittiOdometryDataModule(DepthDataModule):
         with_pose: Batches carry the true motion.
         stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
             ``offsets: []`` it is the only one.
+        manifest: Frames to leave out of training and validation, as ``saunet-doctor`` wrote them.
+        on_error: A file that cannot be read: ``raise`` stops and names it, ``skip`` names, counts and passes it over.
 
     Raises:
         ConfigError: if a parameter is out of range or a word unknown.
@@ -62,6 +64,8 @@ class KittiOdometryDataModule(DepthDataModule):
         seed: int = 0,
         with_pose: bool = False,
         stereo: bool = False,
+        manifest: str | None = None,
+        on_error: Literal["raise", "skip"] = "raise",
     ) -> None:
         super().__init__(
             height=height,
@@ -75,6 +79,8 @@ class KittiOdometryDataModule(DepthDataModule):
             seed=seed,
             with_pose=with_pose,
             stereo=stereo,
+            manifest=manifest,
+            on_error=on_error,
         )
         self.root = root
         self.train_sequences, self.test_sequences = tuple(train_sequences), tuple(test_sequences)

@@ -46,6 +46,7 @@ class SyntheticDataModule(DepthDataModule):
         cache: Folder in which rendered drives are kept between runs; None renders them each time.
         stereo: Batches carry the right camera's image, 0.54 m to the right, as one more source; with ``offsets: []`` it
             is the only one.
+        manifest: Frames to leave out of training and validation, as ``saunet-doctor`` wrote them.
 
     Raises:
         ConfigError: if a parameter is out of range.
@@ -75,6 +76,7 @@ class SyntheticDataModule(DepthDataModule):
         camera_height: float = 1.65,
         cache: str | None = None,
         stereo: bool = False,
+        manifest: str | None = None,
     ) -> None:
         super().__init__(
             height=height,
@@ -89,6 +91,7 @@ class SyntheticDataModule(DepthDataModule):
             target_depth=target_depth,
             with_pose=with_pose,
             stereo=stereo,
+            manifest=manifest,
         )
         self.counts = {"train": train_drives, "val": val_drives, "test": test_drives}
         for split, count in self.counts.items():

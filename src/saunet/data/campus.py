@@ -1,0 +1,150 @@
+"""One clip of any camera as a `Drive`: straightened and cropped frames, without doubled ones, in steps of choice."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from saunet.data.clips import Clip, Recording
+from saunet.data.lens import Lens
+from saunet.data.motion import Motion, even_steps
+from saunet.images import image_size, read_image
+
+LONGEST_STEP = 5.0
+"""Seconds between two frames beyond which they are no neighbours: too much has moved meanwhile."""
+
+
+class CampusDrive:
+    """A clip of any camera, a `saunet.data.sequences.Drive`.
+
+    Frames are numbered anew from 0 in the order of time, without those that are left out; a number is skipped where
+    frames on both sides are no neighbours (a broken image or a long stop between them).
+
+    Args:
+        clip: Where it lies and what its camera is.
+        recording: Its frames on disk.
+        crop: Shares to cut off at the top, bottom, left and right; the camera's own by default.
+        motion: What was measured of the recording; None measures and leaves out nothing.
+        parallax: Frames follow each other when the median flow since the last reaches this, in pixels at 320 width; 0
+            takes all.
+        settings: How frames were chosen before, for `numbering`.
+    """
+
+    def __init__(
+        self,
+        clip: Clip,
+        recording: Recording,
+        crop: Sequence[float] | None = None,
+        motion: Motion | None = None,
+        parallax: float = 0.0,
+        settings: str = "",
+    ) -> None:
+        self.name = clip.name
+        self.clip, self.recording, self._crop = clip, recording, crop
+        self.numbering = settings
+        self._places, self._left_out = _choose(recording, motion, parallax)
+        self._indices = sorted(self._places)
+        self._still = frozenset(np.flatnonzero(motion.static()).tolist()) if motion else frozenset()
+
+    @property
+    def indices(self) -> Sequence[int]:
+        """Numbers of the frames, ascending."""
+        return self._indices
+
+    @property
+    def left_out(self) -> Mapping[str, int]:
+        """Frames of the recording that got no number, and why."""
+        return self._left_out
+
+    @property
+    def camera_height(self) -> float | None:
+        """Metres of the camera above the road; None where the camera file does not say."""
+        return self.clip.camera.camera_height
+
+    @property
+    def condition(self) -> str | None:
+        """What the camera file says about weather and light."""
+        return self.clip.camera.condition
+
+    @property
+    def fps(self) -> float | None:
+        """Frames a second of the recording; None where nobody says."""
+        return self.recording.fps
+
+    def static(self) -> frozenset[int]:
+        """Return the numbers of the frames in which the picture does not move."""
+        return frozenset(index for index, place in self._places.items() if place in self._still)
+
+    def path(self, index: int) -> Path:
+        """Return the image file of a frame (in the cache, where the clip is a video)."""
+        return self.recording.paths[self._places[index]]
+
+    def recorded(self, index: int) -> int:
+        """Return the number of a frame in the clip as recorded, from 0."""
+        return self.recording.numbers[self._places[index]]
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """Return the frame, undistorted and cropped, h x w x 3, RGB.
+
+        Raises:
+            DataError: naming the file, if it is broken or has another size than the first of the clip.
+        """
+        path = self.path(index)
+        return self._lens(read_image(path), str(path))
+
+    def intrinsics(self, index: int) -> NDArray[np.float64]:
+        """Return K, 3 x 3, in pixels of `image`.
+
+        Raises:
+            DataError: if the frames do not belong to the camera.
+        """
+        return self._lens.K.copy()
+
+    def depth(self, index: int) -> NDArray[np.float32] | None:
+        """Return None: a camera alone knows no depth."""
+        return None
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        """Return None: a camera alone knows no pose."""
+        return None
+
+    @functools.cached_property
+    def _lens(self) -> Lens:
+        first = self.path(self._indices[0])
+        return Lens(self.clip.camera, *image_size(first), self._crop, f"the frames of '{self.name}' ({first.name})")
+
+
+def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tuple[dict[int, int], dict[str, int]]:
+    """Return frame number -> place in the recording, and how many places got none, by reason."""
+    count = len(recording.paths)
+    left_out = {"not decodable": recording.missing}
+    if motion is None:
+        return {place: place for place in range(count)}, left_out
+    broken = np.isin(np.arange(count), motion.unreadable)
+    doubled = motion.doubled() & ~broken
+    usable = np.flatnonzero(~broken & ~doubled)
+    left_out |= {"unreadable": int(broken.sum()), "doubled": int(doubled.sum())}
+    if parallax > 0:
+        chosen = usable[even_steps(motion.flow[usable], parallax)]
+        left_out["closer than the parallax"] = len(usable) - len(chosen)
+        usable = chosen
+    places: dict[int, int] = {}
+    number, before = -1, None
+    for place in usable.tolist():
+        number += 1
+        if before is not None and _apart(recording, broken, before, place):
+            number += 1
+        places[number] = before = place
+    return places, left_out
+
+
+def _apart(recording: Recording, broken: NDArray[np.bool_], before: int, after: int) -> bool:
+    """Tell whether two places of a recording are no neighbours: a broken frame or a long time lies between."""
+    if broken[before:after].any():
+        return True
+    frames = recording.numbers[after] - recording.numbers[before]
+    return after - before > 1 and recording.fps is not None and frames / recording.fps > LONGEST_STEP

@@ -1,0 +1,116 @@
+"""Which frames a training should leave out: what ``saunet-doctor`` writes and ``data.manifest=`` reads, as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from saunet.atomic import write_bytes
+from saunet.checks import DataError
+from saunet.data.sequences import Drive
+from saunet.data.windows import Selection
+
+FORMAT = 1
+"""Version of the file's layout."""
+UNREADABLE = "unreadable"
+"""The reason that also forbids a frame as a neighbour; all others only forbid it as a target."""
+
+LeaveOut = Mapping[str, Mapping[str, Sequence[int]]]
+"""Drive -> reason -> frame numbers."""
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Frames to leave out of training and validation.
+
+    Args:
+        leave_out: Drive -> reason -> frame numbers.
+        numbering: Drive -> how its frames were numbered; see `numbering`.
+        facts: Whatever else was found, free-form.
+        path: The file it was read from, for messages.
+    """
+
+    leave_out: LeaveOut
+    numbering: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    path: Path = Path("manifest.json")
+
+    def apply(self, selection: Selection, offsets: Sequence[int]) -> Selection:
+        """Return a selection without the frames to leave out, counted by reason.
+
+        Raises:
+            DataError: if the drive's frames are numbered otherwise than when the manifest was made.
+        """
+        name = selection.drive.name
+        if name in self.numbering and self.numbering[name] != numbering(selection.drive):
+            raise DataError(
+                f"{self.path} was made for '{name}' with {self.numbering[name] or 'other settings'} and it is now read "
+                f"with {numbering(selection.drive) or 'other settings'}, which counts its frames differently; "
+                "run saunet-doctor again with the settings of this run, or set data.manifest=null"
+            )
+        kept, left_out = list(selection.frames), dict(selection.left_out)
+        for reason, numbers in self.leave_out.get(name, {}).items():
+            unwanted = set(numbers)
+            if reason == UNREADABLE:
+                unwanted |= {number - offset for number in numbers for offset in offsets}
+            before = len(kept)
+            kept = [frame for frame in kept if frame not in unwanted]
+            left_out[f"{reason} (manifest)"] = before - len(kept)
+        return Selection(selection.drive, kept, left_out)
+
+
+def numbering(drive: Drive) -> str:
+    """Return how a drive's frames are numbered, where that depends on settings; empty where it does not."""
+    return str(getattr(drive, "numbering", ""))
+
+
+def write_manifest(path: str | Path, manifest: Manifest) -> None:
+    """Write a manifest, whole or not at all.
+
+    Raises:
+        DataError: if the system refuses.
+    """
+    plain = {
+        "format": FORMAT,
+        **manifest.facts,
+        "numbering": dict(manifest.numbering),
+        "leave_out": {
+            drive: {reason: sorted(numbers) for reason, numbers in reasons.items()}
+            for drive, reasons in manifest.leave_out.items()
+        },
+    }
+    write_bytes(path, (json.dumps(plain, indent=1, ensure_ascii=False) + "\n").encode())
+
+
+def read_manifest(path: str | Path) -> Manifest:
+    """Read a manifest.
+
+    Raises:
+        DataError: if it is missing, not JSON, of another format, or malformed.
+    """
+    path = Path(path).expanduser()
+    try:
+        plain = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as reason:
+        raise DataError(f"no manifest at {path}; make one with saunet-doctor, or set data.manifest=null") from reason
+    except (OSError, ValueError) as reason:
+        raise DataError(f"{path} cannot be read as JSON ({reason}); make it again with saunet-doctor") from reason
+    if not isinstance(plain, dict) or plain.get("format") != FORMAT:
+        found = plain.get("format") if isinstance(plain, dict) else type(plain).__name__
+        raise DataError(f"{path} is not a manifest of format {FORMAT} (found {found}); make it with saunet-doctor")
+    leave_out, numbered = plain.get("leave_out"), plain.get("numbering", {})
+    if not isinstance(leave_out, dict) or not isinstance(numbered, dict) or not all(map(_is_entry, leave_out.values())):
+        raise DataError(
+            f"{path}: 'leave_out' must map each drive to reasons and these to lists of frame numbers, such as "
+            '{"clip l": {"static": [4, 5]}}'
+        )
+    return Manifest(leave_out, {str(key): str(value) for key, value in numbered.items()}, {}, path)
+
+
+def _is_entry(reasons: Any) -> bool:
+    return isinstance(reasons, dict) and all(
+        isinstance(numbers, list) and all(isinstance(number, int) for number in numbers) for numbers in reasons.values()
+    )
