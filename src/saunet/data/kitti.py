@@ -86,7 +86,7 @@ class KittiDrive:
         K = self.calibration.intrinsics(self.number)
         first = self.path(self._indices[0])
         height, width = image_size(first)
-        rows, columns = self._native
+        rows, columns = self.native_size
         if (height, width) == (rows, columns):
             return K
         if abs(height / rows * columns / width - 1) > 0.02:
@@ -97,14 +97,15 @@ class KittiDrive:
         return scale_intrinsics(torch.from_numpy(K), width / columns, height / rows).numpy()
 
     @property
-    def _native(self) -> tuple[int, int]:
+    def native_size(self) -> tuple[int, int]:
+        """(height, width) of the original images, which ground truth has too."""
         if self.number in self.calibration.sizes:
             return self.calibration.sizes[self.number]
         return image_size(self.path(self._indices[0]))
 
     def has_depth(self, index: int) -> bool:
         """Tell whether there is ground truth for a frame, without reading it."""
-        return self._depth_file(index).is_file() and (
+        return self.depth_file(index).is_file() and (
             self.depth_kind == "improved" or self.calibration.T_cam_velo is not None
         )
 
@@ -113,15 +114,15 @@ class KittiDrive:
         if not self.has_depth(index):
             return None
         if self.depth_kind == "improved":
-            return read_depth(self._depth_file(index))
+            return read_depth(self.depth_file(index))
         calibration = self.calibration
         assert calibration.T_cam_velo is not None
         return lidar_depth(
-            read_scan(self._depth_file(index)),
+            read_scan(self.depth_file(index)),
             calibration.projections[self.number],
             calibration.rectification,
             calibration.T_cam_velo,
-            self._native,
+            self.native_size,
             "lidar_x" if self.depth_kind == "lidar_x" else "camera_z",
         )
 
@@ -160,7 +161,8 @@ class KittiDrive:
         """Where the other colour camera is, 4 x 4, metres, by the calibration of the date."""
         return self.calibration.T_cam_cam(self._partner.number, self.number)
 
-    def _depth_file(self, index: int) -> Path:
+    def depth_file(self, index: int) -> Path:
+        """Return the file that a frame's ground truth comes from, whether or not it exists."""
         if self.depth_kind == "improved":
             return self.folder / "proj_depth" / "groundtruth" / f"image_{self.number:02d}" / f"{index:010d}.png"
         return self.folder / "velodyne_points" / "data" / f"{index:010d}.bin"
