@@ -150,3 +150,15 @@ def test_refuses_heads_that_do_not_divide() -> None:
 def test_refuses_impossible_windows(window: int, shift: int) -> None:
     with pytest.raises(ConfigError, match=r"window|shift"):
         WindowAttention(8, 2, window, shift)
+
+
+@pytest.mark.parametrize("mask_padding", [True, False])
+def test_exported_with_any_number_of_maps(mask_padding: bool) -> None:
+    """An exporter that leaves the batch open must not fix it, and computes the same."""
+    layer = make(mask_padding=mask_padding)
+    dynamic = {"x": {0: torch.export.Dim("batch", min=1, max=8)}}
+    with torch.no_grad():
+        program = torch.export.export(layer, (torch.rand(2, 6, 9, 8).double(),), dynamic_shapes=dynamic).module()
+        for batch in (1, 3):
+            x = torch.rand(batch, 6, 9, 8).double()
+            assert torch.allclose(program(x), layer(x))

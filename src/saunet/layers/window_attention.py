@@ -69,6 +69,8 @@ class WindowAttention(nn.Module):
         if self.pads(height, width):
             x = F.pad(x, (0, 0, 0, -width % self.window, 0, -height % self.window))
         batch, rows, columns, _ = x.shape
+        if isinstance(batch, torch.SymInt):
+            return self._attend_each(x)[:, :height, :width]
         order, inverse = window_order(batch, rows, columns, self.window, self.shift, x.device)
         groups = window_groups(rows, columns, self.window, self.shift)
         tokens = reorder(x.reshape(-1, self.dim), order, inverse)
@@ -79,6 +81,20 @@ class WindowAttention(nn.Module):
         attended = self.proj(parts[0] if len(parts) == 1 else torch.cat(parts))
         out = reorder(attended, inverse, order).view(batch, rows, columns, self.dim)
         return out if (rows, columns) == (height, width) else out[:, :height, :width]
+
+    def _attend_each(self, x: Float[Tensor, "b h w c"]) -> Float[Tensor, "b h w c"]:
+        """Attend with one image's order of tokens for all: for an exporter that leaves the number of images open."""
+        _, rows, columns, _ = x.shape
+        order, inverse = window_order(1, rows, columns, self.window, self.shift, x.device)
+        groups = window_groups(rows, columns, self.window, self.shift)
+        qkv = self.qkv(x.flatten(1, 2).index_select(1, order))
+        parts = [
+            self.attend(part.reshape(-1, 3 * self.dim), group, self.bias(group, part.dtype)).view(
+                -1, group.windows * group.area, self.dim
+            )
+            for part, group in zip(qkv.split([g.windows * g.area for g in groups], 1), groups, strict=True)
+        ]
+        return self.proj(torch.cat(parts, 1)).index_select(1, inverse).unflatten(1, (rows, columns))  # type: ignore[no-any-return]
 
     def pads(self, height: int, width: int) -> bool:
         """Return whether a map of this size is padded with zeros."""
