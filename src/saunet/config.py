@@ -59,14 +59,23 @@ class TrainConfig:
 
 @dataclass
 class EvaluateConfig:
-    """Root of ``saunet-evaluate``."""
+    """Root of ``saunet-evaluate``: a ``checkpoint``, or ``predictions`` of another system; docs/evaluation.md."""
 
-    checkpoint: str = MISSING
+    checkpoint: str | None = None
+    predictions: str | None = None
+    predicted: str | None = None
+    match: str = "order"
     data: Any = MISSING
     protocols: list[str] | None = None
     split: str = "test"
     flip: bool = False
     baselines: bool = True
+    buckets: bool = False
+    distances: list[float] = field(default_factory=lambda: [0.0, 10.0, 20.0, 30.0, 50.0, 80.0])
+    intervals: float | None = 0.95
+    compare: str | None = None
+    truth_cache: str | None = None
+    export: str | None = None
     device: str = "auto"
     output_dir: str = MISSING
 
