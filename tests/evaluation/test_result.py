@@ -14,7 +14,8 @@ from rich.console import Console
 
 from saunet.checks import ConfigError, DataError
 from saunet.evaluation.result import EvaluationResult, ImageRow, summarise
-from saunet.evaluation.writers import HEADINGS, as_json, markdown, print_table, read_rows, write_results
+from saunet.evaluation.tables import HEADINGS, print_table
+from saunet.evaluation.writers import as_json, markdown, read_rows, write_results
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import protocol
 

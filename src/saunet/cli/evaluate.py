@@ -1,100 +1,53 @@
-"""``saunet-evaluate``: score a checkpoint against ground truth, beside predictors that look at no image."""
+"""``saunet-evaluate``: score a checkpoint, or predictions made elsewhere, beside predictors that look at no image."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig
 
-from saunet import config
-from saunet.checks import DataError, one_of
 from saunet.cli._app import pick_device, run
+from saunet.cli._subjects import subject_of, trivial
 
 
-def evaluate_model(
-    network: Any,
-    data: Any,
-    protocols: Sequence[str],
-    *,
-    split: str = "test",
-    flip: bool = False,
-    baselines: bool = True,
-) -> Any:
-    """Score a depth network on one split of a data module.
-
-    Args:
-        network: A depth network, on the device it is to run on.
-        data: A data module with ground truth.
-        protocols: Names of protocols; none for the data set's own.
-        split: ``test`` or ``val``.
-        flip: Average with the prediction of the mirrored image.
-        baselines: Also score constant depth and the mean depth map of the training split.
-
-    Returns:
-        A `saunet.evaluation.EvaluationResult`.
+def evaluate_model(network: Any, data: Any, protocols: Sequence[str], *, split: str = "test") -> Any:
+    """Score a depth network, on its device, beside the trivial predictors on one split of a data module.
 
     Raises:
         ConfigError: if a protocol does not fit the data set's ground truth.
         DataError: if the split has no frame with ground truth.
     """
-    from saunet.evaluation import NetworkPredictor, evaluate
-    from saunet.metrics.baselines import ConstantDepth
-    from saunet.metrics.protocols import protocol
+    from saunet.evaluation import NetworkPredictor, evaluate_protocols
 
-    one_of("split", split, ("val", "test"))
-    predictors = {"model": NetworkPredictor(network, flip=flip)}
-    if baselines:
-        predictors["constant depth"] = NetworkPredictor(ConstantDepth())
-        mean = _mean_depth_map(data)
-        if mean is not None:
-            predictors["mean depth map"] = NetworkPredictor(mean)
-    data.setup("test" if split == "test" else "fit")
-    return evaluate(
-        predictors,
-        data.batches(split, next(network.parameters()).device),
-        [protocol(name) for name in protocols or [data.protocol]],
-        ground_truth=data.ground_truth,
-        total=len(data.datasets[split]),
+    return evaluate_protocols(
+        protocols,
+        lambda kind: data,
+        lambda each: {"model": NetworkPredictor(network), **trivial(each)},
+        split=split,
+        device=next(network.parameters()).device,
     )
-
-
-def _mean_depth_map(data: Any) -> Any:
-    """Return the mean depth map of the training split, or None, and say so, where there is no training depth."""
-    from saunet.metrics.baselines import MeanDepthMap
-
-    mean = MeanDepthMap()
-    try:
-        data.setup("fit")
-        for depth in data.ground_truths("train"):
-            mean.update(depth[None], torch.tensor([depth.shape[-2:]]))
-        mean.depth_map()
-    except DataError as reason:
-        print(f"the mean depth map is left out: {reason}", file=sys.stderr)
-        return None
-    return mean
 
 
 def evaluate(cfg: DictConfig) -> None:
-    """Load the checkpoint and the data, print the tables, write them to the output folder."""
-    from saunet.checkpoint import read_checkpoint
-    from saunet.evaluation import print_table, write_results
-    from saunet.registry import instantiate
+    """Load what is scored and the data, print the tables, write them to the output folder."""
+    from saunet.evaluation import evaluate_protocols, print_table, with_statistics, write_results
+    from saunet.evaluation.breakdown import Buckets
 
-    checkpoint = read_checkpoint(cfg.checkpoint)
-    network, _ = checkpoint.networks()
-    data = instantiate({**config.plain(cfg.data), "height": checkpoint.record.height, "width": checkpoint.record.width})
-    result = evaluate_model(
-        network.to(pick_device(cfg.device)),
-        data,
+    subject = subject_of(cfg)
+    result = evaluate_protocols(
         list(cfg.protocols or []),
+        subject.data,
+        subject.predictors,
+        motion=subject.motion,
         split=cfg.split,
-        flip=cfg.flip,
-        baselines=cfg.baselines,
+        device=pick_device(cfg.device),
+        buckets=Buckets(tuple(cfg.distances)) if cfg.buckets else None,
     )
+    result = with_statistics(result, cfg.intervals, Path(cfg.compare) if cfg.compare else None)
+    result = replace(result, settings=subject.settings())
     print_table(result)
     write_results(result, Path(cfg.output_dir))
     print(f"results: {cfg.output_dir}")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from saunet.evaluation.result import EvaluationResult, ImageRow, Summary
 from saunet.evaluation.runner import NetworkPredictor, Predictor, evaluate
-from saunet.evaluation.writers import print_table, write_results
+from saunet.evaluation.suite import evaluate_protocols, with_statistics
+from saunet.evaluation.tables import print_table
+from saunet.evaluation.writers import write_results
 
 __all__ = [
     "EvaluationResult",
@@ -13,6 +15,8 @@ __all__ = [
     "Predictor",
     "Summary",
     "evaluate",
+    "evaluate_protocols",
     "print_table",
+    "with_statistics",
     "write_results",
 ]

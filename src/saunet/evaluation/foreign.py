@@ -34,9 +34,7 @@ class ForeignArray:
         DataError: if the file cannot be read, has another shape, or another number of images.
     """
 
-    def __init__(
-        self, path: Path, names: Sequence[str], values: Literal["disparity", "depth"] = "disparity"
-    ) -> None:
+    def __init__(self, path: Path, names: Sequence[str], values: Literal["disparity", "depth"] = "disparity") -> None:
         self.path, self.values = path, one_of("values", values, ("disparity", "depth"))
         array = _load_array(path)
         if array.ndim == 4 and array.shape[1] == 1:

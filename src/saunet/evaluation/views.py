@@ -118,9 +118,7 @@ def summarise_views(rows: Sequence[ViewRow]) -> list[tuple[str, str, str, int, t
         mine = [row for row in rows if (row.protocol, row.predictor) == (protocol, predictor)]
         groups = list(dict.fromkeys(row.group for row in mine))
         for group in [*(groups if len(groups) > 1 else []), "all"]:
-            numbers = [
-                (r.warped, r.unwarped, r.explained, r.visible) for r in mine if group in ("all", r.group)
-            ]
+            numbers = [(r.warped, r.unwarped, r.explained, r.visible) for r in mine if group in ("all", r.group)]
             a, b, c, d = np.mean(numbers, axis=0).tolist()
             found.append((protocol, predictor, group, len(numbers), (a, b, c, d)))
     return found

@@ -1,4 +1,4 @@
-"""An evaluation as a table on the terminal, as Markdown, JSON and CSV."""
+"""An evaluation as Markdown, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -6,108 +6,71 @@ import csv
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from rich.box import HORIZONTALS
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-
 from saunet.atomic import replacing
 from saunet.checks import DataError
-from saunet.evaluation.breakdown import BucketRow
-from saunet.evaluation.result import EvaluationResult, ImageRow, Summary
-from saunet.metrics.functional import ERROR_NAMES, HIGHER_IS_BETTER
-from saunet.metrics.protocols import Protocol
-
-HEADINGS: tuple[str, ...] = ("Abs Rel ↓", "Sq Rel ↓", "RMSE ↓", "RMSE log ↓", "δ1 ↑", "δ2 ↑", "δ3 ↑")
-"""Column headings in the order of `ERROR_NAMES`; the arrow points to better."""
+from saunet.evaluation.result import Comparison, EvaluationResult, ImageRow, Spread, Summary
+from saunet.evaluation.tables import HEADINGS, VIEW_HEADINGS, images_note, spread_note
+from saunet.evaluation.views import summarise_views
+from saunet.metrics.functional import ERROR_NAMES
 
 _ROW_FIELDS = ("predictor", "protocol", "name", "pixels", "scale", *ERROR_NAMES)
-_SUMMARY_FIELDS = ("predictor", "protocol", *ERROR_NAMES, "scale", "scale_std", "images", "images_without_truth")
-
-
-def print_table(result: EvaluationResult, console: Console | None = None) -> None:
-    """Print one table a protocol, the best of each column in bold, then where the errors are, if that was asked for."""
-    console = console or Console()
-    for protocol in result.protocols:
-        console.print(protocol_table(protocol, [s for s in result.summaries() if s.protocol == protocol.name]), "")
-    for protocol in result.protocols:
-        for predictor in result.predictors:
-            rows = [r for r in result.buckets if (r.protocol, r.predictor) == (protocol.name, predictor)]
-            if rows:
-                console.print(bucket_table(rows), "")
-
-
-def protocol_table(protocol: Protocol, summaries: Sequence[Summary]) -> Table:
-    """Return the table of one protocol: errors to three decimals, the images behind them and the scale found."""
-    table = _error_table(f"[bold]{protocol.name}[/bold]: {protocol.summary}", "predictor", "scale")
-    best = _best(summaries)
-    for summary in summaries:
-        cells = [
-            f"[bold]{value:.3f}[/bold]" if len(summaries) > 1 and value == top else f"{value:.3f}"
-            for value, top in zip(summary.errors, best, strict=True)
-        ]
-        table.add_row(escape(summary.predictor), *cells, f"{summary.scale:.3g} ± {summary.scale_std:.2g}")
-    if summaries:
-        table.caption = images_note(summaries[0])
-    return table
-
-
-def bucket_table(rows: Sequence[BucketRow]) -> Table:
-    """Return the table of one predictor's errors by distance, region and edges under one protocol."""
-    title = f"[bold]{rows[0].protocol}[/bold]: where the errors of '{escape(rows[0].predictor)}' are"
-    table = _error_table(title, "where", "pixels")
-    for row, following in zip(rows, (*rows[1:], None), strict=True):
-        ends = following is not None and following.group != row.group
-        table.add_row(row.bucket, *(f"{value:.3f}" for value in row.errors), f"{row.pixels:,}", end_section=ends)
-    table.caption = "over pixels, not images"
-    return table
-
-
-def _error_table(title: str, first: str, last: str) -> Table:
-    """An empty table that fits a terminal of 80 columns: headings on two lines, no vertical rules."""
-    table = Table(title=title, box=HORIZONTALS, padding=0, show_edge=False, title_justify="left", title_style="")
-    table.caption_justify = "left"
-    table.add_column(first, min_width=9)
-    for heading in HEADINGS:
-        name, arrow = heading.rsplit(" ", 1)
-        table.add_column(f"{name.replace(' ', chr(10))} {arrow}", justify="right", no_wrap=True, min_width=6)
-    table.add_column(last, justify="right", no_wrap=True)
-    return table
-
-
-def images_note(summary: Summary) -> str:
-    """Return how many images a summary stands for, such as ``697 images``, and how many had no ground truth."""
-    note = f"{summary.images} image{'' if summary.images == 1 else 's'}"
-    if summary.images_without_truth:
-        note += f"; {summary.images_without_truth} more without a ground-truth pixel to compare, left out"
-    return note
+_SUMMARY_FIELDS = (
+    "predictor",
+    "protocol",
+    *ERROR_NAMES,
+    "scale",
+    "scale_std",
+    "images",
+    "images_without_truth",
+    *(f"{name}_{end}" for end in ("low", "high") for name in ERROR_NAMES),
+)
+_VIEW_FIELDS = ("predictor", "protocol", "name", "condition", "warped", "unwarped", "explained", "visible")
+_COMPARISON_FIELDS = ("protocol", "before", "now", "error", "mean_before", "mean_now", "difference", "low", "high")
 
 
 def markdown(result: EvaluationResult) -> str:
-    """Return the tables as Markdown."""
+    """Return the tables as Markdown: means, with their intervals below where they were asked for, and comparisons."""
     parts = []
+    summaries, spreads = result.summaries(), {(s.predictor, s.protocol): s for s in result.spreads}
     for protocol in result.protocols:
-        summaries = [s for s in result.summaries() if s.protocol == protocol.name]
-        lines = [
-            f"**{protocol.name}**: {protocol.summary} ({images_note(summaries[0])})",
-            "",
-            f"| predictor | {' | '.join(HEADINGS)} |",
-            f"|---|{'---:|' * len(HEADINGS)}",
-            *(f"| {s.predictor} | {' | '.join(f'{value:.3f}' for value in s.errors)} |" for s in summaries),
-        ]
-        parts.append("\n".join(lines))
+        mine = [s for s in summaries if s.protocol == protocol.name]
+        if mine:
+            found = [spreads[s.predictor, s.protocol] for s in mine if (s.predictor, s.protocol) in spreads]
+            note = "; ".join([images_note(mine[0]), *(spread_note(spread) for spread in found[:1])])
+            table = [f"**{protocol.name}**: {protocol.summary} ({note})", "", *_header("predictor", *HEADINGS)]
+            for summary in mine:
+                table.append(_line(summary.predictor, *(f"{value:.3f}" for value in summary.errors)))
+                spread = spreads.get((summary.predictor, summary.protocol))
+                if spread is not None:
+                    ends = zip(spread.low, spread.high, strict=True)
+                    table.append(_line("", *(f"{low:.3f} to {high:.3f}" for low, high in ends)))
+            parts.append("\n".join(table))
+        views = summarise_views([row for row in result.views if row.protocol == protocol.name])
+        if views:
+            table = [f"**{protocol.name}**: {protocol.summary}", "", *_header("predictor", "condition", *VIEW_HEADINGS)]
+            table += [_line(who, group, *(f"{value:.4f}" for value in values)) for _, who, group, _, values in views]
+            parts.append("\n".join(table))
+    for comparison in result.comparisons:
+        columns = ("error", "before", "now", "difference", "interval", "better on", "p")
+        title = f"**{comparison.protocol}**: '{comparison.second}' against '{comparison.first}'"
+        table = [f"{title} ({comparison.images} images, paired)", "", *_header(*columns)]
+        for heading, row in zip(HEADINGS, comparison.differences, strict=True):
+            numbers = (f"{row.first:.4f}", f"{row.second:.4f}", f"{row.difference:+.4f}")
+            interval = f"{row.low:+.4f} to {row.high:+.4f}"
+            table.append(_line(heading, *numbers, interval, f"{row.better:.0%}", f"{row.p_value:.2g}"))
+        parts.append("\n".join(table))
     return "\n\n".join(parts) + "\n"
 
 
 def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
     """Write ``metrics.json``, ``metrics.csv``, ``metrics.md`` and ``per_image.csv``, each whole or not at all.
 
-    Errors by bucket go to ``buckets.csv``, if there are any.
+    What else the result holds goes to ``buckets.csv``, ``views.csv`` (an image a line) and ``comparison.csv``.
 
     Returns:
         The files by those names.
@@ -115,17 +78,30 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
     Raises:
         DataError: if the folder cannot be written to.
     """
-    paths = {name: folder / name for name in ("metrics.json", "metrics.csv", "metrics.md", "per_image.csv")}
-    with _whole(paths["per_image.csv"]) as file:
-        _write_csv(file, _ROW_FIELDS, ((*_key(row), row.pixels, row.scale, *row.errors) for row in result.rows))
-    with _whole(paths["metrics.csv"]) as file:
-        table = ([_summary_dict(s)[field] for field in _SUMMARY_FIELDS] for s in result.summaries())
-        _write_csv(file, _SUMMARY_FIELDS, table)
+    spreads = {(s.predictor, s.protocol): s for s in result.spreads}
+    summaries = [_summary_dict(summary, spreads) for summary in result.summaries()]
+    tables: dict[str, tuple[Sequence[str], Iterable[Sequence[object]]]] = {
+        "per_image.csv": (
+            _ROW_FIELDS,
+            ((r.predictor, r.protocol, r.name, r.pixels, r.scale, *r.errors) for r in result.rows),
+        ),
+        "metrics.csv": (_SUMMARY_FIELDS, ([row.get(field, "") for field in _SUMMARY_FIELDS] for row in summaries)),
+    }
     if result.buckets:
-        paths["buckets.csv"] = folder / "buckets.csv"
-        with _whole(paths["buckets.csv"]) as file:
-            places = ((r.predictor, r.protocol, r.group, r.bucket, r.pixels, *r.errors) for r in result.buckets)
-            _write_csv(file, ("predictor", "protocol", "group", "bucket", "pixels", *ERROR_NAMES), places)
+        places = ((r.predictor, r.protocol, r.group, r.bucket, r.pixels, *r.errors) for r in result.buckets)
+        tables["buckets.csv"] = (("predictor", "protocol", "group", "bucket", "pixels", *ERROR_NAMES), places)
+    if result.views:
+        tables["views.csv"] = (_VIEW_FIELDS, map(dataclasses.astuple, result.views))
+    if result.comparisons:
+        lines = [_comparison_lines(comparison) for comparison in result.comparisons]
+        tables["comparison.csv"] = (
+            (*_COMPARISON_FIELDS, "better", "p_value"),
+            [line for part in lines for line in part],
+        )
+    paths = {name: folder / name for name in (*tables, "metrics.md", "metrics.json")}
+    for name, (header, content) in tables.items():
+        with _whole(paths[name]) as file:
+            _write_csv(file, header, content)
     with _whole(paths["metrics.md"]) as file:
         file.write(markdown(result))
     with _whole(paths["metrics.json"]) as file:
@@ -136,11 +112,30 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
 
 def as_json(result: EvaluationResult) -> dict[str, object]:
     """Return the summaries and the exact rules they were computed under as plain data; NaN becomes None."""
-    summaries = [
-        {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
-        for row in map(_summary_dict, result.summaries())
-    ]
-    return {"protocols": [dataclasses.asdict(protocol) for protocol in result.protocols], "results": summaries}
+    spreads = {(s.predictor, s.protocol): s for s in result.spreads}
+    content: dict[str, object] = {
+        "settings": dict(result.settings),
+        "protocols": [dataclasses.asdict(protocol) for protocol in result.protocols],
+        "results": [_summary_dict(summary, spreads) for summary in result.summaries()],
+    }
+    if result.spreads:
+        spread = result.spreads[0]
+        content["intervals"] = {"level": spread.level, "by": spread.by, "groups": spread.groups}
+    if result.buckets:
+        content["buckets"] = [
+            {**_without_errors(row), **dict(zip(ERROR_NAMES, row.errors, strict=True))} for row in result.buckets
+        ]
+    if result.views:
+        content["views"] = [
+            {"protocol": rules, "predictor": who, "condition": group, "images": images}
+            | dict(zip(_VIEW_FIELDS[4:], values, strict=True))
+            for rules, who, group, images, values in summarise_views(result.views)
+        ]
+    if result.comparisons:
+        content["comparisons"] = [dataclasses.asdict(comparison) for comparison in result.comparisons]
+    plain = _without_nan(content)
+    assert isinstance(plain, dict)
+    return plain
 
 
 def read_rows(path: Path) -> tuple[ImageRow, ...]:
@@ -180,19 +175,42 @@ def _whole(path: Path) -> Iterator[TextIO]:
         yield file
 
 
-def _best(summaries: Sequence[Summary]) -> list[float]:
-    columns = zip(*(summary.errors for summary in summaries), strict=True)
-    return [max(column) if up else min(column) for column, up in zip(columns, HIGHER_IS_BETTER, strict=True)]
-
-
-def _key(row: ImageRow) -> tuple[str, str, str]:
-    return row.predictor, row.protocol, row.name
-
-
-def _summary_dict(summary: Summary) -> dict[str, object]:
+def _summary_dict(summary: Summary, spreads: Mapping[tuple[str, str], Spread]) -> dict[str, object]:
     row = dataclasses.asdict(summary)
     errors = dict(zip(ERROR_NAMES, row.pop("errors"), strict=True))
-    return {"predictor": row.pop("predictor"), "protocol": row.pop("protocol"), **errors, **row}
+    plain = {"predictor": row.pop("predictor"), "protocol": row.pop("protocol"), **errors, **row}
+    spread = spreads.get((summary.predictor, summary.protocol))
+    if spread is not None:
+        for end, values in (("low", spread.low), ("high", spread.high)):
+            plain |= {f"{name}_{end}": value for name, value in zip(ERROR_NAMES, values, strict=True)}
+    return plain
+
+
+def _comparison_lines(comparison: Comparison) -> list[Sequence[object]]:
+    who = (comparison.protocol, comparison.first, comparison.second)
+    return [(*who, *dataclasses.astuple(difference)) for difference in comparison.differences]
+
+
+def _without_errors(row: object) -> dict[str, object]:
+    plain = dataclasses.asdict(row)  # type: ignore[call-overload]
+    return {key: value for key, value in plain.items() if key != "errors"}
+
+
+def _without_nan(value: object) -> object:
+    """Return plain data with None in place of NaN, which JSON cannot hold."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _header(*columns: str) -> list[str]:
+    return [_line(*columns), f"|---|{'---:|' * (len(columns) - 1)}"]
+
+
+def _line(*cells: str) -> str:
+    return f"| {' | '.join(cells)} |"
 
 
 def _write_csv(file: TextIO, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -1,0 +1,144 @@
+"""What ``saunet-evaluate`` scores: a checkpoint, or predictions made elsewhere; each with the data as it wants them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from saunet import config
+from saunet.checks import ConfigError, DataError
+from saunet.cli._app import pick_device
+
+
+def subject_of(cfg: DictConfig) -> Subject:
+    """Return what a configuration asks to score.
+
+    Raises:
+        ConfigError: if it names a checkpoint and predictions, or neither.
+        CheckpointError: if the checkpoint cannot be read.
+    """
+    if (cfg.checkpoint is None) == (cfg.predictions is None):
+        raise ConfigError(
+            "give checkpoint=FILE to score a model, or predictions=FILE_OR_FOLDER to score what another system "
+            f"predicted; {'neither is' if cfg.checkpoint is None else 'both are'} set"
+        )
+    return CheckpointSubject(cfg) if cfg.checkpoint is not None else ForeignSubject(cfg)
+
+
+class Subject:
+    """One thing to score.
+
+    Args:
+        cfg: Root of ``saunet-evaluate``.
+        fixed: Keys of the data that it decides.
+    """
+
+    motion: Any = None
+    """The camera's motion as it predicts it, for protocols without ground truth."""
+
+    def __init__(self, cfg: DictConfig, fixed: Mapping[str, Any]) -> None:
+        self.cfg = cfg
+        node = config.plain(cfg.data)
+        self.node = {**node, **{key: value for key, value in fixed.items() if key in node}}
+
+    def data(self, kind: str | None) -> Any:
+        """Return the data module, with ground truth of a kind where it has the choice."""
+        from saunet.registry import instantiate
+
+        chosen = {"depth": kind} if kind is not None and "depth" in self.node else {}
+        return instantiate({**self.node, **chosen})
+
+    def predictors(self, data: Any) -> dict[str, Any]:
+        """Return what to score on these data, first the subject, then those that look at no image."""
+        from saunet.data.truth_cache import cache_truths
+        from saunet.evaluation.export import ExportingPredictor
+        from saunet.metrics.protocols import protocol
+
+        name, predictor = self.predictor(data)
+        if self.cfg.truth_cache:
+            cache_truths(data.datasets[self.cfg.split].drives, self.cfg.truth_cache)
+        if self.cfg.export:
+            rules = protocol((list(self.cfg.protocols or []) or [data.protocol])[0])
+            predictor = ExportingPredictor(predictor, Path(self.cfg.export), rules)
+        return {name: predictor, **(trivial(data, self.cfg.truth_cache) if self.cfg.baselines else {})}
+
+    def predictor(self, data: Any) -> tuple[str, Any]:
+        """Return its name in tables, and itself."""
+        raise NotImplementedError
+
+    def settings(self) -> dict[str, object]:
+        """Return what the numbers depend on, as plain data."""
+        return {"split": self.cfg.split, "post_processing": "monodepth blend of two flips" if self.cfg.flip else None}
+
+
+class CheckpointSubject(Subject):
+    """A trained model."""
+
+    def __init__(self, cfg: DictConfig) -> None:
+        from saunet.checkpoint import read_checkpoint
+        from saunet.evaluation.views import PoseNetwork
+
+        checkpoint = read_checkpoint(cfg.checkpoint)
+        record = checkpoint.record
+        fixed = {"height": record.height, "width": record.width}
+        super().__init__(cfg, {**fixed, "offsets": list(record.offsets)} if record.pose else fixed)
+        self.device = pick_device(cfg.device)
+        network, pose = checkpoint.networks()
+        self.network = network.to(self.device)
+        self.motion = PoseNetwork(pose.to(self.device)) if pose is not None else None
+
+    def predictor(self, data: Any) -> tuple[str, Any]:
+        """Return the depth network, with Monodepth's blend of two flips if that is wanted."""
+        from saunet.evaluation import NetworkPredictor
+
+        return "model", NetworkPredictor(self.network, flip=self.cfg.flip)
+
+    def settings(self) -> dict[str, object]:
+        """Return the checkpoint's path too."""
+        return {"checkpoint": str(self.cfg.checkpoint), **super().settings()}
+
+
+class ForeignSubject(Subject):
+    """Predictions in files."""
+
+    def __init__(self, cfg: DictConfig) -> None:
+        # One image at a time: files of a folder may differ in size.
+        super().__init__(cfg, {"batch_size": 1})
+        if cfg.flip:
+            raise ConfigError("flip=true blends two predictions of a model; leave it out with predictions=...")
+
+    def predictor(self, data: Any) -> tuple[str, Any]:
+        """Return the reader of the files, in the order in which the split lists its images."""
+        from saunet.evaluation.foreign import foreign_predictor
+
+        names = data.listed(self.cfg.split)
+        return "predictions", foreign_predictor(Path(self.cfg.predictions), names, self.cfg.predicted, self.cfg.match)
+
+    def settings(self) -> dict[str, object]:
+        """Return the files' path too."""
+        return {"predictions": str(self.cfg.predictions), "match": self.cfg.match, **super().settings()}
+
+
+def trivial(data: Any, truth_cache: str | None = None) -> dict[str, Any]:
+    """Return constant depth and, where the training split has depth, its mean map; say so where it has none."""
+    from saunet.data.truth_cache import cache_truths
+    from saunet.evaluation import NetworkPredictor
+    from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
+
+    found, mean = {"constant depth": NetworkPredictor(ConstantDepth())}, MeanDepthMap()
+    try:
+        data.setup("fit")
+        if truth_cache:
+            cache_truths(data.datasets["train"].drives, truth_cache)
+        for depth in data.ground_truths("train"):
+            mean.update(depth[None], torch.tensor([depth.shape[-2:]]))
+        mean.depth_map()
+    except DataError as reason:
+        print(f"the mean depth map is left out: {reason}", file=sys.stderr)
+        return found
+    return {**found, "mean depth map": NetworkPredictor(mean)}
