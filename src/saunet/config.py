@@ -116,7 +116,38 @@ class BenchmarkConfig:
     output_dir: str = MISSING
 
 
-ROOTS = (TrainConfig, EvaluateConfig, PredictConfig, BenchmarkConfig, ModelConfig)
+@dataclass
+class DoctorConfig:
+    """Root of ``saunet-doctor``."""
+
+    data: Any = MISSING
+    splits: list[str] = field(default_factory=lambda: ["train", "val", "test"])
+    frames: int = 1000
+    output_dir: str = MISSING
+
+
+@dataclass
+class CalibrateConfig:
+    """Root of ``saunet-calibrate``; ``columns`` and ``rows`` count the board's squares."""
+
+    input: str = MISSING
+    output: str = "camera.yaml"
+    board: str = "chessboard"
+    columns: int = 10
+    rows: int = 7
+    square: float = 0.025
+    marker: float = 0.75
+    dictionary: str = "DICT_4X4_100"
+    model: str = "pinhole"
+    views: int = 40
+    max_error: float = 1.0
+    camera_height: float | None = None
+    condition: str | None = None
+    print_board: str | None = None
+    overwrite: bool = False
+
+
+ROOTS = (TrainConfig, EvaluateConfig, PredictConfig, BenchmarkConfig, DoctorConfig, CalibrateConfig, ModelConfig)
 """The typed roots, and what lies directly below them."""
 
 

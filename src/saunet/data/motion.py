@@ -18,7 +18,7 @@ from saunet.images import read_image, resize
 
 MIN_FLOW = 0.5
 """Pixels of median flow, at 320 pixels width, under which a frame counts as static."""
-_SAME_PICTURE = 0.01
+SAME_PICTURE = 0.01
 """Mean difference over the picture's standard deviation under which two frames are the same picture twice."""
 
 
@@ -35,7 +35,7 @@ class Motion:
 
     def doubled(self) -> NDArray[np.bool_]:
         """Tell which frames are the same picture as the one before: a video whose frame rate was raised."""
-        return np.nan_to_num(self.change, nan=1.0) < _SAME_PICTURE
+        return np.nan_to_num(self.change, nan=1.0) < SAME_PICTURE
 
     def static(self, min_flow: float = MIN_FLOW) -> NDArray[np.bool_]:
         """Tell which frames show no motion against the one before; the first is judged by the second."""

@@ -41,11 +41,20 @@ def median_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
         first: RGB, h x w x 3.
         second: RGB, h x w x 3.
     """
+    return float(np.median(np.linalg.norm(optical_flow(first, second), axis=-1)))
+
+
+def optical_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the optical flow between two images, h x w x 2, in pixels of an image 320 pixels wide.
+
+    Args:
+        first: RGB, h x w x 3.
+        second: RGB, h x w x 3.
+    """
     before, after = _small(first), _small(second)
     flow = np.zeros((*before.shape, 2), np.float32)
     measure = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-    flow = np.asarray(measure.calc(before, after, flow))
-    return float(np.median(np.linalg.norm(flow, axis=-1)))
+    return np.asarray(measure.calc(before, after, flow), dtype=np.float32)
 
 
 def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

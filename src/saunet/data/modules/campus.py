@@ -218,7 +218,7 @@ class CampusDataModule(DepthDataModule):
                 advance=lambda: bar.advance(task),
             )
             bar.update(task, visible=False)
-        settings = f"fps={self.fps} parallax={self.parallax} static={self.static} on_error={self.on_error}"
+        settings = f"fps={self.fps} parallax={self.parallax} static={self.static}"
         return CampusDrive(clip, recording, self.crop, motion, self.parallax, settings)
 
 

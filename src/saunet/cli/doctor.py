@@ -1,0 +1,59 @@
+"""``saunet-doctor``: look at a data set before hours of training; findings, a picture sheet and a manifest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from saunet import config
+from saunet.checks import one_of, positive
+from saunet.cli._app import run
+
+
+def doctor(cfg: DictConfig) -> None:
+    """Look, print what was found with what to do about it, and write ``doctor.png`` and ``manifest.json``."""
+    from hydra.core.hydra_config import HydraConfig
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from saunet.data.doctor import diagnose, draw_sheet, manifest_of, survey
+    from saunet.data.doctor.survey import SPLITS
+    from saunet.data.manifest import write_manifest
+    from saunet.images import write_image
+    from saunet.registry import instantiate
+
+    for split in cfg.splits:
+        one_of("splits", split, SPLITS)
+    positive("frames", cfg.frames, allow_zero=True)
+    data = instantiate(config.plain(cfg.data))
+    columns = (TextColumn("reading frames"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("", total=None)
+        found = survey(
+            data, list(cfg.splits), cfg.frames, lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    findings = diagnose(found)
+    folder = Path(cfg.output_dir)
+    name = HydraConfig.get().runtime.choices["data"]
+    place = f" at {data.root}" if hasattr(data, "root") else ""
+    manifest = manifest_of(found, findings, folder / "manifest.json")
+    write_manifest(manifest.path, manifest)
+    write_image(folder / "doctor.png", draw_sheet(found, findings, f"saunet-doctor: {name}{place}"))
+    for finding in findings:
+        print(finding)
+    left_out = sum(len(numbers) for reasons in manifest.leave_out.values() for numbers in reasons.values())
+    print(f"pictures: {folder / 'doctor.png'}")
+    print(f"manifest: {manifest.path} names {left_out} frames to leave out; train with data.manifest={manifest.path}")
+    if any(finding.level == "error" for finding in findings):
+        raise SystemExit(1)
+
+
+def main() -> None:
+    """Entry point of ``saunet-doctor``."""
+    run("doctor", doctor)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""From measurements to the manifest: the frames that a training should leave out, by reason."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from saunet.data.doctor.findings import BRIGHT, DARK, FLAT, Finding
+from saunet.data.doctor.survey import FrameFacts, Survey
+from saunet.data.manifest import UNREADABLE, Manifest
+from saunet.data.motion import MIN_FLOW, SAME_PICTURE
+
+
+def manifest_of(survey: Survey, findings: Sequence[Finding], path: str | Path) -> Manifest:
+    """Return what ``data.manifest=`` reads: each frame that was read and is of no use, under the first reason."""
+    leave_out: dict[str, dict[str, list[int]]] = {}
+    for frame in survey.frames:
+        reason = _reason(frame)
+        if reason:
+            leave_out.setdefault(frame.drive, {}).setdefault(reason, []).append(frame.index)
+    facts: dict[str, Any] = {
+        "read": f"{len(survey.frames)} frames read; only these are judged",
+        "splits": {
+            split: {"samples": count, "left_out": survey.left_out[split], "sha256": survey.fingerprints[split]}
+            for split, count in survey.windows.items()
+        },
+        "findings": [{"level": each.level, "text": each.text, "fix": each.fix} for each in findings],
+    }
+    return Manifest(leave_out, {drive: survey.numbering[drive] for drive in leave_out}, facts, Path(path))
+
+
+def _reason(frame: FrameFacts) -> str | None:
+    if frame.problem:
+        return UNREADABLE
+    if frame.brightness < DARK:
+        return "dark"
+    if frame.brightness > BRIGHT:
+        return "bright"
+    if frame.contrast < FLAT:
+        return "flat"
+    if frame.change is not None and frame.change < SAME_PICTURE:
+        return "doubled"
+    if frame.flow is not None and frame.flow < MIN_FLOW:
+        return "static"
+    return None
