@@ -1,0 +1,90 @@
+"""One experiment per row of the paper's Tables 1 and 3: each composes, also at smoke size, and says what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from saunet.benchmarking.report import PUBLISHED
+from saunet.checks import ConfigError
+from saunet.cli._globs import expand_globs
+from saunet.config import check, config_dir, plain, register_configs, register_training_configs
+
+ROWS = sorted(
+    path.relative_to(config_dir() / "experiment").with_suffix("").as_posix()
+    for path in (config_dir() / "experiment").glob("table*/*.yaml")
+)
+TABLE_3 = ["table3/resnet50_unet", "table3/stf_t_aunet", "table3/stf_t_unet"]
+SMOKE = ("trainer=smoke", "data=synthetic_tiny")
+
+
+@pytest.fixture(autouse=True)
+def _hydra() -> Iterator[None]:
+    register_configs()
+    register_training_configs()
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        yield
+
+
+def resolved(*overrides: str) -> dict[str, Any]:
+    cfg = compose("train", overrides=["output_dir=/tmp/x", *overrides])
+    check(cfg)
+    return {key: plain(cfg[key]) for key in cfg}
+
+
+def test_every_row_is_there() -> None:
+    assert {row.removeprefix("table1/") for row in ROWS if row.startswith("table1/")} == {*PUBLISHED, "lite_mono"}
+    assert [row for row in ROWS if row.startswith("table3/")] == TABLE_3
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_a_row_trains_on_kitti_at_the_papers_size(row: str) -> None:
+    cfg = resolved(f"experiment={row}")
+    assert cfg["name"] == row
+    data = cfg["data"]
+    assert (data["_target_"].rpartition(".")[2], data["height"], data["width"]) == ("KittiDataModule", 192, 640)
+    assert (data["batch_size"], cfg["trainer"]["max_epochs"]) == (12, 80)
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_a_row_can_be_tried_at_smoke_size(row: str) -> None:
+    cfg = resolved(f"experiment={row}", *SMOKE)
+    data = cfg["data"]
+    assert (data["_target_"].rpartition(".")[2], data["height"], data["batch_size"]) == ("SyntheticDataModule", 64, 2)
+    assert (cfg["trainer"]["max_epochs"], cfg["trainer"]["limit_train_batches"]) == (1, 2)
+
+
+def test_rows_of_table_3_differ_in_the_depth_network_only() -> None:
+    rows = [resolved(f"experiment={row}") for row in TABLE_3]
+    parts = [(row["model"].pop("encoder")["_target_"], row["model"].pop("decoder")["_target_"]) for row in rows]
+    classes = [tuple(path.rpartition(".")[2] for path in pair) for pair in parts]
+    assert classes == [
+        ("ResNet", "UNetDecoder"),
+        ("StratifiedTransformer", "AUNetDecoder"),
+        ("StratifiedTransformer", "UNetDecoder"),
+    ]
+    for row in rows:
+        row.pop("name")
+    assert rows[0] == rows[1] == rows[2]
+
+
+def test_a_glob_over_a_table_becomes_its_rows() -> None:
+    expanded = expand_globs(["-m", "experiment=glob(table3/*)", "seed=1"], config_dir())
+    assert expanded == ["-m", f"experiment={','.join(TABLE_3)}", "seed=1"]
+    assert expand_globs(["experiment='glob(table3/stf*)'"], config_dir()) == [f"experiment={','.join(TABLE_3[1:])}"]
+
+
+@pytest.mark.parametrize("argument", ["model/encoder=glob(resnet*)", "experiment=table3/stf_t_unet", "a=glob(x,y/*)"])
+def test_what_hydra_understands_is_left_to_it(argument: str) -> None:
+    assert expand_globs([argument], config_dir()) == [argument]
+
+
+def test_a_glob_that_matches_nothing_says_what_there_is(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"experiment=glob\(table4/\*\) matches none of: .*table3/stf_t_unet"):
+        expand_globs(["experiment=glob(table4/*)"], config_dir())
+    with pytest.raises(ConfigError, match="matches none of: no files"):
+        expand_globs(["experiment=glob(table4/*)"], tmp_path)
