@@ -71,6 +71,18 @@ def test_starts_nearly_still(name, kwargs):
     assert (T_src_tgt - torch.eye(4)).abs().max() < 0.02
 
 
+@pytest.mark.parametrize(("name", "kwargs"), VARIANTS)
+def test_an_untrained_network_tells_pairs_apart_and_all_of_it_learns(name, kwargs):
+    """Seven layers without normalisation lose the signal on the way unless their weights start large enough."""
+    pose = poses.build(name, **kwargs)
+    T_src_tgt = pose(torch.rand(6, 3, 64, 64), torch.rand(6, 2, 3, 64, 64))
+    forward = T_src_tgt[:, 1, :3, 3] / MOTION_SCALE
+    assert forward.std(0).mean() > 1e-3
+    T_src_tgt[:, :, 2, 3].square().sum().sqrt().backward()
+    sizes = {key: p.grad.norm().item() for key, p in pose.named_parameters() if p.ndim == 4}
+    assert min(sizes.values()) > 1e-3 * max(sizes.values()), sizes
+
+
 def test_motion_is_forward_in_time():
     motion = torch.zeros(2, 1, 6)
     motion[..., 5] = 1 / MOTION_SCALE  # T_later_earlier moves points by +1 along z
