@@ -22,6 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from saunet import schema
 from saunet.checks import SaunetError, suggest
+from saunet.cli._globs import expand_globs
 from saunet.config import ROOTS, config_dir, register_configs
 from saunet.registry import REGISTRIES
 
@@ -51,6 +52,7 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
         task(cfg)
 
     try:
+        sys.argv[1:] = expand_globs(sys.argv[1:], config_dir())
         hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(required)()
     except KeyboardInterrupt:
         _fail(name, "interrupted", code=130)
