@@ -147,7 +147,30 @@ class CalibrateConfig:
     overwrite: bool = False
 
 
-ROOTS = (TrainConfig, EvaluateConfig, PredictConfig, BenchmarkConfig, DoctorConfig, CalibrateConfig, ModelConfig)
+@dataclass
+class OdometryConfig:
+    """Root of ``saunet-odometry``; see docs/evaluation.md."""
+
+    checkpoint: str = MISSING
+    data: Any = MISSING
+    snippet: int = 5
+    lengths: list[float] | None = None
+    batch_size: int = 8
+    figure: bool = True
+    device: str = "auto"
+    output_dir: str = MISSING
+
+
+ROOTS = (
+    TrainConfig,
+    EvaluateConfig,
+    PredictConfig,
+    BenchmarkConfig,
+    OdometryConfig,
+    DoctorConfig,
+    CalibrateConfig,
+    ModelConfig,
+)
 """The typed roots, and what lies directly below them."""
 
 
