@@ -56,6 +56,7 @@ class OdometrySequence:
         self._T_cam_cam0[:3, 3] = np.linalg.solve(self._K, matrices[key][:, 3])
         poses = root / "poses" / f"{sequence}.txt"
         self._poses = read_poses(poses) if poses.is_file() else None
+        self._times = _read_times(folder / "times.txt")
 
     @property
     def indices(self) -> Sequence[int]:
@@ -73,6 +74,10 @@ class OdometrySequence:
     def depth(self, index: int) -> NDArray[np.float32] | None:
         """Return None: the benchmark comes without depth."""
         return None
+
+    def time(self, index: int) -> float | None:
+        """Return the seconds at which a frame was taken, by ``times.txt``; None where that is missing or shorter."""
+        return float(self._times[index]) if 0 <= index < len(self._times) else None
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """Return T_world_cam of this camera, 4 x 4, metres; None where the file of poses is missing or shorter."""
@@ -124,6 +129,15 @@ def sequences(root: Path) -> list[str]:
     """Return the names of the sequences on disk, sorted."""
     folder = root / "sequences"
     return sorted(entry.name for entry in folder.iterdir() if entry.is_dir()) if folder.is_dir() else []
+
+
+def _read_times(path: Path) -> NDArray[np.float64]:
+    if not path.is_file():
+        return np.empty(0)
+    try:
+        return np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
+    except ValueError as reason:
+        raise DataError(f"{path} holds what is no number ({reason}); expected seconds, one a frame") from reason
 
 
 def read_poses(path: Path) -> NDArray[np.float64]:

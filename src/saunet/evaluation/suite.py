@@ -71,8 +71,8 @@ def evaluate_protocols(
     one_of("split", split, STAGES)
     first: EvaluationData | None = data_with(None)
     assert first is not None
-    own = first.ground_truth if getattr(first, "has_ground_truth", True) else "none"
-    names = names or [first.protocol if own != "none" else "campus"]
+    own = first.ground_truth
+    names = names or [first.protocol]
     results = []
     for kind, rules in passes([protocol(name) for name in names], own).items():
         # The data that were asked for their own ground truth serve the pass that wants it; others start anew.

@@ -22,7 +22,10 @@ VIEW_HEADINGS: tuple[str, ...] = ("warped ↓", "unwarped", "explained ↑", "vi
 
 
 def print_table(result: EvaluationResult, console: Console | None = None) -> None:
-    """Print one table a protocol, the best of each column in bold, then whatever else the result holds."""
+    """Print one table a protocol, the best of each column in bold, then what else the result holds.
+
+    Where the errors are is shown for the first predictor alone.
+    """
     console = console or Console()
     summaries = result.summaries()
     for protocol in result.protocols:
@@ -32,11 +35,10 @@ def print_table(result: EvaluationResult, console: Console | None = None) -> Non
         views = [row for row in result.views if row.protocol == protocol.name]
         if views:
             console.print(view_table(protocol, views), "")
-    for protocol in result.protocols:
-        for predictor in result.predictors:
-            rows = [r for r in result.buckets if (r.protocol, r.predictor) == (protocol.name, predictor)]
-            if rows:
-                console.print(bucket_table(rows), "")
+    for protocol in result.protocols:  # of the others, the places of their errors are in the files
+        rows = [r for r in result.buckets if (r.protocol, r.predictor) == (protocol.name, result.predictors[0])]
+        if rows:
+            console.print(bucket_table(rows), "")
     for comparison in result.comparisons:
         console.print(comparison_table(comparison), "")
 
@@ -71,7 +73,7 @@ def spread_note(spread: Spread | Comparison) -> str:
 
 def view_table(protocol: Protocol, rows: Sequence[ViewRow]) -> Table:
     """Return the table of what is measured without ground truth, by predictor and condition."""
-    table = _plain_table(f"[bold]{protocol.name}[/bold]: {protocol.summary}")
+    table = plain_table(f"[bold]{protocol.name}[/bold]: {protocol.summary}")
     table.add_column("predictor", min_width=9)
     table.add_column("condition", min_width=9)
     for heading in VIEW_HEADINGS:
@@ -97,7 +99,7 @@ def bucket_table(rows: Sequence[BucketRow]) -> Table:
 def comparison_table(comparison: Comparison) -> Table:
     """Return the table of two predictors' differences; bold where the interval leaves out zero."""
     first, second = escape(comparison.first), escape(comparison.second)
-    table = _plain_table(f"[bold]{comparison.protocol}[/bold]: '{second}' against '{first}'")
+    table = plain_table(f"[bold]{comparison.protocol}[/bold]: '{second}' against '{first}'")
     table.add_column("error", min_width=10)
     for heading in ("before", "now", "difference", f"{comparison.level:.0%} interval", "better on", "p"):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -130,7 +132,7 @@ def images_note(summary: Summary) -> str:
 
 def _error_table(title: str, first: str, last: str) -> Table:
     """An empty table that fits a terminal of 80 columns: headings on two lines, no vertical rules."""
-    table = _plain_table(title)
+    table = plain_table(title)
     table.add_column(first, min_width=9)
     for heading in HEADINGS:
         name, arrow = heading.rsplit(" ", 1)
@@ -139,7 +141,8 @@ def _error_table(title: str, first: str, last: str) -> Table:
     return table
 
 
-def _plain_table(title: str) -> Table:
+def plain_table(title: str) -> Table:
+    """Return an empty table without vertical rules, title and caption on the left."""
     table = Table(title=title, box=HORIZONTALS, padding=0, show_edge=False, title_justify="left", title_style="")
     table.caption_justify = "left"
     return table

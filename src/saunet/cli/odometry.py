@@ -1,0 +1,75 @@
+"""``saunet-odometry``: the path of the camera through whole sequences, its errors, its files and its picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from saunet import config
+from saunet.checks import ConfigError
+from saunet.cli._app import pick_device, run
+
+
+def odometry(cfg: DictConfig) -> None:
+    """Predict the path through each test sequence and compare it with the true one where that is known."""
+    from rich.console import Console
+
+    from saunet.checkpoint import read_checkpoint
+    from saunet.evaluation.foreign import file_stem
+    from saunet.evaluation.motion import predict_trajectory
+    from saunet.evaluation.odometry import Path3d, path_errors, path_table, write_errors, write_path
+    from saunet.evaluation.plot import check_plotting, draw_path
+    from saunet.registry import instantiate
+
+    if cfg.figure:
+        check_plotting()
+    checkpoint = read_checkpoint(cfg.checkpoint)
+    record, device, output = checkpoint.record, pick_device(cfg.device), Path(cfg.output_dir)
+    pose = checkpoint.networks()[1]
+    if pose is None:
+        raise ConfigError(f"{cfg.checkpoint} has no pose network (it was trained on stereo pairs); a path needs one")
+    size = {"height": record.height, "width": record.width}
+    data = instantiate({**config.plain(cfg.data), **size, "offsets": list(record.offsets)})
+    data.setup("test")
+    errors = []
+    for drive in data.datasets["test"].drives:
+        predicted = predict_trajectory(
+            pose.to(device), drive, offsets=record.offsets, device=device, batch_size=cfg.batch_size, **size
+        )
+        path = Path3d(drive.name, predicted, _times(drive), _truth(drive))
+        folder = output / file_stem(drive.name)
+        write_path(path, folder)
+        if cfg.figure:
+            draw_path(path, folder / "path.png")
+        if path.true is None:
+            print(f"{drive.name}: no true poses, so the path is written and not compared")
+        else:
+            errors.append(path_errors(path, cfg.snippet, list(cfg.lengths) if cfg.lengths else None))
+    write_errors(errors, output, {"checkpoint": str(cfg.checkpoint)})
+    if errors:
+        Console().print(path_table(errors))
+    print(f"results: {output}")
+
+
+def _times(drive: Any) -> Any:
+    """Return seconds by the recording, or ten frames a second where it does not say."""
+    numbers = list(drive.indices)
+    known = [drive.time(number) for number in numbers] if hasattr(drive, "time") else [None]
+    return np.array(numbers) * 0.1 if None in known else np.array(known, dtype=np.float64)
+
+
+def _truth(drive: Any) -> Any:
+    poses = [drive.pose(number) for number in drive.indices]
+    return None if any(pose is None for pose in poses) else np.stack(poses)
+
+
+def main() -> None:
+    """Entry point of ``saunet-odometry``."""
+    run("odometry", odometry)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""How far off a predicted path is: published snippets, the whole path aligned, KITTI's relative errors; its files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+from rich.markup import escape
+from rich.table import Table
+
+from saunet.atomic import write_bytes
+from saunet.evaluation.tables import plain_table
+from saunet.evaluation.trajectories import write_kitti, write_tum
+from saunet.metrics.odometry import (
+    KITTI_LENGTHS,
+    Similarity,
+    align_trajectory,
+    relative_motions,
+    segment_errors,
+    snippet_ate,
+    trajectory_ate,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PathErrors:
+    """One predicted path against the true one."""
+
+    sequence: str
+    frames: int
+    metres: float
+    """Length of the true path."""
+    snippet: int
+    """Frames in a snippet."""
+    snippet_ate: float
+    """Mean error of snippets in metres, each with its own scale, as published (Zhou et al., Monodepth2)."""
+    snippet_std: float
+    """Its standard deviation over snippets."""
+    ate: float
+    """Root mean square distance of positions in metres after 7-DoF alignment of the whole path."""
+    scale: float
+    """Metres a unit of the prediction: the scale of that alignment."""
+    t_rel: float
+    """KITTI's translation error after that alignment, percent; NaN if no segment fits into the path."""
+    r_rel: float
+    """KITTI's rotation error, degrees per 100 m; NaN if no segment fits."""
+    segments: int
+    """How many segments these are the mean of."""
+    lengths: tuple[float, ...]
+    """Their lengths in metres; other than KITTI's where its shortest, 100 m, does not fit."""
+
+
+@dataclass(frozen=True)
+class Path3d:
+    """A predicted path, with the true one where it is known."""
+
+    sequence: str
+    predicted: Float64[ndarray, "n 4 4"]
+    """``T_world_cam``; the world is the first camera, the scale the network's own."""
+    times: Float64[ndarray, " n"]
+    """Seconds of each frame."""
+    true: Float64[ndarray, "n 4 4"] | None = None
+    """``T_world_cam`` in metres."""
+
+    @property
+    def alignment(self) -> Similarity:
+        """The similarity that brings the prediction onto the truth; nothing moves where there is no truth."""
+        if self.true is None:
+            return Similarity(1.0, np.eye(3), np.zeros(3))
+        return align_trajectory(self.predicted, self.true)
+
+    @property
+    def aligned(self) -> Float64[ndarray, "n 4 4"]:
+        """The predicted poses, aligned."""
+        return self.alignment.poses(self.predicted)
+
+
+def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None = None) -> PathErrors:
+    """Compute the errors of a path whose truth is known.
+
+    Args:
+        path: The path.
+        snippet: Frames in a snippet; published numbers use 5.
+        lengths: Segment lengths in metres for t_rel and r_rel; by default KITTI's 100 to 800 m, or tenths of the path
+            where it is shorter than 100 m (such numbers compare with no published ones).
+
+    Raises:
+        DataError: if there are fewer than two poses.
+    """
+    true = path.true
+    assert true is not None, "errors need the true path"
+    metres = float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum())
+    chosen = tuple(lengths or KITTI_LENGTHS)
+    if lengths is None and metres <= min(KITTI_LENGTHS) and metres > 0:
+        tenth = 10 ** math.floor(math.log10(metres / 4))
+        chosen = tuple(tenth * round(metres / 10 / tenth * k) for k in (2, 4, 6, 8) if round(metres / 10 / tenth * k))
+    snippets = snippet_ate(relative_motions(path.predicted), relative_motions(true), snippet)
+    relative = segment_errors(path.aligned, true, chosen, step=10 if len(true) > 100 else 1)
+    return PathErrors(
+        path.sequence,
+        len(true),
+        metres,
+        snippet,
+        snippets.mean,
+        snippets.std,
+        trajectory_ate(path.predicted, true),
+        path.alignment.scale,
+        relative.t_rel,
+        relative.r_rel,
+        relative.segments,
+        chosen,
+    )
+
+
+def path_table(errors: Sequence[PathErrors]) -> Table:
+    """Return one line a sequence."""
+    table = plain_table("[bold]odometry[/bold]: the path of the camera from the pose network")
+    table.add_column("sequence", min_width=9)
+    for heading in (
+        "frames",
+        "path m",
+        f"{errors[0].snippet}-frame\nATE m",
+        "ATE m",
+        "scale",
+        "t_rel\n%",
+        "r_rel\n°/100m",
+    ):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in errors:
+        table.add_row(
+            escape(row.sequence),
+            str(row.frames),
+            f"{row.metres:.1f}",
+            f"{row.snippet_ate:.4f} ± {row.snippet_std:.4f}",
+            f"{row.ate:.3f}",
+            f"{row.scale:.3g}",
+            f"{row.t_rel:.2f}",
+            f"{row.r_rel:.2f}",
+        )
+    lengths = sorted({f"{row.lengths[0]:g} to {row.lengths[-1]:g} m" for row in errors if row.lengths})
+    table.caption = (
+        f"{errors[0].snippet}-frame ATE: own scale a snippet, as published; the rest after 7-DoF alignment; "
+        f"t_rel and r_rel over segments of {', '.join(lengths)}"
+    )
+    return table
+
+
+def write_path(path: Path3d, folder: Path) -> None:
+    """Write a path in KITTI's and TUM's format: as predicted and, with a truth, aligned to it and the truth itself.
+
+    Raises:
+        DataError: if a file cannot be written.
+    """
+    kinds = {"predicted": path.predicted}
+    if path.true is not None:
+        kinds |= {"aligned": path.aligned, "true": path.true}
+    for kind, poses in kinds.items():
+        write_kitti(folder / f"{kind}_kitti.txt", poses)
+        write_tum(folder / f"{kind}_tum.txt", poses, path.times)
+
+
+def write_errors(errors: Sequence[PathErrors], folder: Path, settings: dict[str, object]) -> None:
+    """Write ``odometry.json`` and ``odometry.csv``, one entry a sequence.
+
+    Raises:
+        DataError: if a file cannot be written.
+    """
+    rows = [
+        {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in asdict(row).items()}
+        for row in errors
+    ]
+    text = json.dumps({"settings": settings, "results": rows}, indent=2, ensure_ascii=False, allow_nan=False)
+    write_bytes(folder / "odometry.json", f"{text}\n".encode())
+    if rows:
+        table = io.StringIO(newline="")
+        writer = csv.DictWriter(table, list(rows[0]))
+        writer.writeheader()
+        writer.writerows({**row, "lengths": " ".join(map(str, row["lengths"]))} for row in rows)  # type: ignore[call-overload]
+        write_bytes(folder / "odometry.csv", table.getvalue().encode())
