@@ -46,6 +46,7 @@ class TrainConfig:
     objective: Any = MISSING
     data: Any = MISSING
     optim: Any = MISSING
+    speed: Any = MISSING
     trainer: Any = MISSING
     callbacks: dict[str, Any] = field(default_factory=dict)
     logger: dict[str, Any] = field(default_factory=dict)
@@ -53,6 +54,7 @@ class TrainConfig:
     name: str = MISSING
     output_dir: str = MISSING
     resume: str | None = None
+    init_from: str | None = None
     monitor: str = MISSING
     protocol: str | None = None
 
@@ -191,10 +193,12 @@ def register_training_configs() -> None:
     from lightning import Trainer
 
     from saunet.lit.optim import Recipe
+    from saunet.lit.speed import Speed
 
     store = ConfigStore.instance()
     store.store(group="trainer", name="lightning", node=schema.node(Trainer, root="lightning.Trainer"))
     store.store(group="optim", name="recipe", node=schema.node(Recipe))
+    store.store(group="speed", name="switches", node=schema.node(Speed))
 
 
 def plain(node: Any) -> Any:
@@ -212,6 +216,12 @@ def check(cfg: DictConfig) -> None:
     from hydra.types import RunMode
 
     positive("seed", cfg.seed, allow_zero=True)
+    if cfg.optim.fused and str(cfg.trainer.precision).startswith("16") and cfg.trainer.gradient_clip_val:
+        raise ConfigError(
+            "optim.fused=true, trainer.precision=16-mixed and trainer.gradient_clip_val do not go together: the fused "
+            "optimiser unscales gradients after they would have been clipped; use trainer.precision=bf16-mixed, or leave "
+            "one out"
+        )
     if cfg.trainer.max_epochs == -1 and cfg.trainer.max_steps == -1:
         raise ConfigError(
             "trainer.max_epochs is -1: a training without end has no schedule; set it, or trainer.max_steps"

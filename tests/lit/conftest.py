@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from saunet.data.windows import Selection
 from saunet.lit.assemble import assemble
 from saunet.lit.module import SelfSupervisedDepth
 from saunet.registry import REGISTRIES
+
+sys.path.insert(0, str(Path(__file__).parent))  # for `tiny`: tests are imported without being a package
 
 
 class Wall:

@@ -16,11 +16,11 @@ from torch import Tensor, nn
 
 import saunet
 from saunet.checkpoint import read_checkpoint
-from saunet.checks import ConfigError, SaunetError
+from saunet.checks import ConfigError
 from saunet.data.module import DepthDataModule
 from saunet.images import read_image
 from saunet.lit.assemble import assemble
-from saunet.lit.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel, StopOnNonFinite
+from saunet.lit.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
 from saunet.lit.module import SelfSupervisedDepth
 from saunet.types import EvalBatch
 
@@ -103,16 +103,6 @@ def test_a_resumed_training_equals_the_uninterrupted_one_bit_for_bit(
     expected, got = _weights(model), _weights(resumed)
     assert expected.keys() == got.keys()
     assert all(torch.equal(expected[name], got[name]) for name in expected)
-
-
-def test_a_non_finite_loss_ends_the_run_with_one_sentence(
-    model: SelfSupervisedDepth, walls: DepthDataModule, make_trainer: Callable[..., Trainer]
-) -> None:
-    with torch.no_grad():
-        next(model.depth.parameters()).fill_(float("nan"))
-    trainer = make_trainer(max_epochs=1, callbacks=[StopOnNonFinite(every_n_steps=1)])
-    with pytest.raises(SaunetError, match=r"the loss became NaN or infinite at or before step 1 \(last batch: train"):
-        trainer.fit(model, walls)
 
 
 def test_last_is_the_last_and_best_is_the_best(

@@ -17,13 +17,16 @@ import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from saunet import schema
 from saunet.checks import SaunetError, suggest
 from saunet.cli._globs import expand_globs
+from saunet.cli._sweep import summary, swept_folder
 from saunet.config import ROOTS, config_dir, register_configs
+from saunet.lit.run_record import FILE, Stopped
 from saunet.registry import REGISTRIES
 
 
@@ -31,7 +34,7 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
     """Run ``task`` as the Hydra application whose root config is ``conf/<name>.yaml``.
 
     What a user can mend ends in one sentence and exit code 1; only a defect of the program shows a traceback.
-    ``HYDRA_FULL_ERROR=1`` shows it always.
+    ``HYDRA_FULL_ERROR=1`` shows it always. In a sweep, the other jobs go on, and failures are named at the end.
     """
     before = os.environ.get("HYDRA_FULL_ERROR")
     # A process that DDP started inherits the variable from us, not from the user.
@@ -40,32 +43,66 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
     register_configs()
     _quieten()
 
-    folders: list[Path] = []  # Hydra's run folder, once it exists
+    folders: list[Path] = []  # of a single run, once they exist
 
     @wraps(task)
-    def required(cfg: DictConfig) -> None:
-        folders.append(Path(HydraConfig.get().runtime.output_dir))
+    def required(cfg: DictConfig) -> Any:
+        hydra_cfg = HydraConfig.get()
+        if hydra_cfg.mode == RunMode.MULTIRUN:
+            return _job(name, task, cfg)
+        folders.append(Path(hydra_cfg.runtime.output_dir))
+        if "output_dir" in cfg:
+            folders.append(Path(cfg.output_dir).resolve())
         missing = sorted(OmegaConf.missing_keys(cfg))
         if missing:
             needed = " ".join(f"{key}=..." for key in missing)
             raise SaunetError(f"{missing[0]} is not set; add {needed} to the command line")
-        task(cfg)
+        return task(cfg)
 
     try:
         sys.argv[1:] = expand_globs(sys.argv[1:], config_dir())
         hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(required)()
+        _end_sweep(name)
     except KeyboardInterrupt:
+        _end_sweep(name)
         _fail(name, "interrupted", code=130)
+    except Stopped as stop:
+        _end_sweep(name)
+        if stop.code:
+            _fail(name, stop.message, code=int(stop.code))
     except Exception as error:
-        sentence = _sentence(error)
-        if debug or sentence is None:
+        reason = sentence(error)
+        if debug or reason is None:
             raise
+        _end_sweep(name)
         for folder in folders:
             _remove_if_bare(folder)
-        _fail(name, sentence)
+        _fail(name, reason)
     finally:
         if before is None:
             del os.environ["HYDRA_FULL_ERROR"]
+
+
+def _job(name: str, task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
+    """Run one job of a sweep; what goes wrong is said at once and ends this job only."""
+    try:
+        return task(cfg)
+    except Exception as error:
+        job = HydraConfig.get().job
+        reason = sentence(error) or f"{type(error).__name__}: {error}"
+        print(f"saunet-{name}: job {job.num} ({job.override_dirname}) failed: {reason}", file=sys.stderr)
+        raise
+
+
+def _end_sweep(name: str) -> None:
+    """After a sweep, say how its jobs ended; exit with code 1 if one failed."""
+    folder = swept_folder()
+    if folder is None:
+        return
+    text, finished = summary(folder)
+    print(text, file=sys.stdout if finished else sys.stderr)
+    if not finished:
+        raise SystemExit(1)
 
 
 def pick_device(name: str) -> str:
@@ -93,16 +130,21 @@ def _fail(name: str, message: str, code: int = 1) -> NoReturn:
 
 def _remove_if_bare(folder: Path) -> None:
     """Remove a run folder that holds nothing but its config and empty logs: the run never began."""
-    if folder == Path.cwd() or not (folder / ".hydra").is_dir():
+    if folder == Path.cwd() or not ((folder / ".hydra").is_dir() or (folder / FILE).is_file()):
         return
-    started = ("hparams.yaml", "events.out.tfevents")
+    started = ("hparams.yaml", "events.out.tfevents", FILE)
     files = [path for path in folder.rglob("*") if path.is_file() and path.parent.name != ".hydra"]
-    if all(path.suffix == ".log" or path.name.startswith(started) for path in files):
+    if not all(path.suffix == ".log" or path.name.startswith(started) for path in files):
+        return
+    (folder / FILE).unlink(missing_ok=True)
+    if (folder / ".hydra").is_dir():
         logging.shutdown()
         shutil.rmtree(folder, ignore_errors=True)
+    elif not any(folder.iterdir()):
+        folder.rmdir()
 
 
-def _sentence(error: Exception) -> str | None:
+def sentence(error: Exception) -> str | None:
     """Say in one sentence what a user can mend; None for a defect of the program."""
     if isinstance(error, SaunetError):
         return str(error)
@@ -111,6 +153,8 @@ def _sentence(error: Exception) -> str | None:
         return raised_elsewhere[1]
     if type(error).__name__ == "MisconfigurationException":  # Lightning's word for a user's error
         return " ".join(str(error).split())
+    if type(error).__name__ == "ProcessExitedException":  # a process that was spawned is gone
+        return f"{' '.join(str(error).split())}, so the run ends; go on with resume= and the run's last.ckpt"
     text = f"{error}\n{error.__cause__ or ''}"
     if isinstance(error, MissingConfigException):  # which is an OSError too
         return _unknown_choice(text)

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from saunet import config
 from saunet.cli._app import run
 from saunet.cli.evaluate import evaluate_model
-from saunet.cli.train import train
+from saunet.cli.train import fit
 
 PICTURES = 3
 """Test frames shown in the panel, evenly spread over the drive."""
@@ -23,7 +23,7 @@ def demo(cfg: DictConfig) -> None:
     import saunet
     from saunet.evaluation import print_table, write_results
 
-    data = train(cfg)
+    data, _ = fit(cfg)
     folder = Path(cfg.output_dir)
     predictor = saunet.load(folder / "checkpoints" / "best.ckpt")
     result = evaluate_model(predictor.network, data, [])

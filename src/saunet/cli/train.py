@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,40 +10,69 @@ from hydra.utils import instantiate as hydra_instantiate
 from omegaconf import DictConfig
 
 from saunet import config
-from saunet.cli._app import run
+from saunet.checks import SaunetError
+from saunet.cli._app import run, sentence
 
 
-def train(cfg: DictConfig) -> Any:
-    """Build every part from the config, train, print where the results are, and return the data module."""
+def train(cfg: DictConfig) -> float | None:
+    """Train, print where the results are, and return the best monitored value: what a search minimises."""
+    return fit(cfg)[1]
+
+
+def fit(cfg: DictConfig) -> tuple[Any, float | None]:
+    """Build every part from the config and train; ``run.json`` in the run's folder says how that went.
+
+    Returns:
+        The data module, and the best monitored value.
+    """
     from lightning import seed_everything
 
-    from saunet.checkpoint import load_weights, read_checkpoint
     from saunet.lit.assemble import assemble
+    from saunet.lit.callbacks import BestCheckpoint, SplitsRecorded
+    from saunet.lit.run_record import recording
+    from saunet.lit.start import check_resume, resume_path, warm_start
     from saunet.lit.storage import AtomicCheckpointIO
     from saunet.registry import instantiate
 
-    config.check(cfg)
-    seed_everything(cfg.seed, workers=True, verbose=False)
-    data = instantiate(config.plain(cfg.data))
-    resume = str(Path(cfg.resume).expanduser().resolve()) if cfg.resume else None
-    model = assemble(config.plain(cfg), data, pretrained=resume is None)
-    if resume:  # what does not fit fails here in one sentence rather than deep inside the trainer
-        checkpoint = read_checkpoint(resume)
-        checkpoint.record.check_same_training(model.record)
-        load_weights(model.depth, checkpoint.weights("depth"), "depth network")
-        if model.pose is not None:
-            load_weights(model.pose, checkpoint.weights("pose"), "pose network")
-    trainer = hydra_instantiate(
-        cfg.trainer,
-        callbacks=[hydra_instantiate(callback) for callback in cfg.callbacks.values() if callback],
-        logger=[hydra_instantiate(logger) for logger in cfg.logger.values() if logger] or False,
-        plugins=[AtomicCheckpointIO()],
-        default_root_dir=cfg.output_dir,
-    )
-    trainer.fit(model, datamodule=data, ckpt_path=resume, weights_only=True)
+    with recording(cfg.output_dir, cfg.name, sentence) as record:
+        config.check(cfg)
+        seed_everything(cfg.seed, workers=True, verbose=False)
+        resume = resume_path(cfg.resume, cfg.output_dir, cfg.init_from)
+        data = instantiate(config.plain(cfg.data))
+        model = assemble(config.plain(cfg), data, pretrained=resume is None and cfg.init_from is None)
+        if resume:
+            check_resume(model, resume)
+            record.write(resumed=resume)
+            print(f"going on from {resume}")
+        elif cfg.init_from:
+            print(warm_start(model, cfg.init_from))
+        callbacks = [hydra_instantiate(callback) for callback in cfg.callbacks.values() if callback]
+        trainer = hydra_instantiate(
+            cfg.trainer,
+            callbacks=[SplitsRecorded(record), *callbacks],
+            logger=[hydra_instantiate(logger) for logger in cfg.logger.values() if logger] or False,
+            plugins=[AtomicCheckpointIO()],
+            default_root_dir=cfg.output_dir,
+        )
+        try:
+            trainer.fit(model, datamodule=data, ckpt_path=resume, weights_only=True)
+        except RuntimeError as error:
+            if trainer.world_size > 1 and re.search(r"Connection|NCCL|Gloo|gloo|store", str(error)):
+                raise SaunetError(
+                    "the connection to another process of this run broke, most likely because it died (see its "
+                    "message); " + _way_on(cfg)
+                ) from error
+            raise
     if trainer.is_global_zero:
         print(f"results: {cfg.output_dir}")
-    return data
+    scores = [each.best_model_score for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint)]
+    return data, next((float(score) for score in scores if score is not None), None)
+
+
+def _way_on(cfg: DictConfig) -> str:
+    from saunet.lit.durable import way_on
+
+    return way_on(Path(cfg.output_dir) / "checkpoints")
 
 
 def main() -> None:

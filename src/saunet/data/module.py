@@ -24,6 +24,8 @@ from saunet.data.unreadable import SkippingWindows, readable
 from saunet.data.windows import Selection, Usage, WindowDataset, check_offsets, collate, find_windows
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
 
+AHEAD = 4
+"""Batches that each loader process keeps ready: enough that one slow file, or a validation, is not felt."""
 STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("predict",)}
 
 
@@ -248,6 +250,7 @@ class DepthDataModule(LightningDataModule):
             "batch_size": None,  # the samplers yield whole batches
             "collate_fn": collate,
             "num_workers": self.workers,
+            "prefetch_factor": AHEAD if self.workers else None,
             "pin_memory": torch.cuda.is_available(),
             "persistent_workers": self.workers > 0,
             "worker_init_fn": single_threaded,

@@ -8,6 +8,7 @@ batches without repeating or dropping a sample.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -110,11 +111,21 @@ def share(batch_size: int, world_size: int) -> int:
 
 
 class Loader(DataLoader[Any]):
-    """A loader whose processes report a bad file in one sentence, not with their traceback."""
+    """A loader whose processes report a bad file in one sentence, and that knows how long it was waited for."""
+
+    waited = 0.0
+    """Seconds that its user has waited for batches so far."""
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
         try:
-            yield from super().__iter__()
+            batches = iter(super().__iter__())
+            while True:
+                began = time.perf_counter()
+                batch = next(batches, None)
+                self.waited += time.perf_counter() - began
+                if batch is None:
+                    return
+                yield batch
         except SaunetError as error:
             # torch prefixes what a loader process raised with its traceback, of which the last line is the error
             name = f"{type(error).__module__}.{type(error).__qualname__}: "

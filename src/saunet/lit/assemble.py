@@ -10,6 +10,7 @@ from saunet.checks import ConfigError, divisible
 from saunet.data.module import DepthDataModule
 from saunet.lit.module import SelfSupervisedDepth
 from saunet.lit.optim import Recipe
+from saunet.lit.speed import Speed
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.protocols import protocol
 from saunet.record import ModelRecord, Scale
@@ -50,11 +51,16 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule, pretrained: bool = T
         depth=depth,
         pose=pose,
         objective=instantiate(cfg["objective"]),
-        recipe=Recipe(**{key: value for key, value in cfg["optim"].items() if not key.startswith("_")}),
+        recipe=Recipe(**_settings(cfg["optim"])),
         metrics=DepthMetrics(rules),
         seed=cfg["seed"],
         record=record.to_plain(),
+        speed=Speed(**_settings(cfg.get("speed", {}))),
     )
+
+
+def _settings(node: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in node.items() if not key.startswith("_")}
 
 
 def _check_sources(cfg: Mapping[str, Any], data: DepthDataModule) -> None:

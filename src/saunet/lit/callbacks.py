@@ -1,9 +1,8 @@
-"""What accompanies a training: checkpoints, the progress bar, a stop on a non-finite loss, a picture every epoch."""
+"""What accompanies a training: checkpoints, the progress bar, a picture every epoch."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,65 +11,56 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_info
-from torch import Tensor
 
 from saunet.atomic import replacing
-from saunet.checks import CheckpointError, SaunetError, positive
+from saunet.checks import CheckpointError, positive
+from saunet.data.module import DepthDataModule
 from saunet.images import write_image
 from saunet.lit.pictures import training_panel
+from saunet.lit.run_record import RunRecord
 from saunet.types import EvalBatch
 
 
-class StopOnNonFinite(Callback):
-    """End the run with one sentence when the loss is NaN or infinite, instead of training on garbage for hours.
-
-    The flag stays on the device and is read only now and then, so the step never waits for it.
+class SplitsRecorded(Callback):
+    """Write into ``run.json`` which frames a run sees, as one SHA-256 a split.
 
     Args:
-        every_n_steps: How often the flag is read.
+        record: The run's record.
     """
 
-    def __init__(self, every_n_steps: int = 10) -> None:
-        self.every_n_steps = int(positive("every_n_steps", every_n_steps))
-        self._bad: Tensor | None = None
-        self._names: list[str] = []
+    def __init__(self, record: RunRecord) -> None:
+        self.record = record
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write them once the data are set up."""
+        data = getattr(trainer, "datamodule", None)
+        if trainer.is_global_zero and isinstance(data, DepthDataModule):
+            self.record.write(splits=data.fingerprints())
+
+
+class LastCheckpoint(ModelCheckpoint):
+    """``last.ckpt``, after every epoch and every so many steps: what to resume from.
+
+    Args:
+        folder: Where it goes.
+        every_n_steps: Also after so many optimiser steps; 0 for never.
+    """
+
+    def __init__(self, folder: str, every_n_steps: int = 1000) -> None:
+        super().__init__(folder, "last", enable_version_counter=False)
+        self.every_n_steps = int(positive("every_n_steps", every_n_steps, allow_zero=True))
+        self._saved_at = 0
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Remember whether any loss since the last look was not finite."""
-        loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
-        bad = ~torch.isfinite(loss.detach())
-        self._bad = bad if self._bad is None else self._bad | bad
-        self._names = batch["name"][:4]
-        if trainer.global_step % self.every_n_steps == 0:
-            self._look(trainer)
-
-    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Look before broken weights are scored and saved."""
-        self._look(trainer)
-
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Look before broken weights are saved."""
-        self._look(trainer)
-
-    def _look(self, trainer: Trainer) -> None:
-        if self._bad is not None and bool(self._bad):
-            raise SaunetError(
-                f"the loss became NaN or infinite at or before step {trainer.global_step} "
-                f"(last batch: {', '.join(self._names)}); lower optim.lr, or train with trainer.precision=32"
-            )
-
-
-class LastCheckpoint(ModelCheckpoint):
-    """``last.ckpt``, after every epoch: what to resume from.
-
-    Args:
-        folder: Where it goes.
-    """
-
-    def __init__(self, folder: str) -> None:
-        super().__init__(folder, "last", enable_version_counter=False)
+        """Save when it is time, right after an optimiser step."""
+        step = trainer.global_step
+        if (batch_idx + 1) % trainer.accumulate_grad_batches and not trainer.is_last_batch:
+            return  # a gradient that is being accumulated is in no checkpoint
+        if self.every_n_steps and step % self.every_n_steps == 0 and step != self._saved_at:
+            self._saved_at = step
+            trainer.save_checkpoint(Path(str(self.dirpath)) / "last.ckpt", weights_only=False)
 
 
 class BestCheckpoint(ModelCheckpoint):

@@ -5,23 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from lightning import LightningModule
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from saunet.checks import ConfigError
 from saunet.geometry import warp
 from saunet.geometry.depth import disparity_to_depth
+from saunet.lit.health import health
 from saunet.lit.optim import Recipe
+from saunet.lit.speed import Speed
+from saunet.lit.trained import TrainedModule
 from saunet.losses.base import Objective
 from saunet.metrics.depth import DepthMetrics
 from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
 
 
-class SelfSupervisedDepth(LightningModule):
+class SelfSupervisedDepth(TrainedModule):
     """Depth and pose networks trained together on video by view synthesis (SAU-Net section III).
 
     Args:
@@ -33,6 +34,7 @@ class SelfSupervisedDepth(LightningModule):
         metrics: Scores validation batches that have ground truth.
         seed: With step and process, all that dropped paths and tie-break noise depend on.
         record: Plain data stored in every checkpoint under ``"saunet"``; `saunet.load` rebuilds the networks from it.
+        speed: Speed switches.
     """
 
     def __init__(
@@ -44,35 +46,37 @@ class SelfSupervisedDepth(LightningModule):
         metrics: DepthMetrics | None = None,
         seed: int = 0,
         record: Mapping[str, Any] | None = None,
+        speed: Speed | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(recipe, speed, seed, record)
         self.depth = depth
         self.pose = pose
         self.objective = objective
         self.metrics = metrics if metrics is not None else DepthMetrics()
-        self.recipe = recipe if recipe is not None else Recipe()
-        self.seed = seed
-        self.record = dict(record or {})
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> DepthPyramid:
         """Return the depth of images in [0, 1]."""
         pyramid: DepthPyramid = self.depth(image)
         return pyramid
 
-    def on_train_batch_start(self, batch: TrainBatch, batch_idx: int) -> None:
-        """Make the step's randomness a function of seed, step and process: a resumed run draws what it would have."""
-        place = [self.seed, self.global_step, self.global_rank]
-        torch.manual_seed(int(np.random.SeedSequence(place).generate_state(1)[0]))
-
     def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
         """Return the loss of one batch, eq. (14)."""
-        terms = self.step(batch)[-1]
+        pyramid, poses, _, terms = self.predict_and_compare(batch)
         self.log_dict(terms.named("train"), prog_bar=False, batch_size=len(batch["name"]))
+        figures = health(pyramid, poses, terms, float(getattr(self.depth, "max_depth", torch.inf)))
+        self.log_dict({f"health/{name}": value for name, value in figures.items()}, batch_size=len(batch["name"]))
         self.log("train/lr", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=len(batch["name"]))
         self.log("loss", terms.total.detach(), prog_bar=True, logger=False, batch_size=len(batch["name"]))
         return terms.total
 
     def step(self, batch: TrainBatch) -> tuple[DepthPyramid, tuple[View, ...], LossTerms]:
+        """Return depth, the sources warped into the target, and the loss of a batch."""
+        pyramid, _, views, terms = self.predict_and_compare(batch)
+        return pyramid, views, terms
+
+    def predict_and_compare(
+        self, batch: TrainBatch
+    ) -> tuple[DepthPyramid, Float[Tensor, "b s 4 4"], tuple[View, ...], LossTerms]:
         """Predict depth and motion, synthesise the target from its neighbours, and compare."""
         pyramid: DepthPyramid = self.depth(batch["target"])  # Z_t
         poses = self.motion(batch)  # D_{t->t'}
@@ -80,7 +84,7 @@ class SelfSupervisedDepth(LightningModule):
         if self.objective.needs_source_depth:
             batch = {**batch, "source_depth": self._source_depth(batch)}
         terms: LossTerms = self.objective(batch, pyramid, poses, views)  # alpha L1 + beta L2, eq. (14)
-        return pyramid, views, terms
+        return pyramid, poses, views, terms
 
     def motion(self, batch: TrainBatch) -> Float[Tensor, "b s 4 4"]:
         """Return T_src_tgt of each source: predicted for neighbours in time, known for a stereo partner, the last."""
@@ -144,13 +148,3 @@ class SelfSupervisedDepth(LightningModule):
             self.log_dict(named)
             self.log("abs_rel", named["val/abs_rel"], prog_bar=True, logger=False)
         self.metrics.reset()
-
-    def configure_optimizers(self) -> Any:
-        """Return Adam over both networks with the recipe's schedule."""
-        total = self.trainer.estimated_stepping_batches
-        trainable = (parameter for parameter in self.parameters() if parameter.requires_grad)
-        return self.recipe.configure(trainable, int(total))
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Store the plain record from which the networks are rebuilt."""
-        checkpoint["saunet"] = self.record

@@ -1,0 +1,59 @@
+"""Sweeps: one failed job costs no other, and at the end every failure is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from saunet.lit.run_record import FILE, mark_lost, read
+
+_folders: list[Path] = []
+
+
+class NoteFolder(Callback):
+    """Note where a sweep puts its jobs; they may run in other processes."""
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Note the folder before the first job starts."""
+        _folders[:] = [Path(str(config.hydra.sweep.dir)).resolve()]
+
+
+def swept_folder() -> Path | None:
+    """Return the folder of the sweep that this process started, if it did, and forget it."""
+    return _folders.pop() if _folders else None
+
+
+def summary(folder: Path) -> tuple[str, bool]:
+    """Say how the jobs of a sweep ended, one line for each that did not finish; jobs that vanished are marked failed.
+
+    Args:
+        folder: The sweep's folder, with one ``run.json`` in each job's.
+
+    Returns:
+        The text, and whether all jobs finished.
+    """
+    jobs = {path.parent: path for path in sorted(folder.glob(f"**/{FILE}"), key=_in_order)}
+    lines, finished = [], 0
+    for job in jobs:
+        mark_lost(job)
+        content = read(job) or {}
+        if content.get("status") == "finished":
+            finished += 1
+        else:
+            reason = content.get("error") or "its record cannot be read"
+            lines.append(f"  {job.relative_to(folder)} ({_overrides(job)}) {content.get('status', 'failed')}: {reason}")
+    head = f"sweep: {finished} of {len(jobs)} jobs finished; results: {folder}"
+    return "\n".join([head, *lines]), finished == len(jobs)
+
+
+def _in_order(path: Path) -> tuple[int, str]:
+    name = path.parent.name
+    return (int(name) if name.isdecimal() else -1, str(path))
+
+
+def _overrides(job: Path) -> str:
+    path = job / ".hydra" / "overrides.yaml"
+    return ", ".join(str(each) for each in OmegaConf.load(path)) if path.is_file() else "overrides unknown"

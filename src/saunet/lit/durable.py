@@ -1,0 +1,173 @@
+"""Ends in good order: a run that is asked to stop saves first, and one that loses a process says so and ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from subprocess import Popen
+from types import FrameType
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.fabric.plugins.environments import LightningEnvironment
+from torch import distributed
+
+from saunet.checks import SaunetError, positive
+from saunet.lit.run_record import Stopped, mark_lost
+
+LAST = "last.ckpt"
+
+
+def way_on(folder: str | Path) -> str:
+    """Return how a run with this checkpoint folder is continued, as the end of a sentence."""
+    last = Path(folder) / LAST
+    return f"go on with resume={last}" if last.is_file() else "no checkpoint was written yet, so start again"
+
+
+class GracefulStop(Callback):
+    """On SIGTERM, Ctrl-C, or a batch system's SIGUSR1: finish the step, save ``last.ckpt``, end with a message.
+
+    All processes of a run stop after the same step, whichever of them was asked. A second Ctrl-C ends at once. During
+    validation, that is finished first.
+
+    Args:
+        folder: Where ``last.ckpt`` goes.
+        every_n_steps: How often several processes ask each other.
+    """
+
+    def __init__(self, folder: str, every_n_steps: int = 4) -> None:
+        self.folder = Path(folder)
+        self.every_n_steps = int(positive("every_n_steps", every_n_steps))
+        self.received: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Listen, in place of the trainer, which would stop between two steps without saving."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        wanted = [signal.SIGTERM, signal.SIGINT]
+        if "SLURM_JOB_ID" in os.environ and hasattr(signal, "SIGUSR1"):
+            wanted.append(signal.SIGUSR1)
+        self._before = {number: signal.signal(number, self._receive) for number in wanted}
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Stop if anybody was asked to, where no accumulated gradient is lost."""
+        accumulated = trainer.accumulate_grad_batches
+        if (batch_idx + 1) % accumulated and not trainer.is_last_batch:
+            return
+        number = self.received or 0
+        if trainer.world_size > 1:
+            if (batch_idx + 1) % (self.every_n_steps * accumulated):
+                return
+            asked = torch.tensor(number, device=pl_module.device)
+            distributed.all_reduce(asked, distributed.ReduceOp.MAX)
+            number = int(asked)
+        if not number:
+            return
+        self._restore()
+        trainer.save_checkpoint(self.folder / LAST, weights_only=False)
+        name = signal.Signals(number).name
+        message = f"stopped by {name} after step {trainer.global_step}, everything is saved; {way_on(self.folder)}"
+        # Where one process starts the others, it takes a bad end of theirs for a crash.
+        raise Stopped(message, 128 + number if trainer.is_global_zero else 0)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Listen no longer."""
+        self._restore()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Listen no longer."""
+        self._restore()
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if self.received == signal.SIGINT == number:
+            raise KeyboardInterrupt
+        self.received = number
+        print(f"\n{signal.Signals(number).name}: finishing the step, then saving", file=sys.stderr, flush=True)
+
+    def _restore(self) -> None:
+        before, self._before = self._before, {}
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class ProcessWatch(Callback):
+    """End the whole run with one sentence when one of its processes dies, instead of waiting for it for ever.
+
+    For runs whose processes the trainer starts (``trainer=ddp``); torchrun and SLURM look after theirs themselves.
+
+    Args:
+        folder: The run's folder, whose record is told.
+        checkpoints: Where ``last.ckpt`` is.
+    """
+
+    def __init__(self, folder: str, checkpoints: str) -> None:
+        self.folder, self.checkpoints = Path(folder), Path(checkpoints)
+        self._thread: threading.Thread | None = None
+        self._own_end = False
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Begin to watch: the first process its children, the children their parent."""
+        started: list[Popen[bytes]] = list(getattr(trainer.strategy.launcher, "procs", None) or [])
+        if started:
+            _silence_lightnings_watch()
+            self._thread = threading.Thread(target=self._watch_children, args=(started,), daemon=True)
+        elif (
+            isinstance(getattr(trainer.strategy, "cluster_environment", None), LightningEnvironment)
+            and int(os.environ.get("LOCAL_RANK", "0")) > 0
+        ):
+            self._thread = threading.Thread(target=self._watch_parent, args=(os.getppid(),), daemon=True)
+        if self._thread is not None:
+            self._thread.start()
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Watch no longer."""
+        self._own_end = True
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Let the watch speak if what went wrong here is only that another process is gone."""
+        if isinstance(exception, SaunetError | SystemExit | KeyboardInterrupt):
+            self._own_end = True
+        elif self._thread is not None:
+            self._thread.join(timeout=3)
+            self._own_end = True
+
+    def _watch_children(self, started: list[Popen[bytes]]) -> None:
+        while not self._own_end:
+            for rank, process in enumerate(started, start=1):
+                code = process.poll()
+                if code:
+                    time.sleep(1 if code > 0 else 0)  # what ended a child by itself may be ending this process too
+                    if self._own_end:
+                        return
+                    how = f"was killed (signal {-code})" if code < 0 else f"ended with code {code}, see its message"
+                    self._end(f"process {rank} of {len(started) + 1} {how}, so the run ends", started)
+            time.sleep(0.2)
+
+    def _watch_parent(self, parent: int) -> None:
+        while not self._own_end:
+            if os.getppid() != parent:
+                self._end("the first process of the run is gone, so the run ends", [])
+            time.sleep(0.2)
+
+    def _end(self, reason: str, started: list[Popen[bytes]]) -> None:
+        sentence = f"{reason}; {way_on(self.checkpoints)}"
+        mark_lost(self.folder, sentence)
+        print(f"\nsaunet-train: {sentence}", file=sys.stderr, flush=True)
+        for process in started:
+            process.kill()
+        os._exit(1)  # the main thread waits inside a collective call, which no exception reaches
+
+
+def _silence_lightnings_watch() -> None:
+    """Keep Lightning's own watch from killing this process before it has said why."""
+    for thread in threading.enumerate():
+        if thread.name == "child-process-observer":
+            thread._child_processes = []  # type: ignore[attr-defined]

@@ -1,0 +1,102 @@
+"""A monitor that says when the loader holds the training back, and by how much."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.utilities import rank_zero_info
+
+from saunet.checks import in_range, positive
+
+
+@dataclass(frozen=True, slots=True)
+class Loading:
+    """How fast images came and how fast they could have been used, over some steps of one process."""
+
+    images: int
+    seconds: float
+    waited: float
+
+    @property
+    def share(self) -> float:
+        """Part of the time that was spent waiting for the loader."""
+        return self.waited / self.seconds if self.seconds > 0 else 0.0
+
+    @property
+    def reached(self) -> float:
+        """Images a second that arrived."""
+        return self.images / self.seconds if self.seconds > 0 else 0.0
+
+    @property
+    def needed(self) -> float:
+        """Images a second that the model could use if none were waited for."""
+        return self.images / max(self.seconds - self.waited, 1e-9)
+
+
+class LoaderMonitor(Callback):
+    """Log the loader's images a second and its share of the time, and say once when it is the bottleneck.
+
+    The first steps, in which worker processes start, are left out. Time that the loader needs beside a busy device
+    costs nothing and is not counted: only what the training step waits for is.
+
+    Args:
+        every_n_steps: Steps over which is measured.
+        share: Part of the time from where the loader is called a bottleneck.
+    """
+
+    def __init__(self, every_n_steps: int = 50, share: float = 0.1) -> None:
+        self.every_n_steps = int(positive("every_n_steps", every_n_steps))
+        self.share = in_range("share", share, 0, 1)
+        self._since: tuple[float, float] | None = None
+        self._images = self._steps = 0
+        self._said = False
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Measure no pauses between epochs."""
+        self._since = None
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Count, and report when the window is full."""
+        waited = getattr(trainer.train_dataloader, "waited", None)
+        if waited is None:
+            return
+        now = time.monotonic()
+        if self._since is None:
+            self._since, self._images, self._steps = (now, waited), 0, 0
+            return
+        self._images += _images(batch)
+        self._steps += 1
+        if self._steps < self.every_n_steps:
+            return
+        loading = Loading(self._images, now - self._since[0], waited - self._since[1])
+        self._since = None
+        self.log_dict({"loader/images_per_second": loading.reached, "loader/share": loading.share}, batch_size=1)
+        if loading.share > self.share and not self._said:
+            self._said = True
+            rank_zero_info(sentence(loading, trainer))
+
+
+def sentence(loading: Loading, trainer: Trainer) -> str:
+    """Say that the loader is the bottleneck, with its figures and what to do."""
+    workers = getattr(trainer.train_dataloader, "num_workers", 0)
+    cores = os.cpu_count() or 1
+    each = " on this process" if trainer.world_size > 1 else ""
+    advice = f"raise data.workers (now {workers}, the machine has {cores} cores), or " if workers < cores else ""
+    return (
+        f"the loader is the bottleneck: {loading.reached:.0f} images/s arrive{each} and the model could use "
+        f"{loading.needed:.0f} ({loading.share:.0%} of the time is spent waiting); {advice}load smaller files made "
+        "once with saunet-prepare"
+    )
+
+
+def _images(batch: Mapping[str, Any]) -> int:
+    """Return how many images were read for a batch: targets and sources."""
+    sources = batch["sources"]
+    return int(sources.shape[0] * (1 + sources.shape[1]))

@@ -1,0 +1,77 @@
+"""Where a training starts from: nowhere, the weights of another model, or the middle of itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import nn
+
+from saunet.checkpoint import load_weights, read_checkpoint
+from saunet.checks import CheckpointError, ConfigError
+from saunet.lit.module import SelfSupervisedDepth
+
+
+def resume_path(resume: str | None, output_dir: str | Path, init_from: str | None = None) -> str | None:
+    """Return the checkpoint to go on from, or None.
+
+    Args:
+        resume: A path; ``auto`` for ``checkpoints/last.ckpt`` in the run's own folder, if there is one; or None.
+        output_dir: The run's folder.
+        init_from: What the config gives for a warm start, which cannot be combined with a path.
+
+    Raises:
+        ConfigError: if both are given.
+    """
+    if resume == "auto":
+        last = Path(output_dir) / "checkpoints" / "last.ckpt"
+        return str(last.resolve()) if last.is_file() else None
+    if resume and init_from:
+        raise ConfigError(
+            "resume= and init_from= are both set; resume= goes on with a training, init_from= starts a new one from "
+            "its weights: leave one out"
+        )
+    return str(Path(resume).expanduser().resolve()) if resume else None
+
+
+def check_resume(model: SelfSupervisedDepth, path: str) -> None:
+    """Check that a training can go on from a checkpoint, before the trainer finds out in its own words.
+
+    Raises:
+        CheckpointError: if the file cannot be read or belongs to another model or other data.
+    """
+    checkpoint = read_checkpoint(path)
+    checkpoint.record.check_same_training(model.record)
+    load_weights(model.depth, checkpoint.weights("depth"), "depth network")
+    if model.pose is not None:
+        load_weights(model.pose, checkpoint.weights("pose"), "pose network")
+
+
+def warm_start(model: SelfSupervisedDepth, path: str | Path) -> str:
+    """Give a new training the weights of a checkpoint, as many as fit by name and shape.
+
+    Args:
+        model: The training.
+        path: A checkpoint of any saunet model.
+
+    Returns:
+        One sentence that says what was taken.
+
+    Raises:
+        CheckpointError: if the file cannot be read, or nothing of its depth network fits.
+    """
+    checkpoint = read_checkpoint(Path(path).expanduser())
+    parts: list[tuple[str, nn.Module | None]] = [("depth", model.depth), ("pose", model.pose)]
+    counts = []
+    for name, network in parts:
+        if network is None:
+            continue
+        own, given = network.state_dict(), checkpoint.weights(name)
+        fitting = {key: given[key] for key in own if key in given and given[key].shape == own[key].shape}
+        if name == "depth" and not fitting:
+            raise CheckpointError(
+                f"nothing of {path} fits the depth network (it has '{next(iter(given), 'no weights')}' where the model "
+                f"has '{next(iter(own))}'); choose the same model/encoder and model/decoder"
+            )
+        network.load_state_dict(fitting, strict=False)
+        counts.append(f"{len(fitting)} of {len(own)} tensors of the {name} network")
+    return f"starting from {path}: {', '.join(counts)}"

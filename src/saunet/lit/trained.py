@@ -1,0 +1,119 @@
+"""What any training needs beside its step: seeds, optimiser, averaged and frozen weights, what a checkpoint holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from lightning import LightningModule
+from lightning.pytorch.trainer.states import TrainerFn
+from lightning.pytorch.utilities import rank_zero_info
+from torch import Tensor
+
+from saunet.lit.averaging import WeightAverage
+from saunet.lit.optim import Recipe
+from saunet.lit.speed import Speed
+
+
+class TrainedModule(LightningModule):
+    """A module trained by a `Recipe`, that goes on after an interruption as if there had been none.
+
+    Args:
+        recipe: Optimiser and schedule.
+        speed: Speed switches.
+        seed: With step and process, all that dropped paths and tie-break noise depend on.
+        record: Plain data stored in every checkpoint under ``"saunet"``; `saunet.load` rebuilds the networks from it.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe | None = None,
+        speed: Speed | None = None,
+        seed: int = 0,
+        record: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.recipe = recipe if recipe is not None else Recipe()
+        self.speed = speed if speed is not None else Speed()
+        self.seed = seed
+        self.record = dict(record or {})
+        self.average: WeightAverage | None = None
+        self._loaded_average: dict[str, Tensor] | None = None
+        self._prepared = False
+
+    def setup(self, stage: str) -> None:
+        """Freeze and switch on what the config asks for, once, in the process that trains."""
+        if self._prepared:
+            return
+        self._prepared = True
+        for part in self.recipe.frozen(self):
+            part.requires_grad_(False)
+        self.speed.apply(self)
+
+    def train(self, mode: bool = True) -> TrainedModule:
+        """Change between training and evaluation; frozen parts stay in evaluation."""
+        super().train(mode)
+        for part in self.recipe.frozen(self) if mode and self._prepared else ():
+            part.eval()
+        return self
+
+    def on_fit_start(self) -> None:
+        """Begin or take up the average of the weights, on the training device."""
+        if self.recipe.ema > 0:
+            self.average = WeightAverage(self, self.recipe.ema, self._loaded_average)
+        self._loaded_average = None
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        """Make the step's randomness a function of seed, step and process: a resumed run draws what it would have."""
+        micro = batch_idx % self.trainer.accumulate_grad_batches  # else accumulated batches would all draw the same
+        place = [self.seed, self.global_step, self.global_rank, micro]
+        torch.manual_seed(int(np.random.SeedSequence(place).generate_state(1)[0]))
+
+    def optimizer_step(
+        self,
+        epoch: int,
+        batch_idx: int,
+        optimizer: Any,
+        optimizer_closure: Callable[[], Any] | None = None,
+    ) -> None:
+        """Take one step, then move the average."""
+        super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
+        if self.average is not None:
+            self.average.update(self.global_step)
+
+    def on_validation_start(self) -> None:
+        """Validate the average, if there is one."""
+        if self.average is not None:
+            self.average.put_in()
+
+    def on_validation_end(self) -> None:
+        """Go on training the weights themselves."""
+        if self.average is not None:
+            self.average.put_back()
+
+    def configure_optimizers(self) -> Any:
+        """Return the recipe's optimiser over all that is trained, and its schedule."""
+        return self.recipe.configure(self.recipe.groups(self), int(self.trainer.estimated_stepping_batches))
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Store the record from which the networks are rebuilt, the recipe, and both kinds of weights."""
+        checkpoint["saunet"] = self.record
+        training: dict[str, Any] = {"recipe": self.recipe.to_plain()}
+        if self.average is not None:
+            training["weights"] = self.average.training_weights()
+            checkpoint["state_dict"] = {**checkpoint["state_dict"], **self.average.values}
+        checkpoint["saunet_training"] = training
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take up the weights that were trained, and the average apart; say what becomes of a changed recipe."""
+        if self._trainer is None or self.trainer.state.fn != TrainerFn.FITTING:
+            return
+        training = checkpoint.get("saunet_training", {})
+        if "weights" in training:
+            self._loaded_average = dict(checkpoint["state_dict"])
+            checkpoint["state_dict"] = {**checkpoint["state_dict"], **training["weights"]}
+        sentence = self.recipe.resumed_from(training.get("recipe", {}))
+        if sentence:
+            rank_zero_info(sentence)
