@@ -87,20 +87,27 @@ class CheckpointSubject(Subject):
         record = checkpoint.record
         fixed = {"height": record.height, "width": record.width}
         super().__init__(cfg, {**fixed, "offsets": list(record.offsets)} if record.pose else fixed)
-        self.device = pick_device(cfg.device)
+        self.device, self.record = pick_device(cfg.device), record
         network, pose = checkpoint.networks()
-        self.network = network.to(self.device)
+        self.network: Any = network.to(self.device)
         self.motion = PoseNetwork(pose.to(self.device)) if pose is not None else None
+        self.scale: dict[str, Any] | None = None
 
     def predictor(self, data: Any) -> tuple[str, Any]:
         """Return the depth network, with Monodepth's blend of two flips if that is wanted."""
+        from saunet.cli._scale import apply_scale
         from saunet.evaluation import NetworkPredictor
 
+        if self.scale is None:  # once: other ground truth is of the same images
+            pose = self.motion.network if self.motion else None
+            self.network, pose, self.scale = apply_scale(self.cfg, self.record, self.network, pose, data)
+            if self.motion:
+                self.motion.network = pose
         return "model", NetworkPredictor(self.network, flip=self.cfg.flip)
 
     def settings(self) -> dict[str, object]:
         """Return the checkpoint's path too."""
-        return {"checkpoint": str(self.cfg.checkpoint), **super().settings()}
+        return {"checkpoint": str(self.cfg.checkpoint), **super().settings(), "scale": self.scale}
 
 
 class ForeignSubject(Subject):
@@ -111,6 +118,8 @@ class ForeignSubject(Subject):
         super().__init__(cfg, {"batch_size": 1})
         if cfg.flip:
             raise ConfigError("flip=true blends two predictions of a model; leave it out with predictions=...")
+        if cfg.scale.method != "auto":
+            raise ConfigError("scale.method measures the scale of a model; leave it out with predictions=...")
 
     def predictor(self, data: Any) -> tuple[str, Any]:
         """Return the reader of the files, in the order in which the split lists its images."""

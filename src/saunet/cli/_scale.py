@@ -1,0 +1,171 @@
+"""Metric scale on the command line: what ``scale.method`` asks for, measured, reported, applied and stored."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from saunet.checks import ConfigError, one_of, positive
+from saunet.config import SCALE_METHODS
+
+
+def apply_scale(cfg: DictConfig, record: Any, network: Any, pose: Any, data: Any) -> tuple[Any, Any, dict[str, Any]]:
+    """Return depth and pose network with the scale applied that ``cfg.scale`` asks for, and what to report of it.
+
+    Args:
+        cfg: The root of ``saunet-evaluate``.
+        record: The model's record; it may store a scale.
+        network: The depth network, on its device.
+        pose: The pose network, on its device, or None.
+        data: The data module, set up.
+
+    Raises:
+        ConfigError: if the method is unknown or lacks what it needs.
+        DataError: if no frame could be measured.
+    """
+    from saunet.data.partners import measured_distance
+    from saunet.data.surroundings import mounting_height, surroundings
+    from saunet.scale import METHODS, MetricDepth, MetricMotion, estimate_scale
+    from saunet.scale.speeds import read_speeds
+
+    method, scale = _check(cfg), record.scale
+    if method in METHODS:
+        device = next(network.parameters()).device
+        odometer: Any = measured_distance
+        if cfg.scale.speeds:
+            table = read_speeds(cfg.scale.speeds, cfg.scale.fps or 10.0)
+            odometer = lambda drive, first, second: table.distance(drive.name, first, second)  # noqa: E731
+        batches = surroundings(
+            data,
+            cfg.split,
+            device,
+            offsets=record.offsets if method == "speed" else (),
+            stereo=method == "stereo",
+            odometer=odometer if method == "speed" else None,
+            most=cfg.scale.frames,
+        )
+        height = mounting_height(data) if cfg.scale.camera_height is None else cfg.scale.camera_height
+        network.eval()
+        estimate = estimate_scale(method, batches, lambda image: network(image).depth[0], pose, height)
+        scale = _report(cfg, estimate, Path(cfg.output_dir))
+    scale = _chosen(method, scale)
+    if scale is None:
+        return network, pose, {"method": method, "factor": None}
+    measured = estimate.as_json() if method in METHODS else {"source": scale.source, "factor": scale.factor}
+    measured.pop("per_frame", None)  # scale.json has it
+    motion = None if pose is None else MetricMotion(pose, scale)
+    return MetricDepth(network, scale), motion, {"method": method, **measured}
+
+
+def scale_predictor(cfg: DictConfig, predictor: Any) -> None:
+    """Give a predictor the scale that ``cfg.scale`` asks for; report what was measured.
+
+    Args:
+        cfg: The root of ``saunet-predict``.
+        predictor: An `ImagePredictor`; its own scale is the stored one.
+
+    Raises:
+        ConfigError: if the method is unknown or lacks what it needs.
+        DataError: if no frame could be measured.
+    """
+    from saunet.scale import METHODS, estimate_scale
+
+    method = _check(cfg)
+    if method in METHODS:
+        import torch
+
+        def depth(image: Any) -> Any:
+            return 1 / torch.from_numpy(predictor.disparity(image.numpy()))[:, None]
+
+        pose, offsets = _pose(cfg) if method == "speed" else (None, ())
+        with _clip_batches(cfg, predictor, method, offsets) as batches:
+            estimate = estimate_scale(method, batches, depth, pose, cfg.scale.camera_height)
+        predictor.scale = _report(cfg, estimate, Path(cfg.output))
+    predictor.scale = _chosen(method, predictor.scale)
+
+
+@contextlib.contextmanager
+def _clip_batches(cfg: DictConfig, predictor: Any, method: str, offsets: Any) -> Iterator[Any]:
+    from saunet.infer.clips import open_clip
+    from saunet.infer.pointcloud import Camera
+    from saunet.scale.clips import clip_batches
+    from saunet.scale.speeds import read_speeds
+
+    options: dict[str, Any] = {"offsets": offsets, "most": cfg.scale.frames}
+    with contextlib.ExitStack() as stack:
+        clip = open_clip(cfg.input)
+        stack.callback(clip.close)
+        if method != "speed":
+            needed = _needed(cfg.camera, "camera", method, "fx,fy,cx,cy in pixels of the images")
+            first = next(iter(clip))
+            camera = Camera.from_numbers(list(needed), *first.shape[:2])
+            clip = open_clip(cfg.input)
+            stack.callback(clip.close)
+            options["intrinsics"] = lambda height, width: camera.resized(height, width).K
+        if method == "speed":
+            path = _needed(cfg.scale.speeds, "scale.speeds", method, "a CSV file with the columns frame,speed")
+            table = read_speeds(path, cfg.scale.fps or clip.fps)
+            options["distance"] = lambda first, second: table.distance("", first, second)
+        if method == "stereo":
+            other = open_clip(_needed(cfg.scale.partner, "scale.partner", method, "the other camera's images"))
+            stack.callback(other.close)
+            options["partner"] = other
+            options["baseline"] = _needed(cfg.scale.baseline, "scale.baseline", method, "metres to the right camera")
+        yield clip_batches(clip, predictor.height, predictor.width, count=clip.declared, **options)
+
+
+def _pose(cfg: DictConfig) -> tuple[Any, Any]:
+    from saunet.checkpoint import read_checkpoint
+
+    checkpoint = read_checkpoint(cfg.checkpoint)
+    pose = checkpoint.networks()[1]
+    return (None, ()) if pose is None else (pose.eval(), checkpoint.record.offsets)
+
+
+def _check(cfg: DictConfig) -> str:
+    from saunet.scale import METHODS
+
+    method = one_of("scale.method", cfg.scale.method, SCALE_METHODS)
+    positive("scale.frames", cfg.scale.frames)
+    if cfg.scale.store and method not in METHODS:
+        raise ConfigError(
+            f"scale.store=true stores what is measured and scale.method is '{method}'; "
+            f"set scale.method to one of {', '.join(METHODS)}"
+        )
+    return method
+
+
+def _chosen(method: str, scale: Any) -> Any:
+    if method == "none":
+        return None
+    if method == "stored" and scale is None:
+        raise ConfigError(
+            "scale.method=stored and the checkpoint stores no scale; measure one, "
+            "such as with scale.method=camera_height, and keep it with scale.store=true"
+        )
+    return scale
+
+
+def _needed(value: Any, key: str, method: str, what: str) -> Any:
+    if value is None:
+        raise ConfigError(f"scale.method={method} needs {key}: {what}")
+    return value
+
+
+def _report(cfg: DictConfig, estimate: Any, folder: Path) -> Any:
+    from saunet.atomic import write_bytes
+    from saunet.checkpoint import store_scale
+
+    print(estimate)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_bytes(folder / "scale.json", (json.dumps(estimate.as_json(), indent=2) + "\n").encode())
+    scale = estimate.scale()
+    if cfg.scale.store:
+        store_scale(cfg.checkpoint, scale)
+        print(f"stored in {cfg.checkpoint}")
+    return scale

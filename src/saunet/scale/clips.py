@@ -1,0 +1,93 @@
+"""Frames of a folder or video as the batches from which the scale is measured."""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from numpy.typing import NDArray
+
+from saunet.checks import DataError
+from saunet.images import network_input
+from saunet.types import TrainBatch
+
+Image = UInt8[np.ndarray, "_ _ 3"]
+
+
+def clip_batches(
+    frames: Iterable[Image],
+    height: int,
+    width: int,
+    *,
+    offsets: Sequence[int] = (),
+    distance: Callable[[int, int], float] | None = None,
+    intrinsics: Callable[[int, int], NDArray[np.float64]] | None = None,
+    partner: Iterable[Image] | None = None,
+    baseline: float = 0.0,
+    count: int | None = None,
+    most: int = 100,
+) -> Iterator[TrainBatch]:
+    """Yield frames of a clip one by one as a network wants them, with neighbours, intrinsics and partner as asked for.
+
+    Args:
+        frames: RGB bytes in the order of time.
+        height: Height of the network's input.
+        width: Width of the network's input.
+        offsets: Time offsets of the sources.
+        distance: Gives the metres travelled between two frames by their numbers, NaN where unknown.
+        intrinsics: Gives K, 3 x 3, in pixels of an image of the given height and width.
+        partner: The other camera's frames, one for each.
+        baseline: Metres from the camera to its partner, positive if that is the right one.
+        count: How many frames there are, where known.
+        most: Of more frames, only so many are used, evenly spread if ``count`` is known.
+
+    Raises:
+        DataError: if there are more frames of one camera than of the other.
+    """
+    before, after = -min(0, *offsets, 0), max(0, *offsets, 0)
+    step = max(1, (count - before - after) // most) if count else 1
+    window: deque[NDArray[np.float32]] = deque(maxlen=before + 1 + after)
+    yielded = 0
+    pairs = itertools.zip_longest(frames, () if partner is None else partner)
+    others: deque[Image | None] = deque(maxlen=after + 1)
+    for number, (frame, other) in enumerate(pairs):
+        if frame is None or (partner is not None and other is None):
+            raise DataError(
+                f"the two cameras have different numbers of images (one ends after {number}); give pairs of one moment"
+            )
+        window.append(network_input(frame, height, width))
+        others.append(other)
+        target = number - after
+        if len(window) < before + 1 + after or (target - before) % step:
+            continue
+        sources = [window[before + offset] for offset in offsets]
+        batch: TrainBatch = {
+            "target": _tensor(window[before]),
+            "sources": torch.zeros(1, 0, 3, height, width),
+            "loss_target": _tensor(window[before]),
+            "loss_sources": torch.zeros(1, 0, 3, height, width),
+            "K": torch.eye(3)[None],
+            "name": [f"frame {target}"],
+        }
+        if intrinsics is not None:
+            batch["K"] = torch.from_numpy(intrinsics(height, width)).float()[None]
+        if distance is not None:
+            batch["distance"] = torch.tensor([[distance(target, target + offset) for offset in offsets]])
+        if others[0] is not None:
+            sources.append(network_input(others[0], height, width))
+            batch["T_stereo_tgt"] = torch.eye(4)[None]
+            batch["T_stereo_tgt"][0, 0, 3] = -baseline
+        if sources:
+            batch["sources"] = batch["loss_sources"] = torch.from_numpy(np.stack(sources))[None]
+        yield batch
+        yielded += 1
+        if yielded == most:
+            return
+
+
+def _tensor(image: NDArray[np.float32]) -> torch.Tensor:
+    return torch.from_numpy(image)[None]
