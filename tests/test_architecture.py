@@ -54,6 +54,7 @@ ALLOWED: dict[str, set[str]] = {
         "losses.base",
     },
     "benchmarking": {"checks", "atomic"},
+    "scale": {"types", "checks", "geometry", "record", "images"},
     "config": {"registry", "schema", "checks", "lit.optim", "lit.speed"},
 }
 # third-party package -> the rooms that may import it

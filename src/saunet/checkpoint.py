@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ __all__ = [
     "build_networks",
     "load_weights",
     "read_checkpoint",
+    "store_scale",
 ]
 
 
@@ -150,6 +151,18 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         raise CheckpointError(f"{path}: {error}") from error
     state = {str(key): value for key, value in content["state_dict"].items() if isinstance(value, Tensor)}
     return Checkpoint(path, record, state, content.get("epoch"), content.get("global_step"))
+
+
+def store_scale(path: str | Path, scale: Scale) -> None:
+    """Write a measured factor to metres into a checkpoint; everything else in the file stays as it is.
+
+    Raises:
+        CheckpointError: if the file is no saunet checkpoint or cannot be written; it then stays as it was.
+    """
+    read_checkpoint(path)
+    content = _load_plain(Path(path))
+    content["saunet"]["scale"] = asdict(scale)
+    atomic_save(content, path)
 
 
 def atomic_save(obj: Any, path: str | Path) -> None:

@@ -59,6 +59,24 @@ class TrainConfig:
     protocol: str | None = None
 
 
+SCALE_METHODS = ("auto", "none", "stored", "camera_height", "speed", "stereo")
+"""``auto``: the factor stored in the checkpoint, where there is one; the last three measure it."""
+
+
+@dataclass
+class ScaleConfig:
+    """How depth becomes metres without ground truth; see docs/scale.md."""
+
+    method: str = "auto"
+    camera_height: float | None = None
+    speeds: str | None = None
+    fps: float | None = None
+    partner: str | None = None
+    baseline: float | None = None
+    frames: int = 100
+    store: bool = False
+
+
 @dataclass
 class EvaluateConfig:
     """Root of ``saunet-evaluate``: a ``checkpoint``, or ``predictions`` of another system; docs/evaluation.md."""
@@ -72,6 +90,7 @@ class EvaluateConfig:
     split: str = "test"
     flip: bool = False
     baselines: bool = True
+    scale: ScaleConfig = field(default_factory=ScaleConfig)
     buckets: bool = False
     distances: list[float] = field(default_factory=lambda: [0.0, 10.0, 20.0, 30.0, 50.0, 80.0])
     intervals: float | None = 0.95
@@ -94,6 +113,7 @@ class PredictConfig:
     camera: list[float] | None = None
     flip: bool = False
     keep_aspect: bool = False
+    scale: ScaleConfig = field(default_factory=ScaleConfig)
     overwrite: bool = False
     batch_size: int = 1
     device: str = "auto"
@@ -172,6 +192,7 @@ ROOTS = (
     DoctorConfig,
     CalibrateConfig,
     ModelConfig,
+    ScaleConfig,
 )
 """The typed roots, and what lies directly below them."""
 
@@ -179,7 +200,9 @@ ROOTS = (
 def register_configs() -> None:
     """Put the root schemas and every registered component into Hydra's config store."""
     store = ConfigStore.instance()
-    for root in ROOTS[:-1]:
+    for root in ROOTS:
+        if root in (ModelConfig, ScaleConfig):  # parts of roots
+            continue
         store.store(name=f"{root.__name__.removesuffix('Config').lower()}_schema", node=root)
     for registry in REGISTRIES.values():
         if registry.group is None:

@@ -61,6 +61,9 @@ class KittiDataModule(DepthDataModule):
         ConfigError: if a parameter is out of range or a word unknown.
     """
 
+    camera_height = 1.65
+    """Metres from the road to the cameras."""
+
     def __init__(
         self,
         *,

@@ -44,6 +44,8 @@ class KittiOdometryDataModule(DepthDataModule):
     """
 
     neighbours = ("train", "val", "test")
+    camera_height = 1.65
+    """Metres from the road to the cameras."""
 
     def __init__(
         self,
