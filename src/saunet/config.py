@@ -152,7 +152,7 @@ class DoctorConfig:
 class CalibrateConfig:
     """Root of ``saunet-calibrate``; ``columns`` and ``rows`` count the board's squares."""
 
-    input: str = MISSING
+    input: str | None = None
     output: str = "camera.yaml"
     board: str = "chessboard"
     columns: int = 10
