@@ -37,6 +37,7 @@ ALLOWED: dict[str, set[str]] = {
         "checkpoint",
         "geometry",
         "metrics.functional",
+        "metrics.odometry",
         "models.depth",
     },
     "lit": {
@@ -54,7 +55,18 @@ ALLOWED: dict[str, set[str]] = {
         "losses.base",
     },
     "benchmarking": {"checks", "atomic"},
+    "prepare": {"checks", "atomic", "images", "data", "infer"},
     "scale": {"types", "checks", "geometry", "record", "images"},
+    "report": {
+        "checks",
+        "atomic",
+        "images",
+        "checkpoint",
+        "infer",
+        "evaluation",
+        "metrics.functional",
+        "benchmarking.measure",
+    },
     "config": {"registry", "schema", "checks", "lit.optim", "lit.speed"},
 }
 # third-party package -> the rooms that may import it
