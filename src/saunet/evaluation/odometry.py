@@ -89,8 +89,8 @@ def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None 
     Args:
         path: The path.
         snippet: Frames in a snippet; published numbers use 5.
-        lengths: Segment lengths in metres for t_rel and r_rel; by default KITTI's 100 to 800 m, or tenths of the path
-            where it is shorter than 100 m (such numbers compare with no published ones).
+        lengths: Segment lengths in metres for t_rel and r_rel; by default KITTI's 100 to 800 m, or 20 to 80 % of
+            the path where it is shorter than 100 m (such numbers compare with no published ones).
 
     Raises:
         DataError: if there are fewer than two poses.
@@ -98,10 +98,9 @@ def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None 
     true = path.true
     assert true is not None, "errors need the true path"
     metres = float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum())
-    chosen = tuple(lengths or KITTI_LENGTHS)
-    if lengths is None and metres <= min(KITTI_LENGTHS) and metres > 0:
-        tenth = 10 ** math.floor(math.log10(metres / 4))
-        chosen = tuple(tenth * round(metres / 10 / tenth * k) for k in (2, 4, 6, 8) if round(metres / 10 / tenth * k))
+    chosen = tuple(float(length) for length in lengths or KITTI_LENGTHS)
+    if lengths is None and 0 < metres <= min(KITTI_LENGTHS):
+        chosen = tuple(round(share * metres, 1) for share in (0.2, 0.4, 0.6, 0.8))
     snippets = snippet_ate(relative_motions(path.predicted), relative_motions(true), snippet)
     relative = segment_errors(path.aligned, true, chosen, step=10 if len(true) > 100 else 1)
     return PathErrors(

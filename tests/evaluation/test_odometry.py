@@ -1,0 +1,116 @@
+"""Errors of a path in one line, its files and its picture; whole-path numbers against the evo package."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+
+from saunet.evaluation.odometry import Path3d, path_errors, path_table, write_errors, write_path
+from saunet.evaluation.plot import draw_path
+from saunet.evaluation.trajectories import read_kitti, read_tum
+
+
+def winding(frames=120, step=2.0):
+    """A path that needs no random numbers, so that other programs can be given the same."""
+    poses = [np.eye(4)]
+    for i in range(frames - 1):
+        motion = np.eye(4)
+        motion[:3, :3] = Rotation.from_euler("yx", [0.03 * math.sin(0.1 * i), 0.004 * math.cos(0.3 * i)]).as_matrix()
+        motion[:3, 3] = [0.0, 0.0, step]
+        poses.append(poses[-1] @ motion)
+    return np.stack(poses)
+
+
+def predicted(frames=120):
+    """Another scale and world, and a little wrong everywhere."""
+    poses = [np.eye(4)]
+    for i in range(frames - 1):
+        motion = np.eye(4)
+        motion[:3, :3] = Rotation.from_euler("yx", [0.032 * math.sin(0.1 * i + 0.1), 0.0]).as_matrix()
+        motion[:3, 3] = [0.0, 0.001, 0.05 * (1 + 0.2 * math.sin(0.05 * i))]
+        poses.append(poses[-1] @ motion)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.2, -0.5, 0.1]).as_matrix()
+    return turn @ np.stack(poses)
+
+
+def a_path(frames=120):
+    return Path3d("odometry/99 l", predicted(frames), np.arange(frames) * 0.1, winding(frames))
+
+
+def test_whole_path_numbers_are_those_of_evo():
+    """``align(correct_scale=True)`` and the APE of translations of evo 1.38.1 on the same two paths."""
+    errors = path_errors(a_path())
+    assert errors.ate == pytest.approx(5.328228703138327, rel=1e-9)
+    assert errors.scale == pytest.approx(39.336091266249255, rel=1e-9)
+
+
+def test_a_scaled_and_moved_truth_has_no_error():
+    true = winding()
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = Rotation.from_rotvec([0.3, 0.2, -1.0]).as_matrix(), [3.0, -2.0, 9.0]
+    other = turn @ true
+    other[:, :3, 3] *= 0.03
+    errors = path_errors(Path3d("x", other, np.arange(120.0), true))
+    assert errors.scale == pytest.approx(1 / 0.03)
+    assert max(errors.snippet_ate, errors.ate, errors.t_rel) < 1e-9
+    assert errors.r_rel < 1e-4
+    assert (errors.frames, errors.metres, errors.snippet) == (120, pytest.approx(238.0), 5)
+    assert errors.lengths == (100, 200, 300, 400, 500, 600, 700, 800)
+
+
+def test_a_short_path_gets_shorter_segments_and_says_so():
+    errors = path_errors(a_path(31))
+    assert errors.metres == pytest.approx(60.0)
+    assert errors.lengths == (12.0, 24.0, 36.0, 48.0)
+    assert errors.segments > 10
+    assert math.isfinite(errors.t_rel)
+    assert path_errors(a_path(31), lengths=[100.0]).segments == 0
+    stream = Console(width=100, record=True, file=io.StringIO())
+    stream.print(path_table([errors]))
+    text = stream.export_text()
+    assert "segments of 12 to 48 m" in text
+    assert "odometry/99 l" in text
+
+
+def test_files_are_read_back(tmp_path):
+    path = a_path(20)
+    write_path(path, tmp_path)
+    for kind, poses in (("predicted", path.predicted), ("aligned", path.aligned), ("true", path.true)):
+        np.testing.assert_allclose(read_kitti(tmp_path / f"{kind}_kitti.txt"), poses, atol=1e-12)
+        again, times = read_tum(tmp_path / f"{kind}_tum.txt")
+        np.testing.assert_allclose(again, poses, atol=1e-12)
+        np.testing.assert_array_equal(times, path.times)
+    write_path(Path3d("no truth", path.predicted, path.times), tmp_path / "alone")
+    assert sorted(file.name for file in (tmp_path / "alone").iterdir()) == ["predicted_kitti.txt", "predicted_tum.txt"]
+
+
+def test_errors_as_json_and_csv(tmp_path):
+    rows = [path_errors(a_path(31)), path_errors(a_path(31), lengths=[100.0])]
+    write_errors(rows, tmp_path, {"checkpoint": "x.ckpt"})
+    content = json.loads((tmp_path / "odometry.json").read_text())
+    assert content["settings"] == {"checkpoint": "x.ckpt"}
+    assert content["results"][0]["ate"] == rows[0].ate
+    assert content["results"][1]["t_rel"] is None
+    with (tmp_path / "odometry.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [row["lengths"] for row in table] == ["12.0 24.0 36.0 48.0", "100.0"]
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_picture_shows_a_path(tmp_path, known):
+    pytest.importorskip("matplotlib")
+    path = a_path(40) if known else Path3d("no truth", predicted(40), np.arange(40.0))
+    draw_path(path, tmp_path / "deep" / "path.png")
+    picture = cv2.imread(str(tmp_path / "deep" / "path.png"))
+    assert picture.shape[0] > 400
+    blue, green, red = (picture[..., k].astype(int) for k in range(3))
+    assert ((red - green > 100) & (red - blue > 100)).sum() > 500  # the predicted path is drawn in red
