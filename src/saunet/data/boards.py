@@ -88,7 +88,7 @@ class Board:
 
     def find(self, image: UInt8[np.ndarray, "h w 3"]) -> BoardView | None:
         """Return the board in an RGB picture; None where it is not, or not enough of it."""
-        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         return self._find_charuco(grey) if self._charuco is not None else self._find_chessboard(grey)
 
     def _find_chessboard(self, grey: NDArray[np.uint8]) -> BoardView | None:

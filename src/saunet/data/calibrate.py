@@ -170,7 +170,7 @@ def _pinhole(views: Sequence[BoardView], size: tuple[int, int]) -> Solution:
         [view.points for view in views],
         [view.pixels for view in views],
         (size[1], size[0]),
-        None,  # type: ignore[arg-type,call-overload]
+        None,  # type: ignore[call-overload]
         None,
     )
     uncertainty = float(np.max(np.ravel(deviations)[:2] / np.array([K[0, 0], K[1, 1]])))
@@ -181,10 +181,9 @@ def _fisheye(views: Sequence[BoardView], size: tuple[int, int]) -> Solution:
     points = [view.points[None].astype(np.float64) for view in views]
     pixels = [view.pixels[None].astype(np.float64) for view in views]
     flags = _flag("CALIB_RECOMPUTE_EXTRINSIC") | _flag("CALIB_FIX_SKEW")
-    K, distortion = np.zeros((3, 3)), np.zeros((4, 1))
     try:
         error, K, distortion, rotations, shifts = cv2.fisheye.calibrate(
-            points, pixels, (size[1], size[0]), K, distortion, flags=flags
+            points, pixels, (size[1], size[0]), np.zeros((3, 3)), np.zeros((4, 1)), flags=flags
         )
     except cv2.error as reason:
         raise DataError(

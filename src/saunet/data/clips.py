@@ -183,7 +183,7 @@ def _decode(
     except OSError as reason:
         raise DataError(
             f"cannot keep the frames of {video} in {folder.parent}: {reason.strerror or reason}; "
-            "set data.cache to a folder with room that can be written"
+            "set data.frames_cache to a folder with room that can be written"
         ) from reason
     finally:
         shutil.rmtree(partial, ignore_errors=True)

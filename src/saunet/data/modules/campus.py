@@ -42,7 +42,7 @@ class CampusDataModule(DepthDataModule):
             altogether; or ``keep`` all and measure nothing.
         crop: Shares to cut off at the [top, bottom, left, right], such as ``[0,0.12,0,0]`` for a bonnet; by default
             those of the camera file.
-        cache: Folder for decoded videos and measurements; by default in the user's cache folder.
+        frames_cache: Folder for decoded videos and measurements; by default in the user's cache folder.
         max_width: Frames of videos are kept at most this wide.
         height: Image height in pixels.
         width: Image width in pixels.
@@ -77,7 +77,7 @@ class CampusDataModule(DepthDataModule):
         parallax: float = 0.0,
         static: Literal["drop", "keep"] = "drop",
         crop: Sequence[float] | None = None,
-        cache: str | None = None,
+        frames_cache: str | None = None,
         max_width: int = 1280,
         height: int = 192,
         width: int = 640,
@@ -114,7 +114,7 @@ class CampusDataModule(DepthDataModule):
         if crop is not None:
             check_crop(crop, "crop", ConfigError)
         self.crop = None if crop is None else tuple(crop)
-        self.cache = default_cache() if cache is None else Path(cache).expanduser()
+        self.frames_cache = default_cache() if frames_cache is None else Path(frames_cache).expanduser()
         self.max_width = int(positive("max_width", max_width))
         self._drives: list[CampusDrive] | None = None
 
@@ -201,7 +201,7 @@ class CampusDataModule(DepthDataModule):
         recording = read_clip(
             clip,
             self.fps,
-            self.cache,
+            self.frames_cache,
             self.max_width,
             lambda done, total: bar.update(task, completed=done, total=total),
         )
@@ -214,7 +214,7 @@ class CampusDataModule(DepthDataModule):
                 recording.paths,
                 crop,
                 skip_unreadable=self.on_error == "skip",
-                cache=self.cache,
+                cache=self.frames_cache,
                 advance=lambda: bar.advance(task),
             )
             bar.update(task, visible=False)

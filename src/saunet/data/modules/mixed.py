@@ -1,0 +1,173 @@
+"""Several data sets as one: trained on together, evaluated together and each by itself."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from saunet.checks import ConfigError
+from saunet.data.module import DepthDataModule
+from saunet.data.windows import Selection
+from saunet.registry import datamodules
+
+SHARED = (
+    "height",
+    "width",
+    "offsets",
+    "batch_size",
+    "workers",
+    "translate",
+    "seed",
+    "target_depth",
+    "with_pose",
+    "stereo",
+)
+"""Settings that belong to the mixture; its sources take them over."""
+
+
+@datamodules.register("mixed")
+class MixedDataModule(DepthDataModule):
+    """Several named data sets as one, such as KITTI and campus clips; all images get one size, each keeps its own K.
+
+    On the command line: ``data=mixed +data@data.sources.town=kitti +data@data.sources.campus=campus`` and then
+    ``data.sources.town.root=...``. What every data set has (size, offsets, batch, augmentation) is set for the mixture.
+
+    Args:
+        sources: Name -> data module; names start the names of samples.
+        train: Names of the sources to train and validate on; all if empty.
+        test: Names of the sources to test and predict; all if empty.
+        height: Image height in pixels.
+        width: Image width in pixels.
+        offsets: Time offsets of the source frames.
+        batch_size: Samples a step over all devices together.
+        workers: Loader processes a device.
+        translate: Frames are loaded this much larger in training (0.1 = 10 %) and a random window is cut.
+        flip: Probability of mirroring in training.
+        colour: Probability of colour jitter in training.
+        seed: Decides order, augmentation, and what the sources hold out at random.
+        target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
+        manifest: Frames to leave out of training and validation, as ``saunet-doctor`` wrote them for the mixture.
+        on_error: A file that cannot be read: ``raise`` stops and names it, ``skip`` names, counts and passes it over.
+
+    Raises:
+        ConfigError: if there is no source, a name is unknown, a source contradicts the mixture, or their ground truths
+            are of different kinds.
+    """
+
+    def __init__(
+        self,
+        *,
+        sources: Mapping[str, Any] | None = None,
+        train: Sequence[str] = (),
+        test: Sequence[str] = (),
+        height: int = 192,
+        width: int = 640,
+        offsets: Sequence[int] = (-1, 1),
+        batch_size: int = 12,
+        workers: int = 4,
+        translate: float = 0.05,
+        flip: float = 0.5,
+        colour: float = 0.5,
+        seed: int = 0,
+        target_depth: bool = False,
+        manifest: str | None = None,
+        on_error: Literal["raise", "skip"] = "raise",
+    ) -> None:
+        super().__init__(
+            height=height,
+            width=width,
+            offsets=offsets,
+            batch_size=batch_size,
+            workers=workers,
+            translate=translate,
+            flip=flip,
+            colour=colour,
+            seed=seed,
+            target_depth=target_depth,
+            manifest=manifest,
+            on_error=on_error,
+        )
+        if not sources:
+            raise ConfigError(
+                "data=mixed has no sources; add them with +data@data.sources.NAME=kitti (or campus, ...) and set "
+                "data.sources.NAME.root"
+            )
+        self.sources: dict[str, DepthDataModule] = {}
+        for name, source in sources.items():
+            if not isinstance(source, DepthDataModule) or isinstance(source, MixedDataModule) or "/" in name:
+                raise ConfigError(
+                    f"data.sources.{name} is {type(source).__name__}; it must be a data module that is no mixture, and "
+                    "its name must not contain '/'"
+                )
+            self.sources[name] = self._fitted(name, source)
+        self._names = {"train": _known("train", train, self.sources), "test": _known("test", test, self.sources)}
+        self.ground_truth, self.protocol = _truth([self.sources[name] for name in self._names["test"]])
+
+    def prepare_data(self) -> None:
+        """Let every source prepare on one process."""
+        for source in self.sources.values():
+            source.prepare_data()
+
+    def select(self, split: str) -> Sequence[Selection]:
+        """Return the frames of all sources that serve a split; a drive's name starts with its source's."""
+        selections = []
+        for name in self._names["train" if split in ("train", "val") else "test"]:
+            source = self.sources[name]
+            for each in source.select(split):
+                selection = Selection(*each)
+                if source.manifest is not None and split in ("train", "val"):
+                    selection = source.manifest.apply(selection, self.offsets if split in self.neighbours else ())
+                drive = copy.copy(selection.drive)
+                drive.name = f"{name}/{selection.drive.name}"
+                selections.append(selection._replace(drive=drive))
+        return selections
+
+    def group(self, sample: str) -> str:
+        """Return the name of the source that a sample comes from, and its part of that source, if it has parts."""
+        name, _, rest = sample.partition("/")
+        part = self.sources[name].group(rest) if name in self.sources else ""
+        return f"{name} {part}".strip()
+
+    def _fitted(self, name: str, source: DepthDataModule) -> DepthDataModule:
+        """Give a source the mixture's settings; refuse those it was given that contradict."""
+        defaults = inspect.signature(type(source)).parameters
+        for key in ("height", "width", "offsets"):
+            given, ours, default = getattr(source, key), getattr(self, key), defaults[key].default
+            if given != ours and given != (tuple(default) if key == "offsets" else default):
+                raise ConfigError(
+                    f"data.sources.{name}.{key} is {given} and the mixture's is {ours}; set data.{key} only, "
+                    "which holds for all sources"
+                )
+        if source.maps or source.copies:
+            raise ConfigError(
+                f"data.sources.{name} reads stored maps or a cache of small images, which a mixture does not; "
+                "leave dense, teacher and cache out"
+            )
+        for key in SHARED:
+            setattr(source, key, getattr(self, key))
+        source.on_error = self.on_error
+        return source
+
+
+def _known(key: str, names: Sequence[str], sources: Mapping[str, Any]) -> tuple[str, ...]:
+    for name in names:
+        if name not in sources:
+            raise ConfigError(f"{key} names the source '{name}'; sources: {', '.join(sources)}")
+    return tuple(names) or tuple(sources)
+
+
+def _truth(sources: Sequence[DepthDataModule]) -> tuple[str, str]:
+    """Return the kind of ground truth of sources that have any, and the protocol for it."""
+    kinds = {source.ground_truth: source.protocol for source in sources if source.ground_truth != "none"}
+    if not kinds:
+        return sources[0].ground_truth, sources[0].protocol
+    if set(kinds) == {"camera_z", "exact"}:  # a renderer's depth is a camera's z
+        return "camera_z", kinds["camera_z"]
+    if len(kinds) > 1:
+        raise ConfigError(
+            f"the sources have ground truth of different kinds ({', '.join(sorted(kinds))}), which no protocol mixes; "
+            "set data.sources.NAME.depth alike, or name the sources to evaluate with data.test"
+        )
+    return next(iter(kinds.items()))
