@@ -33,7 +33,7 @@ def evaluate_model(network: Any, data: Any, protocols: Sequence[str], *, split: 
 
 def evaluate(cfg: DictConfig) -> None:
     """Load what is scored and the data, print the tables, write them to the output folder."""
-    from saunet.evaluation import evaluate_protocols, print_table, with_statistics, write_results
+    from saunet.evaluation import EvaluationResult, evaluate_protocols, print_table, with_statistics, write_results
     from saunet.evaluation.breakdown import Buckets
 
     subject = subject_of(cfg)
@@ -49,6 +49,11 @@ def evaluate(cfg: DictConfig) -> None:
     result = with_statistics(result, cfg.intervals, Path(cfg.compare) if cfg.compare else None)
     result = replace(result, settings=subject.settings())
     print_table(result)
+    for source in cfg.data.get("sources") or {}:  # of a mixture
+        rows = tuple(row for row in result.rows if row.name.startswith(f"{source}/"))
+        if rows:
+            print(f"{source} alone:")
+            print_table(EvaluationResult(result.protocols, result.predictors, rows))
     write_results(result, Path(cfg.output_dir))
     print(f"results: {cfg.output_dir}")
 

@@ -126,10 +126,6 @@ class DepthDataModule(LightningDataModule):
         dataset = self.datasets.get("train")
         return dataset.skipped() if isinstance(dataset, SkippingWindows) else []
 
-    def group(self, sample: str) -> str:
-        """Return which part of the data a sample's name belongs to, for numbers by part; empty where there is one."""
-        return ""
-
     def summary(self, split: str) -> str:
         """Return what a split uses and leaves out, readable, with the fingerprint of its frames."""
         dataset, usage = self.datasets[split], self.usage[split]

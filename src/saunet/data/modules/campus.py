@@ -172,11 +172,6 @@ class CampusDataModule(DepthDataModule):
         unused = len(frames) - len(train) - (0 if named else len(val))
         return self._selections(drives, chosen, split, unused)
 
-    def group(self, sample: str) -> str:
-        """Return the condition that a sample's clip was recorded under."""
-        clip = sample.rpartition(" ")[0]
-        return next((drive.condition or "" for drive in self.drives() if drive.name == clip), "")
-
     def _selections(
         self, drives: dict[str, CampusDrive], chosen: Sequence[Frame], split: str, unused: int
     ) -> list[Selection]:

@@ -124,12 +124,6 @@ class MixedDataModule(DepthDataModule):
                 selections.append(selection._replace(drive=drive))
         return selections
 
-    def group(self, sample: str) -> str:
-        """Return the name of the source that a sample comes from, and its part of that source, if it has parts."""
-        name, _, rest = sample.partition("/")
-        part = self.sources[name].group(rest) if name in self.sources else ""
-        return f"{name} {part}".strip()
-
     def _fitted(self, name: str, source: DepthDataModule) -> DepthDataModule:
         """Give a source the mixture's settings; refuse those it was given that contradict."""
         defaults = inspect.signature(type(source)).parameters
