@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
 pytestmark = pytest.mark.ddp
 
@@ -64,3 +67,66 @@ def test_a_sweep_over_processes_is_refused_with_the_ways_out(tmp_path: Path) -> 
     assert done.returncode == 1
     assert "trainer=ddp_spawn, or one process per job through a Hydra launcher" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+CURVE = Path(__file__).with_name("ddp_curve.py")
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+def _curve(folder: Path, processes: int) -> dict[str, Any]:
+    command = [sys.executable, str(CURVE), str(folder), str(processes), "7", "0"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=400, env=ENVIRONMENT, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    curve: dict[str, Any] = json.loads((folder / "curve.json").read_text())
+    return curve
+
+
+def test_two_processes_have_the_loss_curve_of_one(tmp_path: Path) -> None:
+    one, two = _curve(tmp_path / "one", 1), _curve(tmp_path / "two", 2)
+    assert len(one["losses"]) == 21
+    assert one["losses"][-1] < 0.95 * one["losses"][0]
+    assert two["losses"] == pytest.approx(one["losses"], rel=1e-4)  # sums are taken in another order
+    assert two["metrics"] == pytest.approx(one["metrics"], rel=1e-4)  # of weights that differ by as little
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_killed_process_ends_the_run_with_a_sentence_and_a_checkpoint(victim: int, tmp_path: Path) -> None:
+    command = [sys.executable, str(CURVE), str(tmp_path), "2", "500", "0.02"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=ENVIRONMENT
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            words = line.split()
+            if words[:2] == ["process", str(victim)] and words[-1] == "4":
+                os.kill(int(words[3]), signal.SIGKILL)
+                break
+        rest = process.stdout.read()  # ends when all processes have
+    assert process.returncode != 0
+    named = "process 1 of 2 was killed (signal 9)" if victim == 1 else "the first process of the run is gone"
+    assert f"saunet-train: {named}" in rest
+    assert "go on with resume=" in rest
+    record = json.loads((tmp_path / "run.json").read_text())
+    assert record["status"] == "failed"
+    assert named in record["error"]
+    stored = torch.load(tmp_path / "c" / "last.ckpt", weights_only=True)
+    assert stored["global_step"] >= 3
+
+
+def test_one_process_asked_to_stop_stops_both_with_everything_saved(tmp_path: Path) -> None:
+    command = [sys.executable, str(CURVE), str(tmp_path), "2", "500", "0.02"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=ENVIRONMENT
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            words = line.split()
+            if words[:2] == ["process", "0"] and words[-1] == "4":
+                os.kill(int(words[3]), signal.SIGTERM)
+                break
+        process.stdout.read()
+    assert process.returncode == 128 + signal.SIGTERM
+    record = json.loads((tmp_path / "run.json").read_text())
+    assert record["status"] == "interrupted"
+    assert "stopped by SIGTERM after step" in record["error"]
+    assert "everything is saved" in record["error"]

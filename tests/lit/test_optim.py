@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch import nn
 
 from saunet.checks import ConfigError
 from saunet.lit.optim import Recipe
@@ -64,9 +65,70 @@ def test_its_saved_state_is_plain_and_continues_where_it_was() -> None:
     assert second["optimizer"].param_groups[0]["lr"] == pytest.approx(0.5)
 
 
+def test_one_cycle_rises_to_the_rate_and_falls_to_almost_nothing() -> None:
+    recipe = Recipe(schedule="one_cycle", lr=1.0, warmup=0.25)
+    assert recipe.factor(0) == pytest.approx(1 / 25)
+    assert recipe.factor(0.125) == pytest.approx((1 + 1 / 25) / 2)
+    assert recipe.factor(0.25) == pytest.approx(1)
+    assert recipe.factor(0.625) == pytest.approx((1 + 1 / 25e4) / 2)
+    assert recipe.factor(1) == pytest.approx(1 / 25e4)
+    rates = _rates(recipe, 40)
+    assert max(rates) == rates[9] == 1
+    assert rates[:10] == sorted(rates[:10])
+    assert rates[9:] == sorted(rates[9:], reverse=True)
+
+
+class Network(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.depth = nn.ModuleDict({"encoder": nn.Linear(1, 1), "decoder": nn.Linear(1, 1)})
+        self.pose = nn.Linear(1, 1)
+
+
+def test_the_encoder_can_have_a_rate_of_its_own_which_follows_the_schedule() -> None:
+    network = Network()
+    recipe = Recipe(lr=1.0, encoder_lr=0.1, schedule="cosine")
+    configured = recipe.configure(recipe.groups(network), 2)
+    optimizer, scheduler = configured["optimizer"], configured["lr_scheduler"]["scheduler"]
+    assert [group["lr"] for group in optimizer.param_groups] == [1.0, 0.1]
+    assert [id(each) for each in optimizer.param_groups[1]["params"]] == [
+        id(each) for each in network.depth["encoder"].parameters()
+    ]
+    optimizer.step()
+    scheduler.step()
+    assert [group["lr"] for group in optimizer.param_groups] == pytest.approx([0.5, 0.05])
+    assert len(Recipe().groups(network)) == 1
+
+
+def test_frozen_parts_are_named_parts_and_something_is_left_to_train() -> None:
+    network = Network()
+    assert Recipe(freeze=["depth.encoder"]).frozen(network) == [network.depth["encoder"]]
+    with pytest.raises(ConfigError, match=r"optim.freeze is 'depth.encodr'; did you mean 'depth.encoder'\?"):
+        Recipe(freeze=["depth.encodr"]).frozen(network)
+    network.requires_grad_(False)
+    with pytest.raises(ConfigError, match=r"leaves nothing to train"):
+        Recipe(freeze=["depth", "pose"]).groups(network)
+
+
+def test_the_fused_optimiser_takes_the_same_step() -> None:
+    weights = []
+    for fused in (False, True):
+        parameter = nn.Parameter(torch.linspace(-1, 1, 8))
+        optimizer = Recipe(lr=0.1, optimizer="adamw", weight_decay=0.1, fused=fused).configure([parameter], 1)[
+            "optimizer"
+        ]
+        parameter.pow(2).sum().backward()
+        optimizer.step()
+        weights.append(parameter.detach())
+    torch.testing.assert_close(*weights)
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
+        ({"schedule": "one_cycle"}, "optim.schedule=one_cycle rises over optim.warmup, which is 0"),
+        ({"ema": 1.0}, "optim.ema is 1, so the average would never move"),
+        ({"encoder_lr": -1.0}, "optim.encoder_lr is -1.0"),
         ({"lr": 0.0}, "optim.lr is 0.0; it must be greater than 0"),
         ({"lr": float("nan")}, "optim.lr is nan"),
         ({"betas": (0.9,)}, "optim.betas is"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -95,7 +96,22 @@ class TrainedModule(LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Return the recipe's optimiser over all that is trained, and its schedule."""
-        return self.recipe.configure(self.recipe.groups(self), int(self.trainer.estimated_stepping_batches))
+        return self.recipe.configure(self.recipe.groups(self), self._total_steps())
+
+    def _total_steps(self) -> int:
+        """Return the optimiser steps of the whole training.
+
+        The trainer could count them too, but sets up its loader for that: before a resumed run knows where in an epoch
+        it was, so that it would begin the epoch again.
+        """
+        trainer = self.trainer
+        data = getattr(trainer, "datamodule", None)
+        if data is None or trainer.overfit_batches or trainer.max_epochs in (None, -1):
+            return int(trainer.estimated_stepping_batches)
+        batches, limit = len(data.train_dataloader()), trainer.limit_train_batches
+        batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
+        steps = math.ceil(batches / trainer.accumulate_grad_batches) * int(trainer.max_epochs or 0)
+        return min(steps, trainer.max_steps) if trainer.max_steps != -1 else steps
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the record from which the networks are rebuilt, the recipe, and both kinds of weights."""

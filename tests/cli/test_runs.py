@@ -1,0 +1,92 @@
+"""What a run leaves about itself, and sweeps of which a job fails."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from saunet.cli._sweep import summary
+from saunet.lit.run_record import RunRecord
+
+Tool = Callable[..., Any]
+QUICK = ("experiment=smoke", "logger=none", "callbacks.pictures=null", "model/encoder=resnet18", "model/pose=posecnn")
+
+
+def record(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "run.json").read_text())
+    return content
+
+
+def test_a_finished_run_says_so(smoke_run: Path) -> None:
+    content = record(smoke_run)
+    assert (content["status"], content["error"], content["name"]) == ("finished", None, "smoke")
+    assert {"train", "val"} == set(content["splits"])
+    assert all(len(each) == 64 for each in content["splits"].values())
+
+
+def test_a_failing_job_costs_no_other_and_is_recorded(tool: Tool, tmp_path: Path) -> None:
+    jobs = "optim.lr=-1,1e-3"
+    outcome = tool("train", "--multirun", *QUICK, "trainer.limit_train_batches=1", jobs, "hydra.sweep.dir=sweep")
+    assert outcome.code == 1
+    assert "Traceback" not in outcome.err
+    assert "job 0" in outcome.err
+    assert "sweep: 1 of 2 jobs finished" in outcome.err
+    assert "optim.lr=-1) failed: optim.lr is -1.0; it must be greater than 0" in outcome.err
+    failed, finished = record(tmp_path / "sweep" / "0"), record(tmp_path / "sweep" / "1")
+    assert failed["status"] == "failed"
+    assert failed["error"].startswith("optim.lr is -1.0")
+    assert finished["status"] == "finished"
+    assert (tmp_path / "sweep" / "1" / "checkpoints" / "last.ckpt").is_file()
+
+
+def test_a_job_that_vanished_is_marked_failed_in_the_summary(tmp_path: Path) -> None:
+    for job in ("0", "1", "10", "2"):
+        RunRecord(tmp_path / job, "x").start()
+    RunRecord(tmp_path / "2", "x").end("finished")
+    text, finished = summary(tmp_path)
+    lines = text.splitlines()
+    assert not finished
+    assert lines[0].startswith("sweep: 1 of 4 jobs finished")
+    assert [line.split()[0] for line in lines[1:]] == ["0", "1", "10"]
+    assert "killed" in record(tmp_path / "10")["error"]
+
+
+def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    last = smoke_run / "checkpoints" / "last.ckpt"
+    again = ("experiment=smoke", "logger=none", "callbacks.pictures=null", "trainer.limit_train_batches=1")
+    outcome = tool("train", *again, f"init_from={last}", "optim.lr=1e-5", "output_dir=warm")
+    assert outcome.code == 0, outcome.err
+    assert "starting from" in outcome.out
+    outcome = tool("train", *again, f"resume={last}", f"init_from={last}")
+    assert outcome.code == 1
+    assert "resume= and init_from= are both set" in outcome.err
+
+
+@pytest.mark.slow
+def test_sigterm_ends_a_run_with_a_message_and_a_record(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "saunet.cli.train", *QUICK, "trainer.max_epochs=500", "resume=auto"]
+    command += [f"hydra.run.dir={tmp_path}/r", "trainer.limit_train_batches=1.0", "trainer.limit_val_batches=0"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    for attempt in range(2):
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+        ) as run:
+            assert run.stderr is not None
+            heard = ""
+            while "Epoch" not in heard or "loss=" not in heard:  # the progress bar, once a step was made
+                heard += run.stderr.read(1)
+            run.send_signal(signal.SIGTERM)
+            out, err = run.communicate()
+        assert run.returncode == 143
+        assert "saunet-train: stopped by SIGTERM after step" in err
+        assert f"go on with resume={tmp_path}/r/checkpoints/last.ckpt" in err
+        assert record(tmp_path / "r")["status"] == "interrupted"
+        assert ("going on from" in out) == (attempt == 1)

@@ -1,0 +1,69 @@
+"""Run the tiny training in one process or two: ``python ddp_curve.py FOLDER PROCESSES EPOCHS SLEEP``.
+
+Writes the losses of its steps and the validation metric to ``FOLDER/curve.json``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import tiny
+import torch
+from lightning import Callback, LightningModule, Trainer
+
+from saunet.lit.callbacks import LastCheckpoint
+from saunet.lit.durable import GracefulStop, ProcessWatch
+from saunet.lit.optim import Recipe
+from saunet.lit.run_record import recording
+
+
+class Curve(Callback):
+    def __init__(self, sleep: float) -> None:
+        self.sleep = sleep
+        self.losses: list[float] = []
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any) -> None:
+        loss = outputs["loss"].detach().clone()
+        if trainer.world_size > 1:
+            torch.distributed.all_reduce(loss)
+            loss = loss / trainer.world_size
+        self.losses.append(float(loss))
+        print(f"process {trainer.global_rank} pid {os.getpid()} step {trainer.global_step}", flush=True)
+        time.sleep(self.sleep)
+
+
+def main(folder: Path, processes: int, epochs: int, sleep: float) -> None:
+    with recording(folder, "curve"):
+        # The mean of the halves' losses is the whole's where all pixels count and no sample sees another: no auto-mask,
+        # no validity mask, no dropout, no batch norm (which is synchronised on GPUs only).
+        model = tiny.tiny_model(Recipe(lr=3e-3, schedule="cosine"), dropout=0.0)
+        photometric: Any = model.objective.terms["photometric"]
+        photometric.automask, photometric.use_validity = False, False
+        model.depth.encoder[1] = torch.nn.Identity()  # type: ignore[union-attr, index, operator]
+        curve = Curve(sleep)
+        watch = [
+            GracefulStop(str(folder / "c")),
+            ProcessWatch(str(folder), str(folder / "c")),
+            LastCheckpoint(str(folder / "c"), every_n_steps=1),
+        ]
+        trainer = tiny.tiny_trainer(
+            folder,
+            max_epochs=epochs,
+            devices=processes,
+            strategy="ddp" if processes > 1 else "auto",
+            callbacks=[curve, *watch],
+        )
+        trainer.fit(model, tiny.tiny_walls())
+        if trainer.is_global_zero:
+            metrics = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("val")}
+            (folder / "curve.json").write_text(json.dumps({"losses": curve.losses, "metrics": metrics}))
+
+
+if __name__ == "__main__":
+    folder, processes, epochs, sleep = sys.argv[1:]
+    main(Path(folder), int(processes), int(epochs), float(sleep))
