@@ -108,15 +108,30 @@ class PredictConfig:
     checkpoint: str = MISSING
     input: str = MISSING
     output: str = MISSING
-    outputs: list[str] = field(default_factory=lambda: ["colour", "png16"])
+    outputs: list[str] | None = None
     palette: str = "magma"
     camera: list[float] | None = None
+    max_depth: float | None = None
+    max_frames: int | None = None
     flip: bool = False
     keep_aspect: bool = False
     scale: ScaleConfig = field(default_factory=ScaleConfig)
     overwrite: bool = False
     batch_size: int = 1
     device: str = "auto"
+
+
+@dataclass
+class ExportConfig:
+    """Root of ``saunet-export``."""
+
+    checkpoint: str = MISSING
+    output: str = MISSING
+    formats: list[str] = field(default_factory=lambda: ["onnx", "program", "safetensors"])
+    images: str | None = None
+    batch: str = "auto"
+    evaluation: str | None = None
+    overwrite: bool = False
 
 
 @dataclass
@@ -135,6 +150,24 @@ class BenchmarkConfig:
     threads: int | None = None
     figure: bool = False
     abs_rel: dict[str, float] = field(default_factory=dict)
+    output_dir: str = MISSING
+
+
+@dataclass
+class ReportConfig:
+    """Root of ``saunet-report``; ``scenes`` maps a condition to images, folders or patterns."""
+
+    runs: list[str] = MISSING
+    compare: bool = False
+    checkpoint: str = "best"
+    title: str = "saunet report"
+    labels: list[str] = field(default_factory=list)
+    scenes: Any = None
+    scenes_limit: int = 3
+    zooms: int = 2
+    figures: bool = True
+    device: str = "auto"
+    flip: bool = False
     output_dir: str = MISSING
 
 
@@ -183,12 +216,39 @@ class OdometryConfig:
     output_dir: str = MISSING
 
 
+@dataclass
+class PrepareConfig:
+    """Root of ``saunet-prepare``; which keys belong to which job: ``saunet.cli.prepare.KEYS``."""
+
+    job: str = MISSING
+    root: str = MISSING
+    folder: str | None = None
+    cameras: list[str] = field(default_factory=lambda: ["left", "right"])
+    drives: list[str] = field(default_factory=list)
+    split: str = "all"
+    kinds: list[str] = field(default_factory=lambda: ["linear"])
+    depth: str = "camera_z"
+    checkpoint: str | None = None
+    input: str | None = None
+    values: str = "depth"
+    device: str = "auto"
+    height: int = 202
+    width: int = 672
+    format: str = "jpg"
+    quality: int = 95
+    workers: int | None = None
+    on_error: str = "raise"
+
+
 ROOTS = (
+    PrepareConfig,
     TrainConfig,
     EvaluateConfig,
     PredictConfig,
+    ExportConfig,
     BenchmarkConfig,
     OdometryConfig,
+    ReportConfig,
     DoctorConfig,
     CalibrateConfig,
     ModelConfig,
@@ -256,7 +316,8 @@ def check(cfg: DictConfig) -> None:
         )
     objective = plain(cfg.objective)
     gradient = objective.get("gradient") or {}
-    if gradient.get("target") == "lidar" and not cfg.data.get("target_depth", False):
+    has_lidar = cfg.data.get("target_depth", False) or cfg.data.get("dense", "none") != "none"
+    if gradient.get("target") == "lidar" and not has_lidar:
         raise ConfigError(
             "objective.gradient.target=lidar needs LiDAR depth in the training batches; "
             "set data.target_depth=true, or use objective.gradient.target=image"

@@ -26,6 +26,8 @@ class FrameBatch(TypedDict):
     """One readable name a sample, such as ``2011_09_26/..._sync 0000000005 l``."""
     target_depth: NotRequired[Float[Tensor, "b 1 h w"]]
     """Depth of the target in metres at the size of ``frames``, 0 where unknown; for losses that use LiDAR."""
+    target_teacher: NotRequired[Float[Tensor, "b 1 h w"]]
+    """Depth of the target as another model predicts it, at the size of ``frames``, up to scale, 0 where unknown."""
     depth: NotRequired[Float[Tensor, "b 1 hg wg"]]
     """Ground-truth depth in metres at its native size, 0 where unknown, padded to the largest in the batch."""
     depth_size: NotRequired[Int[Tensor, "b 2"]]
@@ -59,7 +61,7 @@ class TrainBatch(TypedDict):
     target_depth: NotRequired[Float[Tensor, "b 1 h w"]]
     """See `FrameBatch`; cropped and flipped with the images."""
     target_teacher: NotRequired[Float[Tensor, "b 1 h w"]]
-    """Depth of the target as another model predicts it, up to scale, 0 where unknown."""
+    """See `FrameBatch`; cropped and flipped with the images."""
     distance: NotRequired[Float[Tensor, "b s"]]
     """See `FrameBatch`."""
     source_depth: NotRequired[Float[Tensor, "b s 1 h w"]]

@@ -17,8 +17,11 @@ from lightning.pytorch.utilities import move_data_to_device, rank_zero_info
 from torch.utils.data import DataLoader
 
 from saunet.checks import ConfigError, DataError, in_range, one_of, positive
+from saunet.data.depth_maps import DepthMaps
+from saunet.data.image_cache import CachedDrive, ImageCache
 from saunet.data.manifest import read_manifest
 from saunet.data.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, share
+from saunet.data.sequences import Drive
 from saunet.data.transforms import Augment, Prepare
 from saunet.data.unreadable import SkippingWindows, readable
 from saunet.data.windows import Selection, Usage, WindowDataset, check_offsets, collate, find_windows
@@ -92,6 +95,8 @@ class DepthDataModule(LightningDataModule):
         self.on_error = one_of("on_error", on_error, ("raise", "skip"))
         self.augment = Augment(self.height, self.width, flip, colour)
         self.prepare = Prepare(self.height, self.width)
+        self.maps: dict[str, DepthMaps] = {}
+        self.copies: ImageCache | None = None
         self.usage: dict[str, list[Usage]] = {}
         self.datasets: dict[str, WindowDataset] = {}
 
@@ -167,17 +172,33 @@ class DepthDataModule(LightningDataModule):
         margin = (round(self.height * self.translate), round(self.width * self.translate))
         kind = SkippingWindows if self.on_error == "skip" and split == "train" else WindowDataset
         return kind(
-            [selection.drive for selection in selections],
+            self._recordings(split, selections, windows),
             windows,
             offsets=offsets,
             height=self.height,
             width=self.width,
             margin=margin if split == "train" else (0, 0),
             with_depth=split in ("val", "test"),
-            with_target_depth=self.target_depth and split in self.neighbours,
+            with_target_depth=self.target_depth and split in self.neighbours and "target_depth" not in self.maps,
             with_pose=self.with_pose and split in self.neighbours,
             stereo=stereo,
+            maps=self.maps if split in self.neighbours else {},
         )
+
+    def _recordings(
+        self, split: str, selections: Sequence[Selection], windows: Sequence[tuple[int, int]]
+    ) -> list[Drive | CachedDrive]:
+        """Return the recordings; training and validation read the cache, so that tests do not depend on it."""
+        if self.copies is None or split not in ("train", "val"):
+            return [selection.drive for selection in selections]
+        needed: dict[int, set[int]] = {position: set() for position, _ in windows}
+        if self.on_error == "raise":  # else a copy that is missing is a sample to skip
+            for position, frame in windows:
+                needed[position].update(frame + offset for offset in (0, *self.offsets))
+        return [
+            self.copies.drive(selection.drive, needed[position]) if position in needed else selection.drive
+            for position, selection in enumerate(selections)
+        ]
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Return shuffled training batches, the same for any number of devices."""

@@ -6,7 +6,7 @@ whatever the number of devices or workers, and nothing here waits for the device
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -21,6 +21,9 @@ from torch import Tensor, nn
 from saunet.checks import DataError, in_range
 from saunet.geometry.camera import crop_intrinsics, flip_intrinsics
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
+
+TARGETS: tuple[Literal["target_depth", "target_teacher"], ...] = ("target_depth", "target_teacher")
+"""Depth maps at the size of the frames, which follow crops and flips."""
 
 
 def crop(
@@ -147,9 +150,10 @@ class Augment(nn.Module):
             2 * torch.pi * self.hue * signed[:, 3],
         )
         out = _split(seen, frames, K, batch["name"])
-        if "target_depth" in batch:
-            depth = crop(batch["target_depth"][:, None], left, top, self.height, self.width)
-            out["target_depth"] = flip_some(depth, mirrored)[:, 0]
+        for key in TARGETS:
+            if key in batch:
+                depth = crop(batch[key][:, None], left, top, self.height, self.width)
+                out[key] = flip_some(depth, mirrored)[:, 0]
         if "T_src_tgt" in batch:
             out["T_src_tgt"] = flip_motion(batch["T_src_tgt"], mirrored)
         if "T_stereo_tgt" in batch:  # the partner of a mirrored image is on the other side
@@ -183,8 +187,9 @@ class Prepare(nn.Module):
         window = (..., slice(top, top + self.height), slice(left, left + self.width))
         frames = batch["frames"][window].float() / 255
         out = _split(frames, frames, crop_intrinsics(batch["K"], left, top), batch["name"])
-        if "target_depth" in batch:
-            out["target_depth"] = batch["target_depth"][window].contiguous()
+        for target in TARGETS:
+            if target in batch:
+                out[target] = batch[target][window].contiguous()
         for key in ("T_src_tgt", "T_stereo_tgt", "distance", "depth", "depth_size"):
             if key in batch:
                 out[key] = batch[key]

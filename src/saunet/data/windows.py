@@ -9,6 +9,7 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from saunet.checks import ConfigError, DataError
+from saunet.data.depth_maps import DepthMaps
 from saunet.data.partners import Odometer, partner_frames, partner_image
 from saunet.data.resize import resize_depth
 from saunet.data.sequences import Drive
@@ -116,6 +118,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         with_pose: Yield true motion; every drive must know it.
         stereo: Yield the stereo partner as the last source, and where it is.
         odometer: Gives the distance travelled; None yields none.
+        maps: Depth maps made beforehand, by the key under which they are yielded at the size of the frames.
 
     Raises:
         ConfigError: if an offset is 0 or given twice.
@@ -135,6 +138,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         with_pose: bool = False,
         stereo: bool = False,
         odometer: Odometer | None = None,
+        maps: Mapping[str, DepthMaps] = MappingProxyType({}),
     ) -> None:
         check_offsets(offsets)
         self.drives = list(drives)
@@ -146,6 +150,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         self.with_pose = with_pose
         self.stereo = stereo
         self.odometer = odometer
+        self.maps = dict(maps)
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -196,6 +201,10 @@ class WindowDataset(Dataset[dict[str, Any]]):
                 sample["target_depth"] = torch.from_numpy(resized)[None]
             if self.with_depth and depth is not None:
                 sample["depth"] = torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32))[None]
+        for key, maps in self.maps.items():
+            depth = maps.read(drive, frame)
+            resized = np.zeros(self.size, np.float32) if depth is None else resize_depth(depth, height, width)
+            sample[key] = torch.from_numpy(resized)[None]
         if self.stereo:
             sample["T_stereo_tgt"] = torch.from_numpy(np.asarray(T_stereo_tgt, np.float64)).float()
         if self.with_pose:

@@ -9,6 +9,8 @@ from typing import Literal
 
 from saunet.checks import ConfigError, DataError, in_range, one_of, suggest
 from saunet.data import splits
+from saunet.data.depth_maps import DENSE_KINDS, DepthMaps
+from saunet.data.image_cache import ImageCache
 from saunet.data.kitti import CAMERAS, DEPTH_KINDS, DepthKind, KittiRaw
 from saunet.data.module import DepthDataModule
 from saunet.data.splits import Frame
@@ -52,6 +54,11 @@ class KittiDataModule(DepthDataModule):
         colour: Probability of colour jitter in training.
         seed: Decides order, augmentation, and what is held out at random.
         target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
+        dense: Dense depth maps as that target in place of the sparse scan: ``linear`` or ``colorization``, made
+            beforehand by ``saunet-prepare densify``; ``none`` uses the scan.
+        teacher: Batches carry another model's depth, made beforehand by ``saunet-prepare teacher``.
+        maps: Folder of these maps; None: beside the recordings.
+        cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
         stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
             ``offsets: []`` it is the only one.
         manifest: Frames to leave out of training and validation, as ``saunet-doctor`` wrote them.
@@ -85,6 +92,10 @@ class KittiDataModule(DepthDataModule):
         colour: float = 0.5,
         seed: int = 0,
         target_depth: bool = False,
+        dense: Literal["none", "linear", "colorization"] = "none",
+        teacher: bool = False,
+        maps: str | None = None,
+        cache: str | None = None,
         stereo: bool = False,
         manifest: str | None = None,
         on_error: Literal["raise", "skip"] = "raise",
@@ -99,7 +110,7 @@ class KittiDataModule(DepthDataModule):
             flip=flip,
             colour=colour,
             seed=seed,
-            target_depth=target_depth,
+            target_depth=target_depth or dense != "none",
             stereo=stereo,
             manifest=manifest,
             on_error=on_error,
@@ -117,6 +128,12 @@ class KittiDataModule(DepthDataModule):
         self.protocol = _PROTOCOLS[depth]
         self._depth: DepthKind = depth
         self._raw: KittiRaw | None = None
+        one_of("dense", dense, ("none", *DENSE_KINDS))
+        if dense != "none":
+            self.maps["target_depth"] = DepthMaps(dense, maps)
+        if teacher:
+            self.maps["target_teacher"] = DepthMaps("teacher", maps)
+        self.copies = ImageCache(cache) if cache else None
 
     def select(self, split: str) -> Sequence[Selection]:
         """Return the frames of a split, grouped by drive and camera.
@@ -144,7 +161,21 @@ class KittiDataModule(DepthDataModule):
                 f"target_depth is true but no training frame below {raw.root} has {kind} depth; "
                 "add the velodyne_points, or set data.target_depth=false"
             )
+        if split in ("train", "val"):
+            self._check_maps(selections)
         return selections
+
+    def _check_maps(self, selections: Sequence[Selection]) -> None:
+        """Check that the frames of a split have the depth maps asked for; a frame without a scan needs no dense one."""
+        for maps in self.maps.values():
+            wanted = []
+            for drive, frames, _ in selections:
+                existing = set(drive.indices)
+                dense = maps.kind != "teacher"
+                wanted.append((drive, [f for f in frames if f in existing and (not dense or drive.has_depth(f))]))  # type: ignore[attr-defined]
+            what = "teacher checkpoint=..." if maps.kind == "teacher" else f"densify kinds=[{maps.kind}]"
+            folder = f" folder={maps.folder}" if maps.folder else ""
+            maps.check(wanted, f"saunet-prepare {what} root={self.root}{folder}")
 
     def listed(self, split: str) -> list[str]:
         """Return the names of all images that a split lists, in its order, also of those that the root lacks."""

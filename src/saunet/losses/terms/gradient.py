@@ -19,7 +19,7 @@ from saunet.types import DepthPyramid, TrainBatch, View
 
 _SOURCES = {
     "lidar": ("target_depth", "set data.target_depth=true, or target: image, which needs no ground truth"),
-    "teacher": ("target_teacher", "use data with a teacher's depth, or target: image, which needs none"),
+    "teacher": ("target_teacher", "set data.teacher=true with data=kitti, or target: image, which needs none"),
 }
 
 

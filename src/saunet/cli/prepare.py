@@ -1,0 +1,92 @@
+"""``saunet-prepare``: work done once before training: dense depth, a teacher's depth, smaller copies of recordings."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any
+
+from omegaconf import DictConfig
+
+from saunet import config
+from saunet.checks import ConfigError, one_of, suggest
+from saunet.cli._app import pick_device, run
+from saunet.config import PrepareConfig
+
+SHARED = ("job", "root", "folder", "cameras", "drives", "split", "on_error")
+KEYS = {
+    "densify": (*SHARED, "kinds", "depth", "workers"),
+    "teacher": (*SHARED, "checkpoint", "input", "values", "device"),
+    "cache": (*SHARED, "height", "width", "format", "quality", "workers"),
+}
+"""Job -> the keys that it uses."""
+
+
+def prepare(cfg: DictConfig) -> None:
+    """Do one job and say what was done."""
+    from saunet.prepare.recordings import kitti_recordings
+
+    one_of("job", cfg.job, KEYS)
+    plain = config.plain(cfg)
+    default = PrepareConfig()
+    for key, value in plain.items():
+        if key not in KEYS[cfg.job] and value != getattr(default, key):
+            owners = " and ".join(job for job, keys in KEYS.items() if key in keys)
+            raise ConfigError(f"{key} belongs to saunet-prepare {owners}, not to {cfg.job}; leave it out")
+    workers = os.cpu_count() or 1 if cfg.workers is None else cfg.workers
+    depth = one_of("depth", cfg.depth, ("camera_z", "improved"))
+    recordings = kitti_recordings(cfg.root, plain["cameras"], plain["drives"], cfg.split, depth)  # type: ignore[arg-type]
+    failures = _JOBS[cfg.job](plain, recordings, workers)
+    for failure in failures:
+        print(f"saunet-prepare: skipped: {failure}", file=sys.stderr)
+
+
+def _densify(cfg: dict[str, Any], recordings: Any, workers: int) -> tuple[str, ...]:
+    from saunet.prepare.densify import densify
+
+    done = densify(recordings, cfg["kinds"], cfg["folder"], workers, cfg["on_error"])
+    print(
+        f"{done.made} frames made, {done.before} were there, {done.without} have no scan, {len(done.failures)} skipped"
+    )
+    return done.failures
+
+
+def _teacher(cfg: dict[str, Any], recordings: Any, workers: int) -> tuple[str, ...]:
+    from saunet.prepare.teacher import source_of, teach
+
+    source = source_of(cfg["checkpoint"], cfg["input"], cfg["values"], pick_device(cfg["device"]))
+    done = teach(recordings, source, cfg["folder"], cfg["on_error"])
+    print(f"{done.made} frames made, {done.before} were there, {len(done.failures)} skipped")
+    return done.failures
+
+
+def _cache(cfg: dict[str, Any], recordings: Any, workers: int) -> tuple[str, ...]:
+    from saunet.data.image_cache import CacheSettings
+    from saunet.prepare.cache import build_cache
+
+    if cfg["folder"] is None:
+        raise ConfigError("a cache needs a folder of its own; set folder=...")
+    settings = CacheSettings(*(cfg[key] for key in ("height", "width", "format", "quality")))
+    done = build_cache(recordings, cfg["folder"], settings, workers, cfg["on_error"])
+    print(
+        f"{done.made} copies made ({done.replaced} in place of damaged ones), {done.verified} verified: {cfg['folder']}"
+    )
+    return done.failures
+
+
+_JOBS = {"densify": _densify, "teacher": _teacher, "cache": _cache}
+
+
+def main() -> None:
+    """Entry point of ``saunet-prepare``."""
+    word = sys.argv[1] if len(sys.argv) > 1 else ""
+    if word in KEYS:
+        sys.argv[1] = f"job={word}"
+    elif not word.startswith(("-", "job=")):
+        hint = suggest(word, KEYS) or ";"
+        sys.exit(f"saunet-prepare: the first word is the job, not '{word}'{hint} jobs: {', '.join(KEYS)}")
+    run("prepare", prepare)
+
+
+if __name__ == "__main__":
+    main()
