@@ -36,19 +36,23 @@ def available(kind: str) -> list[str]:
     return registry(kind).names()
 
 
-def load(path: Any, *, device: str = "cpu") -> Any:
+def load(source: Any, *, device: str = "cpu", flip: bool = False, keep_aspect: bool = False) -> Any:
     """Load a trained model for prediction: ``saunet.load("last.ckpt").predict(image)``.
 
     Args:
-        path: A checkpoint written by ``saunet-train``.
+        source: A checkpoint, a folder or ``model.onnx`` written by ``saunet-export``, or a model on the Hugging Face hub
+            (``hf://organisation/name``).
         device: Where to run, such as ``"cpu"`` or ``"cuda"``.
+        flip: Average with the prediction of the mirrored image.
+        keep_aspect: Feed each image at its own aspect ratio.
 
     Returns:
-        A `saunet.infer.Predictor`.
+        A `saunet.infer.Predictor`, or for ONNX a `saunet.infer.onnx.OnnxPredictor`, which does without torch.
 
     Raises:
-        CheckpointError: if the file is missing, broken, or not a saunet checkpoint.
+        CheckpointError: if it is missing, broken, or not a saunet model.
+        ConfigError: if a package is missing or the device does not exist.
     """
-    from saunet.infer.predictor import Predictor
+    from saunet.infer.load import load as load_any
 
-    return Predictor.from_checkpoint(path, device=device)
+    return load_any(source, device=device, flip=flip, keep_aspect=keep_aspect)

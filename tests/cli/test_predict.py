@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -61,8 +63,9 @@ def video(tmp_path: Path, image: Path) -> Path:
 def test_the_tool_writes_what_the_library_writes_by_default() -> None:
     defaults = {name: p.default for name, p in inspect.signature(predict_files).parameters.items()}
     config = PredictConfig()
-    assert tuple(config.outputs) == defaults["outputs"]
-    for key in ("palette", "camera", "batch_size", "overwrite"):
+    assert config.outputs is None  # ("colour", "png16") for images, ("mp4",) for a clip
+    assert defaults["outputs"] == ("colour", "png16")
+    for key in ("palette", "camera", "max_depth", "batch_size", "overwrite"):
         assert getattr(config, key) == defaults[key]
 
 
@@ -106,10 +109,154 @@ def test_video_is_written_once(tool: Callable[..., Any], checkpoint: Path, video
     assert tool("predict", *arguments, "overwrite=true").code == 0
 
 
-@pytest.mark.parametrize("change", ["outputs=[npy]", "camera=[80,80,44.5,29.5]", "batch_size=2"])
-def test_what_is_for_images_is_refused_for_a_video(
-    tool: Callable[..., Any], checkpoint: Path, video: Path, change: str
-) -> None:
-    outcome = tool("predict", f"checkpoint={checkpoint}", "input=drive.mp4", "output=out", change)
+def test_video_into_everything(tool: Callable[..., Any], checkpoint: Path, video: Path, tmp_path: Path) -> None:
+    outcome = tool(
+        "predict", f"checkpoint={checkpoint}", "input=drive.mp4", "output=out",
+        "outputs=[mp4,png16,ply,html]", "camera=[90]", "batch_size=2", "max_depth=50", "flip=true",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.err
+    assert "depth is relative" in outcome.out
+    files = sorted(str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*"))
+    assert files == [
+        "drive/000000_depth.png", "drive/000000_points.ply", "drive/000001_depth.png", "drive/000001_points.ply",
+        "drive_disparity.mp4", "drive_points.html",
+    ]  # fmt: skip
+    refused = tool("predict", f"checkpoint={checkpoint}", "input=drive.mp4", "output=out2", "outputs=[trajectory]")
+    assert refused.code == 1
+    assert "has no pose network, which a trajectory needs; leave 'trajectory' out" in refused.err
+
+
+def test_folder_into_files_and_a_page(tool: Callable[..., Any], checkpoint: Path, image: Path, tmp_path: Path) -> None:
+    arguments = (f"checkpoint={checkpoint}", "input=*.png", "output=out", "outputs=[npy,html]", "camera=[90]")
+    outcome = tool("predict", *arguments)
+    assert outcome.code == 0, outcome.err
+    assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == [".html", ".json", ".npy"]
+    assert "outputs is 'color'; did you mean 'colour'" in tool("predict", *arguments[:3], "outputs=[color]").err
+
+
+def test_camera_that_is_not_there(tool: Callable[..., Any], checkpoint: Path, tmp_path: Path) -> None:
+    outcome = tool("predict", f"checkpoint={checkpoint}", "input=97", "output=out")
     assert outcome.code == 1
-    assert f"{change.split('=')[0]} is for images" in outcome.err
+    assert "camera 97 gives no picture; check that it is connected" in outcome.err
+    assert not (tmp_path / "out").exists()
+
+
+class TestBadInput:
+    """A clear message or the right result; what is finished stays valid."""
+
+    @pytest.fixture
+    def run(self, tool: Callable[..., Any], checkpoint: Path) -> Callable[..., Any]:
+        return lambda name, *more: tool("predict", f"checkpoint={checkpoint}", f"input={name}", "output=out", *more)
+
+    @pytest.mark.parametrize("kind", ["one pixel", "grey", "grey16", "colour16", "rgba"])
+    def test_unusual_images(self, run: Callable[..., Any], tmp_path: Path, kind: str) -> None:
+        ramp = np.arange(40, dtype=np.uint8)[:, None].repeat(60, 1) * 6
+        pictures: dict[str, Any] = {
+            "one pixel": np.full((1, 1, 3), 77, np.uint8),
+            "grey": ramp,
+            "grey16": ramp.astype(np.uint16) * 257,
+            "colour16": np.dstack([ramp] * 3).astype(np.uint16) * 257,
+            "rgba": np.dstack([ramp, ramp, ramp, 255 - ramp]),
+        }
+        cv2.imwrite(str(tmp_path / "a.png"), pictures[kind])
+        outcome = run("a.png", "outputs=[colour,png16,npy]")
+        assert outcome.code == 0, outcome.err
+        depth = np.load(tmp_path / "out" / "a_depth.npy")
+        assert depth.shape == pictures[kind].shape[:2]
+        assert np.isfinite(depth).all()
+        if kind != "one pixel":  # all are the same grey picture
+            cv2.imwrite(str(tmp_path / "b.png"), np.dstack([ramp] * 3))
+            assert run("b.png", "outputs=[npy]").code == 0
+            assert np.array_equal(depth, np.load(tmp_path / "out" / "b_depth.npy"))
+
+    def test_rotated_by_exif(self, run: Callable[..., Any], tmp_path: Path) -> None:
+        cv2.imwrite(str(tmp_path / "a.jpg"), np.random.default_rng(0).integers(0, 255, (30, 50, 3), dtype=np.uint8))
+        data = (tmp_path / "a.jpg").read_bytes()
+        tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+        exif = b"\xff\xe1" + (len(tiff) + 8).to_bytes(2, "big") + b"Exif\0\0" + tiff
+        (tmp_path / "a.jpg").write_bytes(data[:2] + exif + data[2:])
+        assert run("a.jpg", "outputs=[npy]").code == 0
+        assert np.load(tmp_path / "out" / "a_depth.npy").shape == (50, 30)
+
+    def test_directory_without_images(self, run: Callable[..., Any], tmp_path: Path) -> None:
+        (tmp_path / "in").mkdir()
+        for more in ((), ("outputs=[mp4]",)):
+            outcome = run("in", *more)
+            assert outcome.code == 1
+            assert "no images in in; looked for files ending in .bmp" in outcome.err
+        assert not (tmp_path / "out").exists()
+
+    def test_no_frames_and_truncated_header(self, run: Callable[..., Any], video: Path, tmp_path: Path) -> None:
+        cv2.VideoWriter(str(tmp_path / "none.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 32)).release()
+        video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+        for name, words in (
+            ("none.avi", "none.avi"),
+            ("drive.mp4", "is not a video that can be read, or is truncated"),
+        ):
+            outcome = run(name)
+            assert outcome.code == 1
+            assert words in outcome.err
+        assert not (tmp_path / "out").exists()
+
+    def test_truncated_stream(self, run: Callable[..., Any], image: Path, tmp_path: Path) -> None:
+        writer = cv2.VideoWriter(str(tmp_path / "x.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (90, 60))
+        for _ in range(10):
+            writer.write(cv2.imread(str(image)))
+        writer.release()
+        data = (tmp_path / "x.avi").read_bytes()
+        (tmp_path / "x.avi").write_bytes(data[: len(data) * 6 // 10])
+        outcome = run("x.avi", "outputs=[mp4,npy]")
+        assert outcome.code == 0, outcome.err
+        assert "frames earlier than it declares: it may be truncated" in outcome.err
+        count = len(list((tmp_path / "out" / "x").iterdir()))
+        assert 2 < count < 9
+        assert f"{count} frames" in outcome.out
+
+    @pytest.mark.parametrize("input_", ["in", "drive.mp4"])
+    def test_full_disk_and_interrupt(self, checkpoint: Path, video: Path, tmp_path: Path, input_: str) -> None:
+        """In a process of its own: a file size limit stands for the full disk, a signal to itself for Ctrl-C."""
+        for index in range(6):
+            size = (20, 30) if index < 3 else (400, 600)  # the large ones do not fit
+            picture = np.random.default_rng(index).integers(0, 255, (*size, 3), dtype=np.uint8)
+            cv2.imwrite(str(tmp_path / f"in_{index}.png"), picture)
+            (tmp_path / "in").mkdir(exist_ok=True)
+            (tmp_path / f"in_{index}.png").rename(tmp_path / "in" / f"{index}.png")
+        code = (
+            "import os, resource, signal, sys\n"
+            "from saunet.cli.predict import main\n"
+            "from saunet.infer import files, sinks\n"
+            "how, sys.argv = sys.argv[1], sys.argv[:1] + sys.argv[2:]\n"
+            "if how == 'full':\n"
+            "    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+            "    resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
+            "else:\n"
+            "    left, write = [2], files.write_output\n"
+            "    def interrupted(*arguments):\n"
+            "        left[0] -= 1\n"
+            "        if left[0] == 0:\n"
+            "            os.kill(os.getpid(), signal.SIGINT)\n"
+            "        return write(*arguments)\n"
+            "    files.write_output = sinks.write_output = interrupted\n"
+            "main()\n"
+        )
+        for how in ("full", "interrupt"):
+            out = tmp_path / how
+            arguments = [f"checkpoint={checkpoint}", f"input={input_}", f"output={out}", "outputs=[npy,html]"]
+            result = subprocess.run(
+                [sys.executable, "-c", code, how, *arguments, "camera=[90]"],
+                capture_output=True, text=True, cwd=tmp_path, check=False,
+            )  # fmt: skip
+            assert "Traceback" not in result.stderr
+            if how == "full":
+                assert result.returncode == 1
+                assert "saunet-predict: cannot write" in result.stderr
+                assert "File too large" in result.stderr
+            else:
+                assert result.returncode == 130
+                assert result.stderr.strip().endswith("saunet-predict: interrupted")
+            assert not [path for path in out.rglob("*") if "partial" in path.name or path.suffix == ".html"]
+            for path in out.rglob("*.npy"):
+                assert np.isfinite(np.load(path)).all()
+        assert list((tmp_path / "interrupt").rglob("*.npy"))
+        if input_ == "in":  # and it goes on where it stopped
+            assert list((tmp_path / "full").rglob("*.npy"))

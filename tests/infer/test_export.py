@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,11 +16,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+import saunet
 from saunet.checkpoint import ModelRecord, Scale, atomic_save, build_networks
-from saunet.checks import CheckpointError, ConfigError
+from saunet.checks import CheckpointError, ConfigError, DataError
 from saunet.images import write_image
 from saunet.infer import export
-from saunet.infer.export import export_model, export_onnx, export_program
+from saunet.infer.card import fingerprint
+from saunet.infer.export import export_model
+from saunet.infer.exporters import export_onnx, export_program
 from saunet.infer.onnx import OnnxPredictor
 from saunet.infer.parity import Parity
 from saunet.infer.predictor import Predictor
@@ -60,22 +64,34 @@ def exported(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     folder = tmp_path_factory.mktemp("export")
     y, x = np.mgrid[0:50, 0:100]
     write_image(folder / "road.png", np.stack([x * 2, y * 5, x + y], axis=-1).astype(np.uint8))
-    return folder / "model", export_model(checkpoint, folder / "model", images=[folder / "road.png"])
+    row = {
+        "predictor": "model",
+        "protocol": "eigen_lidar_x",
+        "abs_rel": 0.111,
+        "sq_rel": 0.9,
+        "a1": None,
+        "images": 697,
+    }
+    (folder / "metrics.json").write_text(json.dumps({"protocols": [], "results": [row]}))
+    reports = export_model(checkpoint, folder / "model", images=folder / "road.png", evaluation=folder)
+    return folder / "model", reports
 
 
-def test_folder_has_files_record_report_and_card(exported: tuple[Path, list[Parity]], record: ModelRecord) -> None:
+def test_folder_has_files_config_report_and_card(exported: tuple[Path, list[Parity]], record: ModelRecord) -> None:
     folder, reports = exported
     assert sorted(path.name for path in folder.iterdir()) == [
-        "README.md", "model.onnx", "model.pt2", "record.json", "report.json",
+        "README.md", "config.json", "model.onnx", "model.pt2", "model.safetensors", "report.json",
     ]  # fmt: skip
-    assert [report.file for report in reports] == ["model.onnx", "model.pt2"]
+    assert [report.file for report in reports] == ["model.onnx", "model.pt2", "model.safetensors"]
     for report in reports:
         assert report.difference < 1e-5
-        assert report.images == 3
-        assert report.eager_ms > 0
-        assert report.exported_ms > 0
-    assert ModelRecord.from_plain(json.loads((folder / "record.json").read_text())) == record
-    assert json.loads((folder / "report.json").read_text()) == [dataclasses.asdict(report) for report in reports]
+        assert report.depth_difference < 1e-3
+        assert (report.batch, report.random, report.real) == ("any", 2, 1)
+        assert min(report.eager_ms, report.exported_ms, report.megabytes) > 0
+    assert ModelRecord.from_plain(json.loads((folder / "config.json").read_text())) == record
+    stored = json.loads((folder / "report.json").read_text())
+    assert stored["files"] == [dataclasses.asdict(report) for report in reports]
+    assert stored["versions"]["torch"] == torch.__version__
     card = (folder / "README.md").read_text()
     for text in (
         "ResNet(",
@@ -84,6 +100,8 @@ def test_folder_has_files_record_report_and_card(exported: tuple[Path, list[Pari
         "camera height 1.65 m",
         "synthetic",
         "model.onnx",
+        f"`{fingerprint(record.to_plain()['data'])}`",
+        "| model | eigen_lidar_x | 0.111 | 0.900 |",
     ):
         assert text in card, text
 
@@ -110,10 +128,10 @@ def test_program_runs_without_saunet(exported: tuple[Path, list[Parity]], checkp
 def test_predicting_from_onnx_does_not_import_torch(exported: tuple[Path, list[Parity]], tmp_path: Path) -> None:
     write_image(tmp_path / "in" / "x.png", np.zeros((20, 30, 3), np.uint8))
     code = (
-        "import sys\n"
-        "from saunet.infer.onnx import OnnxPredictor\n"
+        "import sys, saunet\n"
         "from saunet.infer.files import predict_files\n"
-        "predict_files(OnnxPredictor(sys.argv[1]), sys.argv[2], sys.argv[3])\n"
+        "outputs = ('colour', 'png16', 'npy', 'ply')\n"
+        "predict_files(saunet.load(sys.argv[1]), sys.argv[2], sys.argv[3], outputs, camera=(30, 30, 15, 10))\n"
         "print([name for name in ('torch', 'lightning', 'onnx') if name in sys.modules])"
     )
     arguments = [str(exported[0] / "model.onnx"), str(tmp_path / "in"), str(tmp_path / "out")]
@@ -130,8 +148,32 @@ def test_fixed_batch_is_filled_up(network: DepthNet, record: ModelRecord, tmp_pa
         assert np.allclose(got.disparity, wanted.disparity, atol=1e-5)
 
 
+def test_flip_averaging_is_that_of_the_network(
+    exported: tuple[Path, list[Parity]], checkpoint: Path, picture: Picture
+) -> None:
+    flipping = saunet.load(exported[0] / "model.onnx", flip=True)
+    expected = Predictor.from_checkpoint(checkpoint, flip=True).predict(picture).disparity
+    assert np.allclose(flipping.predict(picture).disparity, expected, atol=1e-5)
+    assert flipping.fingerprint != saunet.load(exported[0] / "model.onnx").fingerprint
+
+
+def test_a_folder_with_another_export_is_not_mixed(
+    exported: tuple[Path, list[Parity]], checkpoint: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(exported[0], tmp_path / "out")
+    with pytest.raises(ConfigError, match=r"holds config\.json already; choose another output folder"):
+        export_model(checkpoint, tmp_path / "out", ["safetensors"])
+    with pytest.raises(ConfigError, match="holds the model itself"):
+        export_model(tmp_path / "out", tmp_path / "out", ["safetensors"], overwrite=True)
+    export_model(exported[0], tmp_path / "out", ["safetensors"], overwrite=True)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "README.md", "config.json", "model.safetensors", "report.json",
+    ]  # fmt: skip
+    assert saunet.load(tmp_path / "out").fingerprint == saunet.load(checkpoint).fingerprint
+
+
 def test_a_file_that_differs_is_not_written(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(export._RUNNERS, "program", lambda path: lambda image: image[:, :1] * 0)
+    monkeypatch.setitem(export._RUNNERS, "program", lambda path, record: lambda image: image[:, :1] * 0 + 1)
     with pytest.raises(CheckpointError, match=r"model\.pt2 differs from the network by .* so it is not written"):
         export_model(checkpoint, tmp_path / "out", ["program"])
     assert list((tmp_path / "out").iterdir()) == []
@@ -151,17 +193,58 @@ def test_network_that_fixes_its_batch_size(network: DepthNet, record: ModelRecor
         assert program(torch.zeros(1, 3, 32, 64)).shape == (1, 1, 32, 64)
 
 
+TINY: dict[str, dict[str, Any]] = {
+    "StratifiedTransformer": {"dim": 8, "depths": (2, 1, 1, 1), "heads": (1, 1, 2, 2), "window": (4, 4, 4, 4)},
+    "SwinTransformer": {"dim": 8, "depths": (2, 1, 1, 1), "heads": (1, 1, 2, 2), "window": (4, 4, 4, 4)},
+    "ResNet": {"blocks": (1, 1, 1, 1)},
+    "PackNetEncoder": {"channels": (8, 8, 8, 8, 8), "blocks": (1, 1, 1, 1)},
+    "LiteMonoEncoder": {"dims": (8, 16, 16), "depths": (2, 2, 2), "rates": (2,), "last_rates": (2,), "heads": 2},
+}
+"""What makes an encoder of each kind small; its layers stay the same."""
+HANDFUL = [("stratified_tiny", "aunet"), ("lite_mono", "lite_mono"), ("resnet50", "unet")]
+
+
+def check_pair(encoder: str, decoder: str, record: ModelRecord, folder: Path) -> None:
+    """Export to ONNX with any number of images and compare, in disparity, with 1, 2 and 3."""
+    tiny = TINY[encoders.entry(encoder).target.__name__]
+    network = DepthNet(encoders.build(encoder, **tiny), decoders.partial(decoder)).eval()
+    height, width = 2 * network.size_divisor, 3 * network.size_divisor
+    own = dataclasses.replace(
+        record,
+        encoder={**node("encoder", encoder), **tiny}, decoder=node("decoder", decoder), height=height, width=width,
+    )  # fmt: skip
+    assert export_onnx(network, own, folder / "x.onnx") == "any"
+    predictor = OnnxPredictor(folder / "x.onnx")
+    for batch in (1, 2, 3):
+        image = torch.rand(batch, 3, height, width)
+        with torch.no_grad():
+            expected = network(image).disparity[0][:, 0].numpy()
+        assert np.abs(predictor.disparity(image.numpy()) - expected).max() < 1e-4
+
+
+@pytest.mark.parametrize(("encoder", "decoder"), HANDFUL)
+def test_networks_export_to_onnx(encoder: str, decoder: str, record: ModelRecord, tmp_path: Path) -> None:
+    check_pair(encoder, decoder, record, tmp_path)
+
+
 @pytest.mark.slow
-def test_windowed_attention_exports(record: ModelRecord, tmp_path: Path) -> None:
-    """The paper's encoder in small: its shifted windows and its attention survive, for one image at a time."""
-    encoder = encoders.build("stratified_nano", dim=16, depths=(2, 2, 2, 2), heads=(1, 2, 4, 8))
-    network = DepthNet(encoder, decoders.partial("aunet")).eval()
-    size = (2 * network.size_divisor, 4 * network.size_divisor)
-    export_onnx(network, dataclasses.replace(record, height=size[0], width=size[1]), tmp_path / "x.onnx", "one")
-    image = torch.rand(2, 3, *size)
-    with torch.no_grad():
-        expected = network(image).disparity[0][:, 0].numpy()
-    assert np.abs(OnnxPredictor(tmp_path / "x.onnx").disparity(image.numpy()) - expected).max() < 1e-4
+@pytest.mark.parametrize("decoder", decoders.names())
+@pytest.mark.parametrize("encoder", encoders.names())
+def test_every_pair_exports_to_onnx(encoder: str, decoder: str, record: ModelRecord, tmp_path: Path) -> None:
+    check_pair(encoder, decoder, record, tmp_path)
+
+
+@pytest.mark.slow
+def test_compiled_package(checkpoint: Path, tmp_path: Path) -> None:
+    if shutil.which("g++") is None:
+        pytest.skip("AOTInductor needs a C++ compiler")
+    (report,) = export_model(checkpoint, tmp_path / "out", ["compiled"], batch="one")
+    assert report.file == "model.aoti.pt2"
+    assert report.difference < 1e-5
+    image = torch.rand(1, 3, 32, 64)
+    compiled = torch._inductor.aoti_load_package(str(tmp_path / "out" / "model.aoti.pt2"))
+    expected = Predictor.from_checkpoint(checkpoint).network(image).disparity[0]
+    assert torch.allclose(compiled(image), expected, atol=1e-5)
 
 
 def test_refused(
@@ -171,6 +254,10 @@ def test_refused(
         export_model(checkpoint, tmp_path, ["onx"])
     with pytest.raises(CheckpointError, match="no checkpoint at"):
         export_model(tmp_path / "absent.ckpt", tmp_path)
+    with pytest.raises(ConfigError, match="formats is empty"):
+        export_model(checkpoint, tmp_path, [])
+    with pytest.raises(DataError, match=r"cannot read .*metrics\.json: No such file"):
+        export_model(checkpoint, tmp_path, evaluation=tmp_path)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match="needs the package onnx; run: pip install"):
         export_onnx(network, record, tmp_path / "x.onnx")
@@ -203,23 +290,3 @@ class TestOnnxFile:
     def test_device(self, exported: tuple[Path, list[Parity]]) -> None:
         with pytest.raises(ConfigError, match=r"device 'tpu' is not supported by this onnxruntime; available: .*cpu"):
             OnnxPredictor(exported[0] / "model.onnx", device="tpu")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("decoder", decoders.names())
-@pytest.mark.parametrize("encoder", encoders.names())
-def test_every_pair_exports(encoder: str, decoder: str, record: ModelRecord, tmp_path: Path) -> None:
-    network = DepthNet(encoders.build(encoder), decoders.partial(decoder)).eval()
-    height, width = 2 * network.size_divisor, 4 * network.size_divisor
-    own = dataclasses.replace(
-        record, encoder=node("encoder", encoder), decoder=node("decoder", decoder), height=height, width=width
-    )
-    export_onnx(network, own, tmp_path / "x.onnx", batch="one")
-    export_program(network, own, tmp_path / "x.pt2", batch="one")
-    image = torch.rand(1, 3, height, width)
-    with torch.no_grad():
-        expected = network(image).disparity[0]
-        program = torch.export.load(tmp_path / "x.pt2").module()(image)
-    got = OnnxPredictor(tmp_path / "x.onnx").disparity(image.numpy())
-    assert np.abs(got - expected[:, 0].numpy()).max() < 1e-4 * 10
-    assert (program - expected).abs().max() < 1e-4 * 10

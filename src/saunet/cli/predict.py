@@ -1,4 +1,4 @@
-"""``saunet-predict``: depth pictures of an image, a folder or a video."""
+"""``saunet-predict``: depth of an image, a folder, a pattern, a video or a camera, as pictures, points and videos."""
 
 from __future__ import annotations
 
@@ -8,37 +8,44 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from saunet.checks import ConfigError
+from saunet.checks import one_of
 from saunet.cli._app import pick_device, run
-from saunet.config import PredictConfig
 
 
 def predict(cfg: DictConfig) -> None:
-    """Predict the input into the output folder; a video becomes a side-by-side video."""
-    from saunet.infer.predictor import Predictor
-    from saunet.infer.video import VIDEO_SUFFIXES
+    """Predict the input into the output folder."""
+    from saunet.cli._scale import scale_predictor
+    from saunet.infer.files import OUTPUTS
+    from saunet.infer.load import load
+    from saunet.infer.video import CLIP_OUTPUTS, VIDEO_SUFFIXES
 
-    is_video = Path(cfg.input).suffix.lower() in VIDEO_SUFFIXES and not Path(cfg.input).is_dir()
-    if is_video:
-        _check_video(cfg)
-    predictor = Predictor.from_checkpoint(cfg.checkpoint, pick_device(cfg.device), cfg.flip, cfg.keep_aspect)
+    is_camera = cfg.input.isdecimal() and not Path(cfg.input).exists()
+    source = int(cfg.input) if is_camera else cfg.input
+    is_clip = is_camera or (Path(cfg.input).suffix.lower() in VIDEO_SUFFIXES and not Path(cfg.input).is_dir())
+    outputs = list(cfg.outputs if cfg.outputs is not None else ["mp4"] if is_clip else ["colour", "png16"])
+    for output in outputs:
+        one_of("outputs", output, (*OUTPUTS, *CLIP_OUTPUTS))
+    predictor = load(cfg.checkpoint, device=pick_device(cfg.device), flip=cfg.flip, keep_aspect=cfg.keep_aspect)
+    scale_predictor(cfg, predictor)
     print(f"depth is {predictor.unit}")
-    (_predict_video if is_video else _predict_images)(cfg, predictor)
+    shared = {
+        "palette": cfg.palette,
+        "camera": None if cfg.camera is None else list(cfg.camera),
+        "max_depth": cfg.max_depth,
+        "batch_size": cfg.batch_size,
+        "overwrite": cfg.overwrite,
+    }
+    clip_outputs = [output for output in outputs if is_clip or output in CLIP_OUTPUTS]
+    if not clip_outputs or len(clip_outputs) < len(outputs):
+        _predict_images(cfg, predictor, [output for output in outputs if output not in clip_outputs], shared)
+    if clip_outputs:
+        _predict_clip(cfg, predictor, source, clip_outputs, shared)
 
 
-def _predict_images(cfg: DictConfig, predictor: Any) -> None:
+def _predict_images(cfg: DictConfig, predictor: Any, outputs: list[str], shared: dict[str, Any]) -> None:
     from saunet.infer.files import predict_files
 
-    summary = predict_files(
-        predictor,
-        cfg.input,
-        cfg.output,
-        tuple(cfg.outputs),
-        palette=cfg.palette,
-        camera=None if cfg.camera is None else list(cfg.camera),
-        overwrite=cfg.overwrite,
-        batch_size=cfg.batch_size,
-    )
+    summary = predict_files(predictor, cfg.input, cfg.output, outputs, **shared)
     for failure in summary.failures:
         print(f"saunet-predict: {failure}", file=sys.stderr)
     print(f"{len(summary.written)} files written, {summary.skipped} images were finished before: {cfg.output}")
@@ -46,26 +53,20 @@ def _predict_images(cfg: DictConfig, predictor: Any) -> None:
         raise SystemExit(1)
 
 
-def _predict_video(cfg: DictConfig, predictor: Any) -> None:
-    from saunet.infer.video import render_video
+def _predict_clip(cfg: DictConfig, predictor: Any, source: Any, outputs: list[str], shared: dict[str, Any]) -> None:
+    from saunet.infer.load import locate
+    from saunet.infer.video import predict_clip
 
-    video = render_video(predictor, cfg.input, _video_path(cfg), palette=cfg.palette)
-    print(f"{video.frames} frames: {video.path}")
-    if video.missing:
-        print(f"saunet-predict: {cfg.input} ends {video.missing} frames early: it is truncated", file=sys.stderr)
+    odometer = None
+    if "trajectory" in outputs:
+        from saunet.infer.trajectory import Odometer
 
-
-def _video_path(cfg: DictConfig) -> Path:
-    return Path(cfg.output) / f"{Path(cfg.input).stem}_disparity.mp4"
-
-
-def _check_video(cfg: DictConfig) -> None:
-    default = PredictConfig()
-    for key in ("outputs", "camera", "batch_size"):
-        if cfg[key] != getattr(default, key):
-            raise ConfigError(f"{key} is for images and the input {cfg.input} is a video; leave {key} out")
-    if _video_path(cfg).exists() and not cfg.overwrite:
-        raise ConfigError(f"{_video_path(cfg)} exists; choose another output folder, or set overwrite=true")
+        odometer = Odometer.from_model(locate(cfg.checkpoint), predictor.scale, pick_device(cfg.device))
+    clip = predict_clip(predictor, source, cfg.output, outputs, odometer=odometer, max_frames=cfg.max_frames, **shared)
+    print(f"{clip.frames} frames: {', '.join(map(str, clip.paths))}")
+    if clip.missing:
+        message = f"{source} ends {clip.missing} frames earlier than it declares: it may be truncated"
+        print(f"saunet-predict: {message}", file=sys.stderr)
 
 
 def main() -> None:

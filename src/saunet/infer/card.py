@@ -1,7 +1,8 @@
-"""The model card that goes with an exported model: what it is, was trained on, and means."""
+"""The model card that goes with an exported model: what it is, was trained on, how good it is, and means."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,19 +11,30 @@ from saunet.infer.parity import Parity
 from saunet.infer.prediction import unit_of
 from saunet.record import ModelRecord
 
+_ERRORS = {"abs_rel": "Abs Rel ↓", "sq_rel": "Sq Rel ↓", "rmse": "RMSE ↓", "rmse_log": "RMSE log ↓"}
+_ERRORS |= {"a1": "δ1 ↑", "a2": "δ2 ↑", "a3": "δ3 ↑"}
 
-def model_card(record: ModelRecord, reports: Sequence[Parity] = ()) -> str:
+
+def model_card(record: ModelRecord, reports: Sequence[Parity] = (), metrics: Mapping[str, Any] | None = None) -> str:
     """Return the card as Markdown.
 
     Args:
         record: The model's record.
         reports: How the exported files compare with the original.
+        metrics: Content of an evaluation's ``metrics.json``.
     """
     parts = {"encoder": record.encoder, "decoder": record.decoder, "pose": record.pose}
+    data = record.to_plain()["data"]
     lines = [
+        "---",
+        "library_name: saunet",
+        "pipeline_tag: depth-estimation",
+        "tags: [depth-estimation, monocular-depth, self-supervised]",
+        "---",
+        "",
         "# Monocular depth model",
         "",
-        f"Predicts depth from one RGB image; trained without depth labels by saunet {record.version}.",
+        f"Predicts depth from one RGB image; trained by saunet {record.version} on video, by synthesising views.",
         "",
         "| | |",
         "|---|---|",
@@ -31,32 +43,29 @@ def model_card(record: ModelRecord, reports: Sequence[Parity] = ()) -> str:
         f"| unit of depth | {unit_of(record.scale)} |",
         *(f"| {slot} | {_describe(node)} |" for slot, node in parts.items() if node is not None),
         "",
+        "The whole configuration is in `config.json`.",
+        "",
+        "## Scale",
+        "",
+        f"Network depth x {record.scale.factor:g} is metres; the factor comes from {record.scale.source}."
+        if record.scale
+        else "Depth has no unit: training on one camera's video leaves one factor unknown.",
+        "",
         "## Trained on",
         "",
+        f"Fingerprint of this description: `{fingerprint(data)}` (sha256).",
+        "",
         "```json",
-        json.dumps(record.to_plain()["data"], indent=2),
+        json.dumps(data, indent=2),
         "```",
         "",
+        "## Quality",
+        "",
+        *_quality(metrics),
+        "",
     ]
-    if record.scale:
-        lines += [
-            f"Network depth x {record.scale.factor:g} is metres; the factor comes from {record.scale.source}.",
-            "",
-        ]
-    else:
-        lines += ["Depth has no unit: training on one camera's video leaves one factor unknown.", ""]
     if reports:
-        lines += [
-            "## Files, against the original network on the CPU",
-            "",
-            "| file | largest difference (share of the disparity range) | images | original | this file |",
-            "|---|---|---|---|---|",
-            *(
-                f"| `{r.file}` | {r.difference:.1e} | {r.images} | {r.eager_ms:.1f} ms | {r.exported_ms:.1f} ms |"
-                for r in reports
-            ),
-            "",
-        ]
+        lines += ["## Files, against the original network on the CPU", "", *parity_table(reports), ""]
     lines += [
         "## Limits",
         "",
@@ -68,16 +77,50 @@ def model_card(record: ModelRecord, reports: Sequence[Parity] = ()) -> str:
         "```python",
         "import saunet",
         "",
-        'prediction = saunet.load("last.ckpt").predict("road.png")  # the checkpoint, with torch',
-        "",
-        "from saunet.infer.onnx import OnnxPredictor",
-        "",
-        'prediction = OnnxPredictor("model.onnx").predict("road.png")  # the exported file, without torch',
+        'model = saunet.load("path/to/this/folder")  # or its model.onnx, which runs without torch',
+        'prediction = model.predict("road.png")',
         "prediction.depth, prediction.unit",
         "```",
         "",
     ]
     return "\n".join(lines)
+
+
+def parity_table(reports: Sequence[Parity]) -> list[str]:
+    """Return the comparisons as lines of a Markdown table."""
+    return [
+        "| file | MB | batch | disparity differs by (share of its range) | depth differs by | images: random + real "
+        "| original | this file |",
+        "|---|---:|---|---:|---:|---:|---:|---:|",
+        *(
+            f"| `{r.file}` | {r.megabytes:.1f} | {r.batch} | {r.difference:.1e} | {100 * r.depth_difference:.1g} % "
+            f"| {r.random} + {r.real} | {r.eager_ms:.1f} ms | {r.exported_ms:.1f} ms |"
+            for r in reports
+        ),
+    ]
+
+
+def fingerprint(value: Any) -> str:
+    """Return a short hash of plain data that does not depend on the order of keys."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _quality(metrics: Mapping[str, Any] | None) -> list[str]:
+    if metrics is None:
+        return ["No evaluation was given when this was exported (`evaluation=` the folder of a saunet-evaluate run)."]
+    return [
+        f"| predictor | protocol | {' | '.join(_ERRORS.values())} | images |",
+        f"|---|---|{'---:|' * (len(_ERRORS) + 1)}",
+        *(
+            f"| {row['predictor']} | {row.get('protocol', '')} "
+            f"| {' | '.join(_number(row.get(key)) for key in _ERRORS)} | {row.get('images', '')} |"
+            for row in metrics["results"]
+        ),
+    ]
+
+
+def _number(value: Any) -> str:
+    return f"{value:.3f}" if isinstance(value, int | float) else "-"
 
 
 def _describe(node: Mapping[str, Any]) -> str:

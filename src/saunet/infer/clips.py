@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from saunet.atomic import replacing
 from saunet.checks import DataError, one_of, positive
 from saunet.images import IMAGE_SUFFIXES, read_image
-from saunet.infer.sources import image_paths
+from saunet.infer.sources import find_sources, image_paths
 from saunet.videos import VIDEO_SUFFIXES, VideoReader
 
 __all__ = ["VIDEO_SUFFIXES", "ArrayClip", "Clip", "ImageClip", "Source", "VideoReader", "VideoWriter", "open_clip"]
@@ -95,6 +95,7 @@ class ImageClip:
 
     Args:
         source: A folder, a pattern such as ``frames/*.png``, or an image.
+        output_dir: Where results go, if anywhere; what lies there already is no part of the clip.
 
     Attributes:
         fps: 10, KITTI's frame rate; files do not say.
@@ -102,10 +103,11 @@ class ImageClip:
 
     Raises:
         DataError: if there is no image.
+        ConfigError: if the output folder holds the originals.
     """
 
-    def __init__(self, source: str | Path) -> None:
-        self._paths = image_paths(source)
+    def __init__(self, source: str | Path, output_dir: str | Path | None = None) -> None:
+        self._paths = image_paths(source) if output_dir is None else [s.path for s in find_sources(source, output_dir)]
         self.name, self.fps, self.declared = str(source), 10.0, len(self._paths)
 
     def __iter__(self) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:
@@ -142,16 +144,21 @@ Source = str | Path | int | Iterable[UInt8[np.ndarray, "_ _ 3"]]
 Clip = VideoReader | ImageClip | ArrayClip
 
 
-def open_clip(source: Source) -> Clip:
+def open_clip(source: Source, output_dir: str | Path | None = None) -> Clip:
     """Open what frames come from.
+
+    Args:
+        source: Where frames come from.
+        output_dir: Where results go, if anywhere; images that lie there already are no part of the clip.
 
     Raises:
         DataError: if it does not exist or holds no frame.
+        ConfigError: if the output folder holds the originals.
     """
     if isinstance(source, int):
         return VideoReader(source)
     if isinstance(source, str | Path):
         path = Path(source)
         images = path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES or glob.has_magic(str(source))
-        return ImageClip(source) if images else VideoReader(source)
+        return ImageClip(source, output_dir) if images else VideoReader(source)
     return ArrayClip(source)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8, UInt16
 
-from saunet.checks import ConfigError, one_of
+from saunet.checks import ConfigError, in_range, one_of
 
 PALETTES: tuple[str, ...] = ("magma", "inferno", "viridis", "turbo", "grey")
 """Names of the colour maps."""
@@ -31,6 +31,27 @@ def value_range(values: Float[np.ndarray, "..."], low: float = 0.5, high: float 
         return 0.0, 1.0
     bottom, top = (float(value) for value in np.percentile(finite, [low, high]))
     return (bottom, top) if top > bottom else (bottom, bottom + max(abs(bottom), 1.0) * 1e-3)
+
+
+class RunningRange:
+    """Colour limits that follow a clip slowly: an exponential mean of each frame's range.
+
+    Args:
+        memory: Weight of the past in [0, 1); 0 takes each frame's own range.
+    """
+
+    def __init__(self, memory: float = 0.95) -> None:
+        self.memory = in_range("memory", memory, 0.0, 0.999999)
+        self._limits: tuple[float, float] | None = None
+
+    def update(self, values: Float[np.ndarray, "h w"]) -> tuple[float, float]:
+        """Return the limits after seeing one more frame; the first frame sets them."""
+        low, high = value_range(values)
+        if self._limits is not None:
+            low = self.memory * self._limits[0] + (1 - self.memory) * low
+            high = self.memory * self._limits[1] + (1 - self.memory) * high
+        self._limits = (low, high)
+        return self._limits
 
 
 def colourise(

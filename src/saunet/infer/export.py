@@ -1,225 +1,195 @@
-"""A trained depth network as a file that runs without saunet: ONNX or torch.export, checked against the original."""
+"""A trained model as a folder to deploy or share: exported files, each checked against the network, and a card."""
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
 import json
-import logging
-from collections.abc import Callable, Iterator, Sequence
+import platform
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch._dynamo.exc import UserError
-from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from saunet.atomic import replacing, write_bytes
-from saunet.checkpoint import read_checkpoint
-from saunet.checks import CheckpointError, ConfigError, one_of
+from saunet.checks import CheckpointError, ConfigError, DataError, one_of
 from saunet.images import network_input, read_image
+from saunet.infer import exporters
 from saunet.infer.card import model_card
-from saunet.infer.onnx import INPUT, METADATA, OUTPUT, open_session
+from saunet.infer.folder import CONFIG, WEIGHTS, read_model, restored
 from saunet.infer.parity import Parity, Run, compare
+from saunet.infer.progress import bar
+from saunet.infer.sources import image_paths
 from saunet.models.depth import DepthNet
 from saunet.record import ModelRecord
 
-FORMATS: tuple[str, ...] = ("onnx", "program")
-"""``onnx``: model.onnx, for onnxruntime, TensorRT and others. ``program``: model.pt2, for torch alone."""
-BATCHES: tuple[str, ...] = ("auto", "any", "one")
-"""``any``: any number of images at once. ``one``: exactly one. ``auto``: any where the network allows it, else one."""
+FORMATS: tuple[str, ...] = ("onnx", "program", "compiled", "safetensors")
+"""``onnx``: for onnxruntime, TensorRT and others. ``program`` (torch.export): for torch without saunet. ``compiled``
+(AOTInductor): machine code, for torch or C++. ``safetensors``: the weights, for saunet and the hub."""
+DEFAULT_FORMATS: tuple[str, ...] = ("onnx", "program", "safetensors")
 TOLERANCE = 1e-4
 """Largest difference to the original network that passes, as a share of the range of disparity."""
+FILES = {"onnx": "model.onnx", "program": "model.pt2", "compiled": "model.aoti.pt2", "safetensors": WEIGHTS}
+REPORT, CARD = "report.json", "README.md"
 
-_FILES = {"onnx": "model.onnx", "program": "model.pt2"}
-_LARGEST_BATCH = 256
-_TRACING_ERRORS = (UserError, RuntimeError, ValueError)
-
-
-class FinestDisparity(nn.Module):
-    """A depth network that returns only its full-resolution disparity: what is exported."""
-
-    def __init__(self, network: DepthNet) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return disparity in 1/metre (up to scale) of RGB in [0, 1]."""
-        return self.network(image).disparity[0]  # type: ignore[no-any-return]
+_REAL_AT_MOST = 8
 
 
 def export_model(
     checkpoint: str | Path,
     output_dir: str | Path,
-    formats: Sequence[str] = FORMATS,
+    formats: Sequence[str] = DEFAULT_FORMATS,
     *,
-    images: Sequence[str | Path] = (),
+    images: str | Path | Sequence[str | Path] = (),
     batch: str = "auto",
+    evaluation: str | Path | None = None,
+    overwrite: bool = False,
+    progress: bool = True,
 ) -> list[Parity]:
-    """Export a checkpoint's depth network into a folder, with its record, a parity report and a model card.
+    """Export a trained model's depth network into a folder, with its config, a parity report and a model card.
 
     Args:
-        checkpoint: A checkpoint written by ``saunet-train``.
-        output_dir: Where ``model.onnx``, ``model.pt2``, ``record.json``, ``report.json`` and ``README.md`` go.
+        checkpoint: A checkpoint written by ``saunet-train``, or a folder written by this function.
+        output_dir: Where the files of `FILES`, ``config.json``, ``report.json`` and ``README.md`` go.
         formats: Which files to write; see `FORMATS`.
-        images: Real images to compare on, besides random ones.
-        batch: How many images the files take at once; see `BATCHES`.
+        images: Real images to compare on, besides random ones: files, folders or patterns; at most eight are taken,
+            evenly.
+        batch: How many images the files take at once; see `saunet.infer.exporters.BATCHES`.
+        evaluation: A ``metrics.json`` of ``saunet-evaluate``, or the folder that holds it; goes into the card.
+        overwrite: Replace what an earlier export left in the folder.
+        progress: Show a progress bar on a terminal.
 
     Returns:
         One comparison a format.
 
     Raises:
-        ConfigError: for an unknown format, a package that is missing, or a network that cannot be exported this way.
+        ConfigError: for an unknown format, a package that is missing, a network that cannot be exported this way, or a
+            folder that holds another export.
         CheckpointError: if the checkpoint cannot be read, or a file would differ from the original.
-        DataError: if an image cannot be read or the system refuses to write.
+        DataError: if an image or the evaluation cannot be read, or the system refuses to write.
     """
     for name in formats:
         one_of("formats", name, FORMATS)
-    one_of("batch", batch, BATCHES)
-    read = read_checkpoint(checkpoint)
-    network, record = read.networks()[0].eval(), read.record
-    inputs = _inputs(record, images)
+    if not formats:
+        raise ConfigError(f"formats is empty; allowed: {', '.join(FORMATS)}")
+    one_of("batch", batch, exporters.BATCHES)
+    read = read_model(checkpoint)
     folder = Path(output_dir)
-    span = 1 / record.min_depth - 1 / record.max_depth
+    if read.path.name == WEIGHTS and read.path.resolve().parent == folder.resolve():
+        raise ConfigError(f"the output folder {folder} holds the model itself; choose another")
+    metrics = read_metrics(evaluation) if evaluation is not None else None
+    (network, pose), record = read.networks(), read.record
+    network.eval()
+    random, real = _random(record), _real(record, images)
+    _clear(folder, overwrite)
+    eager, span = exporters.run_eager(network), 1 / record.min_depth - 1 / record.max_depth
     reports = []
-    for name in dict.fromkeys(formats):
-        path = folder / _FILES[name]
-        with replacing(path) as temporary:
-            _EXPORTERS[name](network, record, temporary, batch)
-            report = compare(path.name, _run_eager(network), _RUNNERS[name](temporary), inputs, span)
-            if not report.difference <= TOLERANCE:
-                raise CheckpointError(
-                    f"the exported {path.name} differs from the network by {report.difference:.2g} of the disparity "
-                    f"range, more than {TOLERANCE:g}, so it is not written; report the encoder and decoder"
-                )
-        reports.append(report)
-    plain = record.to_plain()
-    write_bytes(folder / "record.json", (json.dumps(plain, indent=2) + "\n").encode())
-    write_bytes(folder / "report.json", (json.dumps([asdict(report) for report in reports], indent=2) + "\n").encode())
-    write_bytes(folder / "README.md", model_card(record, reports).encode())
+    with bar(progress) as shown:
+        task = shown.add_task("exporting", total=len(dict.fromkeys(formats)))
+        for name in dict.fromkeys(formats):
+            path = folder / FILES[name]
+            with replacing(path) as temporary:
+                takes = "any"
+                if name == "safetensors":
+                    parts = {"depth": network} if pose is None else {"depth": network, "pose": pose}
+                    exporters.write_safetensors(_state(parts), temporary)
+                else:
+                    takes = _EXPORTERS[name](network, record, temporary, batch)
+                size = temporary.stat().st_size / 2**20
+                run = _RUNNERS[name](temporary, record)
+                report = compare(path.name, eager, run, random, real, span, takes, size)
+                if not report.difference <= TOLERANCE:
+                    raise CheckpointError(
+                        f"the exported {path.name} differs from the network by {report.difference:.2g} of the "
+                        f"disparity range, more than {TOLERANCE:g}, so it is not written; report encoder and decoder"
+                    )
+            reports.append(report)
+            shown.advance(task)
+    about = {"threads": torch.get_num_threads(), "machine": platform.machine(), "versions": _versions()}
+    content = {"tolerance": TOLERANCE, **about, "files": [asdict(report) for report in reports]}
+    write_bytes(folder / REPORT, _json(content))
+    write_bytes(folder / CARD, model_card(record, reports, metrics).encode())
+    write_bytes(folder / CONFIG, _json(record.to_plain()))  # last: with it, the folder is a model
     return reports
 
 
-def export_onnx(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> None:
-    """Write a depth network as ONNX, with its record inside, so that one file is enough to predict from.
-
-    Args:
-        network: The network.
-        record: Its record; gives the input size and goes into the file.
-        path: The file to write.
-        batch: How many images it takes at once; see `BATCHES`.
+def read_metrics(path: str | Path) -> Mapping[str, Any]:
+    """Read the ``metrics.json`` of an evaluation.
 
     Raises:
-        ConfigError: if the packages are missing, or the network cannot be exported this way.
+        DataError: if it is missing or is not one.
     """
-    for package in ("onnx", "onnxscript"):
-        if importlib.util.find_spec(package) is None:
-            raise ConfigError(f"ONNX export needs the package {package}; run: pip install 'saunet[export]'")
-    # Attention in its plain form: what the fused kernel returns has strides that the exporter's own run of it has not.
-    with sdpa_kernel(SDPBackend.MATH):
-        program = _program(network, record, batch)
+    path = Path(path)
+    path = path / "metrics.json" if path.is_dir() else path
     try:
-        with _quiet():
-            exported: Any = torch.onnx.export(
-                program, input_names=[INPUT], output_names=[OUTPUT], dynamo=True, verbose=False
-            )
-    except torch.onnx.OnnxExporterError as reason:
-        names = f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
-        raise ConfigError(f"{names} cannot be exported to ONNX; export the format 'program'") from reason
-    exported.model.metadata_props[METADATA] = json.dumps(record.to_plain())
-    exported.save(str(path))
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if [row for row in content["results"] if not isinstance(row["predictor"], str)]:
+            raise ValueError("a row without predictor")
+    except OSError as reason:
+        raise DataError(f"cannot read {path}: {reason.strerror}; give the folder of a saunet-evaluate run") from reason
+    except (ValueError, TypeError, KeyError) as reason:
+        raise DataError(f"{path} is not an evaluation ({reason}); give the metrics.json of saunet-evaluate") from reason
+    return content  # type: ignore[no-any-return]
 
 
-def export_program(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> None:
-    """Write a depth network as a torch.export program: ``torch.export.load(path).module()(image)`` needs no saunet.
-
-    Args:
-        network: The network.
-        record: Its record; gives the input size and goes into the file.
-        path: The file to write.
-        batch: How many images it takes at once; see `BATCHES`.
-
-    Raises:
-        ConfigError: if the network cannot be exported this way.
-    """
-    extra = {METADATA: json.dumps(record.to_plain())}
-    torch.export.save(_program(network, record, batch), path, extra_files=extra)
-
-
-def _program(network: DepthNet, record: ModelRecord, batch: str) -> torch.export.ExportedProgram:
-    one_of("batch", batch, BATCHES)
-    module = FinestDisparity(network).eval()
-    names = f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
-    if batch != "one":
+def _clear(folder: Path, overwrite: bool) -> None:
+    """Remove an earlier export, its config first: what is left of it must not be taken for the new model."""
+    names = (CONFIG, *FILES.values(), REPORT, CARD)
+    present = [name for name in names if (folder / name).exists()]
+    if present and not overwrite:
+        raise ConfigError(f"{folder} holds {present[0]} already; choose another output folder, or set overwrite=true")
+    for name in present:
         try:
-            return _trace(module, torch.zeros(2, 3, record.height, record.width), dynamic=True)
-        except _TRACING_ERRORS as reason:
-            if batch == "any":
-                raise ConfigError(
-                    f"{names} fixes its batch size when it is exported; export with batch=one"
-                ) from reason
-    try:
-        return _trace(module, torch.zeros(1, 3, record.height, record.width), dynamic=False)
-    except _TRACING_ERRORS as reason:
-        raise ConfigError(f"{names} cannot be exported: {str(reason).splitlines()[0]}") from reason
+            (folder / name).unlink()
+        except OSError as reason:
+            raise DataError(f"cannot replace {folder / name}: {reason.strerror or reason}") from reason
 
 
-def _trace(module: nn.Module, image: Tensor, dynamic: bool) -> torch.export.ExportedProgram:
-    shapes = {"image": {0: torch.export.Dim("batch", min=1, max=_LARGEST_BATCH)}} if dynamic else None
-    with torch.no_grad(), _quiet():
-        program: torch.export.ExportedProgram = torch.export.export(module, (image,), dynamic_shapes=shapes)
-        # decomposing into nothing new inlines autocast regions, which cannot be saved
-        return program.run_decompositions({})  # type: ignore[no-any-return]
+def _random(record: ModelRecord) -> list[NDArray[np.float32]]:
+    images = np.random.default_rng(0).random((2, 1, 3, record.height, record.width), dtype=np.float32)
+    return list(images)
 
 
-def _inputs(record: ModelRecord, images: Sequence[str | Path]) -> list[NDArray[np.float32]]:
-    size = (record.height, record.width)
-    random = np.random.default_rng(0).random((2, 3, *size), dtype=np.float32)
-    return [image[None] for image in (*random, *(network_input(read_image(path), *size) for path in images))]
+def _real(record: ModelRecord, images: str | Path | Sequence[str | Path]) -> list[NDArray[np.float32]]:
+    several = [images] if isinstance(images, str | Path) else list(images)
+    paths = [path for item in several for path in image_paths(item)]
+    chosen = [paths[index] for index in np.linspace(0, len(paths) - 1, min(len(paths), _REAL_AT_MOST)).astype(int)]
+    return [network_input(read_image(path), record.height, record.width)[None] for path in chosen]
 
 
-def _run_eager(network: DepthNet) -> Run:
-    def run(image: NDArray[np.float32]) -> NDArray[np.float32]:
-        with torch.no_grad():
-            return network(torch.from_numpy(image)).disparity[0].numpy()  # type: ignore[no-any-return]
-
-    return run
+def _state(parts: Mapping[str, torch.nn.Module]) -> dict[str, torch.Tensor]:
+    return {f"{part}.{name}": value for part, module in parts.items() for name, value in module.state_dict().items()}
 
 
-def _run_onnx(path: Path) -> Run:
-    session = open_session(path, threads=torch.get_num_threads())
-    return lambda image: session.run([OUTPUT], {INPUT: image})[0]
+def _run_weights(path: Path, record: ModelRecord) -> Run:
+    return exporters.run_eager(restored(path, record).networks()[0].eval())
 
 
-def _run_program(path: Path) -> Run:
-    module = torch.export.load(path).module()
-
-    def run(image: NDArray[np.float32]) -> NDArray[np.float32]:
-        with torch.no_grad():
-            return module(torch.from_numpy(image)).numpy()  # type: ignore[no-any-return]
-
-    return run
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence the exporter's notes about packages that saunet does not use."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
+def _versions() -> dict[str, str]:
+    found = {}
+    for package in ("saunet", "torch", "onnx", "onnxruntime", "onnxscript", "safetensors"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
 
 
-_EXPORTERS: dict[str, Callable[[DepthNet, ModelRecord, Path, str], None]] = {
-    "onnx": export_onnx,
-    "program": export_program,
+def _json(value: object) -> bytes:
+    return (json.dumps(value, indent=2) + "\n").encode()
+
+
+_EXPORTERS: dict[str, Callable[[DepthNet, ModelRecord, Path, str], str]] = {
+    "onnx": exporters.export_onnx,
+    "program": exporters.export_program,
+    "compiled": exporters.export_compiled,
 }
-_RUNNERS = {"onnx": _run_onnx, "program": _run_program}
+_RUNNERS: dict[str, Callable[[Path, ModelRecord], Run]] = {
+    "onnx": lambda path, record: exporters.run_onnx(path),
+    "program": lambda path, record: exporters.run_program(path),
+    "compiled": lambda path, record: exporters.run_compiled(path),
+    "safetensors": _run_weights,
+}

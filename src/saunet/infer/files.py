@@ -41,15 +41,16 @@ class Summary:
 
 
 @dataclass(frozen=True, slots=True)
-class _Style:
+class Style:
     """How results are drawn and written."""
 
-    palette: str
-    limits: tuple[float, float] | None
-    camera: Camera | None
-    max_depth: float | None
+    palette: str = "magma"
+    limits: tuple[float, float] | None = None
+    camera: Camera | None = None
+    max_depth: float | int | None = None
 
     def plain(self) -> dict[str, object]:
+        """Return the style as plain data."""
         K = self.camera.K.tolist() if self.camera else None
         return {"palette": self.palette, "limits": self.limits, "camera": K, "max_depth": self.max_depth}
 
@@ -62,8 +63,8 @@ def predict_files(
     *,
     palette: str = "magma",
     limits: tuple[float, float] | None = None,
-    camera: Camera | Sequence[float] | None = None,
-    max_depth: float | None = None,
+    camera: Camera | Sequence[float | int] | None = None,
+    max_depth: float | int | None = None,
     batch_size: int = 1,
     overwrite: bool = False,
     progress: bool = True,
@@ -106,7 +107,7 @@ def predict_files(
     _check_folder(folder, sources)
     if camera is not None and not isinstance(camera, Camera):
         camera = Camera.from_numbers(camera, *_first_size(sources))
-    style = _Style(palette, limits, camera, max_depth)
+    style = Style(palette, limits, camera, max_depth)
     settings = {"model": predictor.fingerprint, "unit": predictor.unit, **style.plain()}
     claimed = _claimed(folder, settings, overwrite)
     todo = [source for source in sources if overwrite or _missing(source, folder, outputs)]
@@ -124,9 +125,7 @@ def predict_files(
                     failures.append(str(error))
             for source, result in zip(readable, predictor.predict_batch(images), strict=True):
                 for output in outputs if overwrite else _missing(source, folder, outputs):
-                    path = folder / f"{source.stem}{_ENDINGS[output]}"
-                    _WRITERS[output](path, result, style)
-                    written.append(path)
+                    written.append(write_output(output, folder / source.stem, result, style))
                     if not claimed:
                         write_bytes(folder / MANIFEST, (json.dumps(settings, indent=2) + "\n").encode())
                         claimed = True
@@ -135,6 +134,17 @@ def predict_files(
         more = f" (and {len(failures) - 1} more images cannot be read)" if len(failures) > 1 else ""
         raise DataError(failures[0] + more)
     return Summary(tuple(written), len(sources) - len(todo), tuple(failures))
+
+
+def write_output(output: str, stem: Path, result: Prediction, style: Style) -> Path:
+    """Write one of `OUTPUTS` of a prediction, whole or not at all, and return its path: ``stem`` and an ending.
+
+    Raises:
+        DataError: if the system refuses to write.
+    """
+    path = stem.with_name(f"{stem.name}{_ENDINGS[output]}")
+    _WRITERS[output](path, result, style)
+    return path
 
 
 def _check_folder(folder: Path, sources: Sequence[Source]) -> None:
@@ -188,26 +198,26 @@ def _missing(source: Source, folder: Path, outputs: Sequence[str]) -> list[str]:
     return [output for output, path in paths.items() if not path.is_file() or path.stat().st_mtime < changed]
 
 
-def _write_colour(path: Path, result: Prediction, style: _Style) -> None:
+def _write_colour(path: Path, result: Prediction, style: Style) -> None:
     write_image(path, result.colour(style.limits, style.palette))
 
 
-def _write_png16(path: Path, result: Prediction, style: _Style) -> None:
+def _write_png16(path: Path, result: Prediction, style: Style) -> None:
     write_image(path, depth_to_png16(result.depth))
 
 
-def _write_npy(path: Path, result: Prediction, style: _Style) -> None:
+def _write_npy(path: Path, result: Prediction, style: Style) -> None:
     buffer = io.BytesIO()
     np.save(buffer, result.depth)
     write_bytes(path, buffer.getvalue())
 
 
-def _write_ply(path: Path, result: Prediction, style: _Style) -> None:
+def _write_ply(path: Path, result: Prediction, style: Style) -> None:
     assert style.camera is not None  # predict_files has asked for it
     write_ply(path, point_cloud(result, style.camera, max_depth=style.max_depth))
 
 
-_WRITERS: dict[str, Callable[[Path, Prediction, _Style], None]] = {
+_WRITERS: dict[str, Callable[[Path, Prediction, Style], None]] = {
     "colour": _write_colour,
     "png16": _write_png16,
     "npy": _write_npy,

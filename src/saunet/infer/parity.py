@@ -18,35 +18,65 @@ class Parity:
     """How an exported file compares with the network it came from."""
 
     file: str
+    batch: str
+    """How many images the file takes at once: ``any`` or ``one``."""
     difference: float
     """Largest difference in disparity, as a share of the network's range of disparity."""
-    images: int
-    """Images compared: random ones and, where given, real ones."""
+    depth_difference: float
+    """Largest relative difference in depth."""
+    random: int
+    """Random images compared."""
+    real: int
+    """Real images compared."""
     eager_ms: float
     """Median time of the original for one image, on the CPU."""
     exported_ms: float
     """Median time of the exported file for one image, on the CPU."""
+    megabytes: float = 0.0
+    """Size of the file."""
 
 
-def compare(file: str, eager: Run, exported: Run, images: Sequence[NDArray[np.float32]], span: float) -> Parity:
-    """Compare an exported file with the original.
+def compare(
+    file: str,
+    eager: Run,
+    exported: Run,
+    random: Sequence[NDArray[np.float32]],
+    real: Sequence[NDArray[np.float32]],
+    span: float,
+    batch: str = "one",
+    megabytes: float = 0.0,
+) -> Parity:
+    """Compare an exported file with the original, one image at a time, and where it takes any number, all at once too.
 
     Args:
         file: Its name, for the report.
         eager: The original.
         exported: The exported file.
-        images: Inputs, each 1 x 3 x h x w.
+        random: Inputs, each 1 x 3 x h x w.
+        real: Further inputs, made of real images.
         span: Largest minus smallest disparity that the network can give.
+        batch: How many images the file takes at once.
+        megabytes: Size of the file, for the report.
     """
-    difference = max(float(np.abs(exported(image) - eager(image)).max()) / span for image in images)
-    return Parity(file, difference, len(images), milliseconds(eager, images[0]), milliseconds(exported, images[0]))
+    inputs = [*random, *real]
+    if batch == "any":
+        inputs.append(np.concatenate(inputs[-4:]))
+    difference = relative = 0.0
+    for image in inputs:
+        got, wanted = exported(image).astype(np.float64), eager(image).astype(np.float64)
+        apart = np.abs(got - wanted)
+        difference = max(difference, float(apart.max()) / span)
+        relative = max(relative, float((apart / np.abs(got)).max()))  # |1/got - 1/wanted| * wanted
+    eager_ms, exported_ms = milliseconds([eager, exported], random[0])
+    return Parity(file, batch, difference, relative, len(random), len(real), eager_ms, exported_ms, round(megabytes, 3))
 
 
-def milliseconds(run: Run, image: NDArray[np.float32], repeats: int = 11) -> float:
-    """Return the median time of ``repeats`` runs, after two that do not count."""
-    times = []
-    for _ in range(repeats + 2):
-        start = time.perf_counter()
-        run(image)
-        times.append(time.perf_counter() - start)
-    return round(float(np.median(times[2:])) * 1000, 3)
+def milliseconds(runs: Sequence[Run], image: NDArray[np.float32], repeats: int = 11) -> list[float]:
+    """Return the median time of ``repeats`` calls of each, taken in turn, after two that do not count."""
+    times = np.zeros((repeats + 2, len(runs)))
+    for row in times:
+        for index, run in enumerate(runs):
+            start = time.perf_counter()
+            run(image)
+            row[index] = time.perf_counter() - start
+    return [round(float(value) * 1000, 3) for value in np.median(times[2:], axis=0)]

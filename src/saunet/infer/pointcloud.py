@@ -54,17 +54,22 @@ class Camera:
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float | int], height: int, width: int) -> Camera:
-        """Read ``fx, fy, cx, cy`` or the nine numbers of K, row by row.
+        """Read ``fx, fy, cx, cy``, the nine numbers of K, row by row, or one: the horizontal field of view in degrees.
 
         Raises:
             ConfigError: for another count, or if K cannot be a camera's.
         """
         values = [float(number) for number in numbers]
+        if len(values) == 1:
+            return cls.from_field_of_view(values[0], height, width)
         if len(values) == 4:
             fx, fy, cx, cy = values
             values = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
         if len(values) != 9:
-            raise ConfigError(f"intrinsics have {len(values)} numbers; needed: fx, fy, cx, cy, or the nine of K")
+            raise ConfigError(
+                f"intrinsics have {len(values)} numbers; needed: fx, fy, cx, cy, "
+                "or the nine of K, or one: a horizontal field of view in degrees"
+            )
         return cls(np.array(values).reshape(3, 3), height, width)
 
     @classmethod
@@ -76,16 +81,17 @@ class Camera:
 
     def resized(self, height: int, width: int) -> Camera:
         """Return the camera of the same picture at another size."""
-        import torch  # here, so that prediction from an exported file starts without torch
-
-        from saunet.geometry.camera import scale_intrinsics
-
-        K = scale_intrinsics(torch.from_numpy(self.K.astype(np.float64)), width / self.width, height / self.height)
-        return Camera(K.numpy(), height, width)
+        y, x = height / self.height, width / self.width
+        K = self.K.astype(np.float64)
+        K[0, :2] *= x
+        K[1, :2] *= y
+        K[0, 2] = (self.K[0, 2] + 0.5) * x - 0.5  # as geometry.camera.scale_intrinsics, which needs torch
+        K[1, 2] = (self.K[1, 2] + 0.5) * y - 0.5
+        return Camera(K, height, width)
 
 
 def point_cloud(
-    prediction: Prediction, camera: Camera, *, max_depth: float | None = None, stride: int = 1, edge: float = 0.1
+    prediction: Prediction, camera: Camera, *, max_depth: float | int | None = None, stride: int = 1, edge: float = 0.1
 ) -> PointCloud:
     """Return a prediction's pixels as points in space, coloured by the image.
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from saunet.checkpoint import read_checkpoint
 from saunet.checks import ConfigError
+from saunet.infer.folder import read_model
 from saunet.infer.pipeline import ImagePredictor
 from saunet.metrics.functional import flip_blend
 from saunet.models.depth import DepthNet
@@ -50,13 +50,13 @@ class Predictor(ImagePredictor):
     def from_checkpoint(
         cls, path: str | Path, device: str | torch.device = "cpu", flip: bool = False, keep_aspect: bool = False
     ) -> Predictor:
-        """Load a trained model; nothing in the file is run.
+        """Load a trained model, a checkpoint or an exported folder; nothing in the file is run.
 
         Raises:
             CheckpointError: if the file is missing, broken, or not a saunet checkpoint.
             ConfigError: if the device does not exist.
         """
-        checkpoint = read_checkpoint(path)
+        checkpoint = read_model(path)
         depth, _ = checkpoint.networks()
         record = checkpoint.record
         return cls(depth, record.height, record.width, device, record.scale, flip, keep_aspect)

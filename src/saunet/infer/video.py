@@ -1,55 +1,44 @@
-"""Side-by-side depth videos, one frame at a time: memory does not grow, and colours do not flicker."""
+"""Clips in, results out, one pass and a few frames at a time: memory does not grow, and colours do not flicker."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-from jaxtyping import Float, UInt8
-
-from saunet.checks import ConfigError, in_range, one_of
-from saunet.infer.clips import VIDEO_SUFFIXES, Source, VideoReader, VideoWriter, open_clip
-from saunet.infer.colour import PALETTES, colourise, value_range
-from saunet.infer.panel import fit, label
+from saunet.checks import ConfigError, one_of, positive
+from saunet.infer.clips import VIDEO_SUFFIXES, Clip, Source, VideoReader, VideoWriter, open_clip
+from saunet.infer.colour import PALETTES, RunningRange
+from saunet.infer.files import OUTPUTS, Style
 from saunet.infer.pipeline import ImagePredictor
+from saunet.infer.pointcloud import Camera
 from saunet.infer.progress import bar
+from saunet.infer.sinks import LAYOUTS, FrameSink, Sink, TrajectorySink, VideoSink, ViewerSink, compose
+
+if TYPE_CHECKING:
+    from saunet.infer.trajectory import Odometer
 
 __all__ = [
+    "CLIP_OUTPUTS",
     "LAYOUTS",
     "VIDEO_SUFFIXES",
+    "ClipSummary",
     "RunningRange",
     "VideoReader",
     "VideoSummary",
     "VideoWriter",
     "compose",
+    "predict_clip",
     "render_video",
 ]
 
-LAYOUTS: tuple[str, ...] = ("auto", "stacked", "beside")
-"""Depth below the image, beside it, or whichever comes nearer to a screen's shape."""
+CLIP_OUTPUTS: tuple[str, ...] = ("mp4", "html", "trajectory")
+"""What can be written for a clip as a whole, besides `saunet.infer.files.OUTPUTS` for each of its frames."""
 
-
-class RunningRange:
-    """Colour limits that follow a clip slowly: an exponential mean of each frame's range.
-
-    Args:
-        memory: Weight of the past in [0, 1); 0 takes each frame's own range.
-    """
-
-    def __init__(self, memory: float = 0.95) -> None:
-        self.memory = in_range("memory", memory, 0.0, 0.999999)
-        self._limits: tuple[float, float] | None = None
-
-    def update(self, values: Float[np.ndarray, "h w"]) -> tuple[float, float]:
-        """Return the limits after seeing one more frame; the first frame sets them."""
-        low, high = value_range(values)
-        if self._limits is not None:
-            low = self.memory * self._limits[0] + (1 - self.memory) * low
-            high = self.memory * self._limits[1] + (1 - self.memory) * high
-        self._limits = (low, high)
-        return self._limits
+_NAMES = {"mp4": "_disparity.mp4", "html": "_points.html", "trajectory": "_trajectory.png"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +46,17 @@ class VideoSummary:
     """What `render_video` did."""
 
     path: Path
+    frames: int
+    missing: int
+    """Frames that the source claimed to hold and did not give: a truncated file."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClipSummary:
+    """What `predict_clip` did."""
+
+    paths: tuple[Path, ...]
+    """The files written; for files a frame, the folder."""
     frames: int
     missing: int
     """Frames that the source claimed to hold and did not give: a truncated file."""
@@ -99,46 +99,149 @@ def render_video(
     one_of("layout", layout, LAYOUTS)
     one_of("palette", palette, PALETTES)
     limits = RunningRange(memory)
-    name = f"disparity ({'1/metre' if predictor.scale else 'relative'})" if labels else None
-    camera = isinstance(source, int)
     if isinstance(source, str | Path) and Path(source).resolve() == Path(output).resolve():
         raise ConfigError(f"the output {output} is the source; choose another name")
     clip = open_clip(source)
-    try:
-        with VideoWriter(output, fps if fps is not None else clip.fps) as writer, bar(progress) as shown:
-            task = shown.add_task("rendering", total=max_frames or clip.declared)
-            try:
-                for frame in itertools.islice(clip, max_frames):
-                    result = predictor.predict(frame)
-                    painted = colourise(result.disparity, limits.update(result.disparity), palette)
-                    writer.write(compose(frame, painted, layout, name))
-                    shown.advance(task)
-            except KeyboardInterrupt:
-                if not camera or writer.count == 0:
-                    raise
-    finally:
-        clip.close()
-    declared = clip.declared if clip.declared is not None and max_frames is None else 0
-    return VideoSummary(Path(output), writer.count, max(0, declared - writer.count))
+    with contextlib.closing(clip):
+        sink = VideoSink(Path(output), fps if fps is not None else clip.fps, layout, palette, labels)
+        camera = isinstance(source, int)
+        frames = _run(predictor, clip, [sink], limits, 1, max_frames, progress, finish=camera)
+    return VideoSummary(Path(output), frames, _missing(clip, frames, max_frames))
 
 
-def compose(
-    image: UInt8[np.ndarray, "h w 3"],
-    painted: UInt8[np.ndarray, "_ _ 3"],
-    layout: str = "auto",
+def predict_clip(
+    predictor: ImagePredictor,
+    source: Source,
+    output_dir: str | Path,
+    outputs: Sequence[str] = ("mp4",),
+    *,
     name: str | None = None,
-) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return one frame of a side-by-side video.
+    fps: float | int | None = None,
+    layout: str = "auto",
+    palette: str = "magma",
+    memory: float = 0.95,
+    camera: Camera | Sequence[float | int] | None = None,
+    max_depth: float | int | None = None,
+    odometer: Odometer | None = None,
+    batch_size: int = 1,
+    max_frames: int | None = None,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> ClipSummary:
+    """Predict a clip once and write any of its results, with colours that are stable over the clip.
+
+    A batch of frames is in memory at a time. Ctrl-C ends a camera's results cleanly; else it discards those that are
+    not complete, and files of single frames stay.
 
     Args:
-        image: RGB.
-        painted: The disparity in colours.
-        layout: ``"stacked"``, ``"beside"``, or ``"auto"``, which stacks pictures wider than 4:3.
-        name: What the painted half shows; None draws no names.
+        predictor: The model.
+        source: A video file, a folder or pattern of images, a camera's number, or RGB frames.
+        output_dir: Where results go; made if missing.
+        outputs: ``"mp4"`` (image and disparity), ``"html"`` (points to orbit, clip to scrub through), ``"trajectory"``
+            (from above, and as KITTI poses), and any of `saunet.infer.files.OUTPUTS` for each frame.
+        name: What results are called; after the source by default.
+        fps: Frames a second; the source's by default, 10 for images.
+        layout: Of the video: ``"stacked"``, ``"beside"``, or ``"auto"``.
+        palette: Colour map.
+        memory: Weight of the past in the running colour range; see `RunningRange`.
+        camera: True intrinsics, which ``"ply"`` and ``"html"`` need: a `Camera`, or numbers as `Camera.from_numbers`
+            takes them, in pixels of the first frame.
+        max_depth: Leave points out that are farther, in the unit of depth.
+        odometer: What ``"trajectory"`` needs.
+        batch_size: Frames that go through the network together.
+        max_frames: Stop after so many frames.
+        overwrite: Replace results that are already there.
+        progress: Show a progress bar on a terminal.
+
+    Raises:
+        ConfigError: for an unknown word, points without a camera, a trajectory without pose network, or results that
+            are already there.
+        DataError: if the source cannot be read or the system refuses to write.
     """
-    height, width = image.shape[:2]
-    halves = [image, fit(painted, height, width)]
-    if name is not None:
-        halves = [np.concatenate([label(t, width), h]) for t, h in zip(("input", name), halves, strict=True)]
-    stacked = layout == "stacked" or (layout == "auto" and width * 3 > height * 4)
-    return np.concatenate(halves, axis=0 if stacked else 1)
+    for output in outputs:
+        one_of("outputs", output, (*OUTPUTS, *CLIP_OUTPUTS))
+    if not outputs:
+        raise ConfigError(f"outputs is empty; allowed: {', '.join((*OUTPUTS, *CLIP_OUTPUTS))}")
+    one_of("palette", palette, PALETTES)
+    positive("batch_size", batch_size)
+    for output in outputs:
+        if output in ("ply", "html") and camera is None:
+            raise ConfigError(
+                f"outputs has '{output}', which needs the camera's true intrinsics; give camera fx, fy, cx, cy, "
+                "or one number, the horizontal field of view in degrees"
+            )
+    if "trajectory" in outputs and odometer is None:
+        raise ConfigError("outputs has 'trajectory', which needs a model with a pose network")
+    title = name or _name(source)
+    limits = RunningRange(memory)
+    clip = open_clip(source, output_dir)
+    with contextlib.closing(clip):
+        rate = fps if fps is not None else clip.fps
+        folder, sinks = Path(output_dir), list[Sink]()
+        paths = {output: folder / f"{title}{_NAMES[output]}" for output in CLIP_OUTPUTS}
+        frame_outputs = [output for output in dict.fromkeys(outputs) if output in OUTPUTS]
+        if "mp4" in outputs:
+            sinks.append(VideoSink(paths["mp4"], rate, layout, palette))
+        if frame_outputs:
+            sinks.append(FrameSink(folder / title, frame_outputs, Style(palette, max_depth=max_depth), camera))
+        if "html" in outputs and camera is not None:
+            sinks.append(ViewerSink(paths["html"], camera, rate, max_depth, title))
+        if "trajectory" in outputs and odometer is not None:
+            sinks.append(TrajectorySink(paths["trajectory"], odometer))
+        written = tuple(path for sink in sinks for path in sink.paths)
+        for path in written:
+            if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+                raise ConfigError(f"{path} exists; choose another output folder, or set overwrite=true")
+        finish = isinstance(source, int)
+        frames = _run(predictor, clip, sinks, limits, batch_size, max_frames, progress, finish=finish)
+    return ClipSummary(written, frames, _missing(clip, frames, max_frames))
+
+
+def _run(
+    predictor: ImagePredictor,
+    clip: Clip,
+    sinks: Sequence[Sink],
+    limits: RunningRange,
+    batch_size: int,
+    max_frames: int | None,
+    progress: bool,
+    *,
+    finish: bool,
+) -> int:
+    """Predict every frame into every sink; with ``finish``, Ctrl-C ends the clip instead of discarding results."""
+    count = 0
+    with contextlib.ExitStack() as stack:
+        for sink in sinks:
+            stack.enter_context(sink)
+        shown = stack.enter_context(bar(progress))
+        task = shown.add_task("rendering", total=max_frames or clip.declared)
+        frames = itertools.islice(clip, max_frames)
+        try:
+            while batch := list(itertools.islice(frames, batch_size)):
+                for result in predictor.predict_batch(batch):
+                    now = limits.update(result.disparity)
+                    for sink in sinks:
+                        sink.add(result, now)
+                    count += 1
+                shown.advance(task, len(batch))
+        except KeyboardInterrupt:
+            if not finish or count == 0:
+                raise
+    return count
+
+
+def _missing(clip: Clip, frames: int, max_frames: int | None) -> int:
+    declared = clip.declared if clip.declared is not None and max_frames is None else 0
+    return max(0, declared - frames)
+
+
+def _name(source: Source) -> str:
+    """Return what to call a source's results."""
+    if isinstance(source, int):
+        return f"camera{source}"
+    if not isinstance(source, str | Path):
+        return "frames"
+    path = Path(source)
+    if "*" in path.name or "?" in path.name or "[" in path.name:
+        path = path.parent
+    return path.resolve().name if path.is_dir() else path.stem or "frames"

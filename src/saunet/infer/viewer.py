@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import cv2
@@ -24,6 +26,81 @@ _MARK = "@CLIP@"
 _LEVELS = 65534
 
 
+class ViewerWriter:
+    """Writes predictions as one self-contained page, to orbit the points and scrub through the clip.
+
+    Use it as a context manager: frames are written as they come, each adds about 0.1 MB at the default width, and the
+    page gets its name only when it is complete; leaving it by an error discards it.
+
+    Args:
+        path: The page to write, ending in ``.html``.
+        camera: True intrinsics of the camera that took the images: a `Camera`, or numbers as
+            `Camera.from_numbers` takes them, in pixels of the first image.
+        width: Points in a row; the rows follow from the first image's aspect ratio.
+        fps: Frames a second when played.
+        max_depth: Leave out what is farther, in the unit of depth.
+        edge: Leave out pixels around which depth changes by more than this share.
+        title: Heading of the page.
+
+    Raises:
+        ConfigError: for another ending or settings out of range.
+        DataError: if there is no frame, or the system refuses to write.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        camera: Camera | Sequence[float | int],
+        *,
+        width: int = 320,
+        fps: float | int = 10.0,
+        max_depth: float | int | None = None,
+        edge: float = 0.15,
+        title: str = "saunet depth",
+    ) -> None:
+        self.path, self.count = Path(path), 0
+        if self.path.suffix.lower() not in (".html", ".htm"):
+            raise ConfigError(f"the page {path} must end in .html")
+        positive("width", width)
+        self._camera, self._width, self._rows = camera, width, 0
+        self._fps, self._title, self._edge = float(positive("fps", fps)), title, edge
+        self._max_depth = None if max_depth is None else positive("max_depth", max_depth)
+        self._open = contextlib.ExitStack()
+
+    def __enter__(self) -> ViewerWriter:
+        template = resources.files("saunet.infer").joinpath(_TEMPLATE).read_text(encoding="utf-8")
+        self._before, self._after = template.split(_MARK)
+        temporary = self._open.enter_context(replacing(self.path))
+        try:
+            self._page = self._open.enter_context(temporary.open("w", encoding="utf-8"))
+        except OSError as reason:
+            self.__exit__(type(reason), reason, reason.__traceback__)
+            raise
+        return self
+
+    def add(self, prediction: Prediction) -> None:
+        """Write one more frame."""
+        if self.count == 0:
+            self._rows = max(1, round(self._width * prediction.depth.shape[0] / prediction.depth.shape[1]))
+            if not isinstance(self._camera, Camera):
+                self._camera = Camera.from_numbers(self._camera, *prediction.depth.shape)
+            head = _head(prediction, self._camera.resized(self._rows, self._width), self._title, self._fps)
+            self._page.write(self._before + _json(head)[:-1] + ',"frames":[')
+        frame = _frame(prediction, self._rows, self._width, self._max_depth, self._edge)
+        self._page.write(("," if self.count else "") + _json(frame))
+        self.count += 1
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._open:  # closes the page, then lets it take its name or vanish
+            if error is not None:
+                raise error
+            if self.count == 0:
+                raise DataError(f"no frame was given, so {self.path} was not written")
+            self._page.write("]}" + self._after)
+
+
 def write_viewer(
     path: str | Path,
     predictions: Iterable[Prediction],
@@ -35,19 +112,7 @@ def write_viewer(
     edge: float = 0.15,
     title: str = "saunet depth",
 ) -> int:
-    """Write predictions as one self-contained page, to orbit the points and scrub through the clip.
-
-    Frames are taken and written one at a time; each adds about 0.1 MB at the default width.
-
-    Args:
-        path: The page to write, ending in ``.html``.
-        predictions: The clip, in order; all frames have the first one's size.
-        camera: True intrinsics of the camera that took the images.
-        width: Points in a row; the rows follow from the aspect ratio.
-        fps: Frames a second when played.
-        max_depth: Leave out what is farther, in the unit of depth.
-        edge: Leave out pixels around which depth changes by more than this share.
-        title: Heading of the page.
+    """Write predictions, in order, as one self-contained page; see `ViewerWriter` for the arguments.
 
     Returns:
         The number of frames.
@@ -56,26 +121,10 @@ def write_viewer(
         ConfigError: for another ending or settings out of range.
         DataError: if there is no frame, or the system refuses to write.
     """
-    path = Path(path)
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise ConfigError(f"the page {path} must end in .html")
-    positive("width", width)
-    positive("fps", fps)
-    before, after = resources.files("saunet.infer").joinpath(_TEMPLATE).read_text(encoding="utf-8").split(_MARK)
-    count = 0
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as page:
+    with ViewerWriter(path, camera, width=width, fps=fps, max_depth=max_depth, edge=edge, title=title) as writer:
         for prediction in predictions:
-            rows = max(1, round(width * prediction.depth.shape[0] / prediction.depth.shape[1]))
-            if count == 0:
-                page.write(
-                    before + _json(_head(prediction, camera.resized(rows, width), title, fps))[:-1] + ',"frames":['
-                )
-            page.write(("," if count else "") + _json(_frame(prediction, rows, width, max_depth, edge)))
-            count += 1
-        if count == 0:
-            raise DataError(f"no frame was given, so {path} was not written")
-        page.write("]}" + after)
-    return count
+            writer.add(prediction)
+    return writer.count
 
 
 def _head(prediction: Prediction, camera: Camera, title: str, fps: float) -> dict[str, Any]:
@@ -91,11 +140,11 @@ def _head(prediction: Prediction, camera: Camera, title: str, fps: float) -> dic
     }
 
 
-def _frame(prediction: Prediction, rows: int, width: int, max_depth: float | None, edge: float) -> dict[str, Any]:
+def _frame(prediction: Prediction, rows: int, width: int, max_depth: float | int | None, edge: float) -> dict[str, Any]:
     disparity = np.asarray(resize(prediction.disparity, rows, width), dtype=np.float32)
     keep = disparity > 0
     if max_depth is not None:
-        keep &= disparity >= 1 / positive("max_depth", max_depth)
+        keep &= disparity >= 1 / max_depth
     if edge:
         keep &= ~jumps(disparity, edge)
     low, high = float(disparity.min()), float(disparity.max())
