@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.checks import positive
-from saunet.layers.conv import Conv3x3, DisparityHead, upsample
+from saunet.layers.conv import DisparityHead, upsample
 from saunet.models.decoders.base import by_level, check_scales
 from saunet.registry import attentions, decoders
 from saunet.types import FeatureSpec
@@ -111,11 +111,15 @@ class AttentionBottleneck(nn.Module):
 
 
 class Mapping(nn.Module):
-    """3×3 convolution, ReLU and 1×1 convolution, added to the input (SAU-Net's feature mapping module)."""
+    """3×3 convolution, ReLU and 1×1 convolution, added to the input (SAU-Net's feature mapping module).
+
+    Padded with zeros, not by reflection: a window encoder has no notion of where in the image it looks, and the border
+    is what tells the decoder; on a road the height in the image says much about depth.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.spatial = Conv3x3(channels, channels)
+        self.spatial = nn.Conv2d(channels, channels, 3, padding=1)
         self.mix = nn.Conv2d(channels, channels, 1)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
