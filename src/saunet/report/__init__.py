@@ -1,0 +1,10 @@
+"""One page from finished runs: the paper's tables and figures with our numbers beside the printed ones."""
+
+from __future__ import annotations
+
+from saunet.report.build import Options, build, write
+from saunet.report.inputs import Inputs, Sweep, collect
+from saunet.report.published import published
+from saunet.report.runs import Run, Score, read_run
+
+__all__ = ["Inputs", "Options", "Run", "Score", "Sweep", "build", "collect", "published", "read_run", "write"]

@@ -1,0 +1,287 @@
+"""From runs to a report: what each table and figure needs, and a list of what has no data."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+
+from saunet import __version__
+from saunet.atomic import write_bytes
+from saunet.checks import ConfigError, positive
+from saunet.report import figures, tables
+from saunet.report.document import Document, Figure, Gallery, Missing, Picture, Scene, Section, Table
+from saunet.report.inputs import Inputs
+from saunet.report.markdown import as_markdown, table_csv
+from saunet.report.models import Seen, look
+from saunet.report.page import as_html
+from saunet.report.published import published
+from saunet.report.runs import Run
+from saunet.report.scenes import View, read_views, scene
+from saunet.report.settings import differing, labels, sweeps_ratio
+from saunet.report.speed import speed
+
+Named = dict[str, Run]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a report is made.
+
+    Args:
+        title: Heading of the page.
+        labels: Names of the single runs, in order; made from what sets them apart if empty.
+        scenes: Images to show, by condition; see `saunet.report.scenes.read_views`.
+        scenes_limit: Images of each condition at most.
+        zooms: Enlarged parts of each scene.
+        figures: Draw curves; needs matplotlib.
+        device: Where scenes are predicted.
+        flip: Average with the prediction of the mirrored image.
+    """
+
+    title: str = "saunet report"
+    labels: Sequence[str] = ()
+    scenes: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
+    scenes_limit: int = 3
+    zooms: int = 2
+    figures: bool = True
+    device: str = "cpu"
+    flip: bool = False
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Single runs, or the jobs of a sweep, by their short names."""
+
+    name: str
+    title: str
+    runs: Named
+    swept: bool
+
+
+def build(
+    inputs: Inputs, options: Options | None = None, progress: Callable[[str], None] = lambda text: None
+) -> Document:
+    """Make a report.
+
+    Args:
+        inputs: What it is made from.
+        options: How.
+        progress: Called with what is done next.
+
+    Raises:
+        ConfigError: if an option cannot work, or matplotlib is missing.
+        DataError: if a scene or a benchmark cannot be read.
+    """
+    options = options or Options()
+    positive("zooms", options.zooms, allow_zero=True)
+    if options.figures:
+        figures.check_matplotlib()
+    views = read_views(options.scenes, options.scenes_limit)
+    groups = _groups(inputs, options.labels)
+    everyone: Named = {name: run for group in groups for name, run in group.runs.items()}
+    missing: list[Missing] = []
+    seen: dict[str, Seen] = {}
+    for name, run in everyone.items():
+        progress(f"looking at {name}")
+        found = look(run, views, options.device, options.flip)
+        if isinstance(found, Seen):
+            seen[name] = found
+        elif run.checkpoint is not None or run.error is None:
+            missing.append(Missing(f"Size and pictures of {name}", found))
+    progress("drawing")
+    sizes = {name: one.parameters for name, one in seen.items()}
+    table1, no_rows = tables.table1(everyone)
+    table2, no_sizes = tables.table2(_by_networks(everyone, sizes))
+    table3, no_ablation = tables.table3(everyone)
+    explained = tables.explained_table(everyone)
+    sections = [
+        Section(
+            "Accuracy",
+            (table1, explained) if explained else (table1,),
+            "The paper’s numbers as published, and ours as measured by this installation.",
+        ),
+        Section("Networks", (table2, table3)),
+        Section("Runs", _runs(groups, options.figures, missing)),
+    ]
+    if options.figures:
+        curves = [figure for group in groups for figure in _curves(group, missing)]
+        sections += [Section("Training", curves, "Each point is a mean over neighbouring steps.")] if curves else []
+    else:
+        missing.append(Missing("Figs. 4, 5 and 10", "figures=false"))
+    galleries = [gallery for group in groups for gallery in _galleries(group, views, seen, options.zooms)]
+    if galleries:
+        sections.append(Section("Depth side by side", galleries, _READING))
+    missing += _no_pictures(views, galleries)
+    points, table10, no_speed = speed(inputs.benchmarks, everyone, sizes)
+    if table10:
+        sections.append(Section("Accuracy and time", [*_speed(points, options.figures), table10]))
+    missing += [*no_rows, *no_sizes, *no_ablation, *no_speed]
+    missing.append(Missing("Published curves and pictures", "the paper prints them as images only"))
+    return Document(options.title, _facts(everyone), tuple(sections), tuple(missing))
+
+
+def write(document: Document, folder: Path) -> dict[str, Path]:
+    """Write ``report.html``, ``report.md``, ``tables/*.csv`` and ``figures/``, each file whole or not at all.
+
+    Returns:
+        The files by their names in the folder.
+
+    Raises:
+        DataError: if the folder cannot be written to.
+    """
+    content = {"report.html": as_html(document).encode(), "report.md": as_markdown(document).encode()}
+    content |= {f"tables/{table.name}.csv": table_csv(table).encode() for table in document.tables}
+    content |= {f"figures/{picture.name}": picture.data for picture in document.pictures}
+    for name, data in content.items():
+        write_bytes(folder / name, data)
+    return {name: folder / name for name in content}
+
+
+_READING = (
+    "Disparity, bright where it is near; each picture has its own range of colours, for the scale of a model means "
+    "nothing. Boxes lie where the models see depth jump on edges of the image, the same ones for all models."
+)
+
+
+def _groups(inputs: Inputs, wanted: Sequence[str]) -> list[_Group]:
+    members = [*([inputs.runs] if inputs.runs else []), *(sweep.runs for sweep in inputs.sweeps)]
+    if wanted and len(wanted) != len(inputs.runs):
+        raise ConfigError(f"labels holds {len(wanted)} names for {len(inputs.runs)} single runs; give one for each")
+    names = labels(members)
+    if wanted:
+        names[0] = list(wanted)
+    if len({name for row in names for name in row}) < sum(map(len, names)):
+        raise ConfigError(f"labels {list(wanted)} name two runs alike; give each its own name")
+    groups = []
+    if inputs.runs:
+        groups.append(_Group("runs", "Runs", dict(zip(names[0], inputs.runs, strict=True)), swept=False))
+    for number, (sweep, row) in enumerate(zip(inputs.sweeps, names[len(groups) :], strict=True)):
+        slug = _slug(f"sweep_{sweep.name}") + (f"_{number}" if len(inputs.sweeps) > 1 else "")
+        title = f"Sweep {sweep.name}, {len(sweep.runs)} jobs"
+        groups.append(_Group(slug, title, dict(zip(row, sweep.runs, strict=True)), swept=True))
+    return groups
+
+
+def _runs(groups: Sequence[_Group], draw: bool, missing: list[Missing]) -> list[Table | Figure]:
+    blocks: list[Table | Figure] = []
+    for group in groups:
+        blocks.append(tables.runs_table(group.name, group.title, group.runs, swept=group.swept))
+        if sweeps_ratio(list(group.runs.values())) and draw:
+            drawing = figures.draw_ratio(group.runs)
+            if drawing is None:
+                missing.append(Missing(f"Errors against α/β of {group.title}", "fewer than two jobs have a score"))
+                continue
+            caption = (
+                "Errors at the best epoch, or of the evaluation where there is one, against the ratio of eq. (14)."
+            )
+            picture = Picture(f"{group.name}_ratio.svg", drawing, "errors against the ratio alpha/beta")
+            blocks.append(Figure("Choice of α and β", picture, caption))
+    return blocks
+
+
+def _curves(group: _Group, missing: list[Missing]) -> list[Figure]:
+    ordered = sweeps_ratio(list(group.runs.values()))
+    wanted = (
+        ("Fig. 4", "loss", (("train/loss", "training loss, total"), ("train/photometric", "photometric term")),
+         "Totals of different weights do not compare; the photometric term, eqs. (8) to (12), does."),
+        ("Fig. 5", "accuracy", (("val/a1", "accuracy, δ < 1.25"), ("val/abs_rel", "Abs Rel")),
+         "On validation frames, after each epoch."),
+    )  # fmt: skip
+    found = []
+    for number, what, panels, caption in wanted:
+        drawing = figures.draw_curves(group.runs, panels, ordered=ordered)
+        if drawing is None:
+            missing.append(Missing(f"{number}, {what} of {group.title.lower()}", "no run has logged it"))
+            continue
+        picture = Picture(f"{group.name}_{what}.svg", drawing, f"{what} against epoch")
+        found.append(Figure(f"{number}. {what.capitalize()} against epoch: {group.title.lower()}", picture, caption))
+    return found
+
+
+def _galleries(group: _Group, views: Sequence[View], seen: Mapping[str, Seen], zooms: int) -> list[Gallery]:
+    """Return the group's pictures by condition: Fig. 7 where losses differ, else Fig. 8 (11: networks differ) and 9."""
+    names = [name for name in group.runs if name in seen]
+    if not names:
+        return []
+    keys = {key.replace("/", ".") for key in differing([group.runs[name] for name in names], by_overrides=group.swept)}
+    networks = {tables.networks(group.runs[name]) for name in names}
+    losses = bool(keys) and all(
+        key.split(".")[0] in ("objective", "loss") or key == "data.target_depth" for key in keys
+    )
+    found = []
+    for condition in dict.fromkeys(view.condition for view in views):
+        members = [(place, view) for place, view in enumerate(views) if view.condition == condition]
+        campus = condition.lower().startswith("campus")
+        number = "Fig. 7" if losses else "Fig. 9" if campus else "Figs. 8 and 11" if len(networks) > 1 else "Fig. 8"
+        scenes: list[Scene] = []
+        for count, (place, view) in enumerate(members):
+            maps = {name: seen[name].disparities[place] for name in names}
+            scenes.append(scene(view, maps, f"{group.name}_{_slug(condition)}_{count}", zooms))
+        what = "loss functions" if losses else "models"
+        title = f"{number}. {what.capitalize()} side by side: {condition.replace('_', ' ')}"
+        found.append(
+            Gallery(title, tuple(scenes), f"{len(names)} {'settings' if losses else 'models'}, {group.title.lower()}.")
+        )
+    return found
+
+
+def _no_pictures(views: Sequence[View], galleries: Sequence[Gallery]) -> list[Missing]:
+    if not views:
+        return [
+            Missing("Figs. 7, 8, 9 and 11", "no scenes given, such as scenes.kitti=FOLDER scenes.campus_sunny=FOLDER")
+        ]
+    if not galleries:
+        return [Missing("Figs. 7, 8, 9 and 11", "no run has a checkpoint that can be used")]
+    found = " ".join(gallery.title.partition(". ")[0] for gallery in galleries)
+    found += " ".join(gallery.title for gallery in galleries)
+    why = {
+        "7": "no group of runs differs in its loss alone",
+        "8": "no scenes but those of the campus, or runs that differ in their loss alone",
+        "9": "no scenes named campus_CONDITION",
+        "11": "no runs of different networks",
+    }
+    return [
+        Missing(f"Fig. {number}", reason) for number, reason in why.items() if not re.search(rf"\b{number}\b", found)
+    ]
+
+
+def _speed(points: Sequence[tuple[str, float, float]], draw: bool) -> list[Figure]:
+    if not points or not draw:
+        return []
+    printed = [(f"{one.method}, published ({one.device})", one.a1, one.seconds) for one in published().figure10]
+    picture = Picture("figure10.svg", figures.draw_speed(points, printed), "seconds an image against accuracy")
+    caption = (
+        "A measured time belongs to the runs whose depth network has exactly the benchmark's number of parameters. "
+        "Hollow: the only time that the paper gives in numbers, from another device and data set."
+    )
+    return [Figure("Fig. 10. Accuracy against time", picture, caption)]
+
+
+def _by_networks(runs: Named, sizes: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
+    """Return sizes by networks in words, so that a sweep's jobs are one row; by run where the words do not tell."""
+    words: dict[str, set[tuple[int, int]]] = {}
+    for name, size in sizes.items():
+        words.setdefault(_words(runs[name]), set()).add(size)
+    return {(_words(runs[name]) if len(words[_words(runs[name])]) == 1 else name): size for name, size in sizes.items()}
+
+
+def _words(run: Run) -> str:
+    pose = run.component("model/pose")
+    return tables.networks(run) + (f", pose {pose}" if pose else "") if run.component("model/encoder") else run.name
+
+
+def _facts(runs: Named) -> tuple[str, ...]:
+    counts = Counter(run.status for run in runs.values())
+    told = ", ".join(
+        f"{count} {status if status != 'unknown' else 'without run.json'}" for status, count in counts.items()
+    )
+    made = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    return (f"{len(runs)} run{'' if len(runs) == 1 else 's'}: {told}", f"made {made}", f"saunet {__version__}")
+
+
+def _slug(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9-]+", "_", text).strip("_").lower() or "scene"
