@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -58,18 +57,22 @@ def test_the_figures_of_a_step() -> None:
         ("translation", 1e-9, "the pose network has collapsed"),
     ],
 )
-def test_each_sickness_is_said_once(figure: str, value: float, words: str, caplog: pytest.LogCaptureFixture) -> None:
-    healthy = {"disparity_spread": 0.5, "holes": 0.0, "automask": 0.5, "translation": 0.1}
-    metrics = {f"health/{name}": torch.tensor(each) for name, each in {**healthy, figure: value}.items()}
-    trainer: Any = SimpleNamespace(global_step=0, is_global_zero=True, callback_metrics=metrics)
-    monitor = HealthMonitor(every_n_steps=10, after=20)
-    with caplog.at_level("INFO"):
-        for step in range(41):
-            trainer.global_step = step
-            monitor.on_train_batch_end(trainer, None, None, None, 0)  # type: ignore[arg-type]
-    (said,) = [record.getMessage() for record in caplog.records]
-    assert said.startswith("step 20: ")
+def test_each_sickness_is_said_once(figure: str, value: float, words: str) -> None:
+    healthy = {"disparity_spread": 0.5, "holes": 0.0, "automask": 0.5, "translation": 0.1, "rotation": 0.0}
+    monitor = HealthMonitor()
+    assert monitor.judge(healthy) == []
+    (said,) = monitor.judge({**healthy, figure: value})
     assert words in said
+    assert monitor.judge({**healthy, figure: value}) == []
+
+
+def test_it_speaks_while_training(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    monitor = HealthMonitor(every_n_steps=2, after=2, spread=1e9)
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=1, limit_val_batches=0, callbacks=[monitor], log_every_n_steps=1)
+    with caplog.at_level("INFO"):
+        trainer.fit(tiny.tiny_model(), tiny.tiny_walls())
+    (said,) = [record.getMessage() for record in caplog.records if "collapsed" in record.getMessage()]
+    assert said.startswith("step 2: disparity is nearly flat")
 
 
 def test_the_figures_are_logged_while_training(tmp_path: Path) -> None:
@@ -80,8 +83,8 @@ def test_the_figures_are_logged_while_training(tmp_path: Path) -> None:
 
 
 def test_thresholds_are_checked() -> None:
-    with pytest.raises(ConfigError, match="holes is 2; it must lie between 0 and 1"):
-        HealthMonitor(holes=2)
+    with pytest.raises(ConfigError, match=r"holes is 2\.0; it must lie between 0 and 1"):
+        HealthMonitor(holes=2.0)
 
 
 def test_loading_figures() -> None:

@@ -10,7 +10,7 @@ import tiny
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from saunet.checks import ConfigError, SaunetError
+from saunet.checks import SaunetError
 from saunet.lit.callbacks import LastCheckpoint
 from saunet.lit.nonfinite import NonFinite
 
@@ -78,8 +78,3 @@ def test_where_the_batch_cannot_be_kept_the_sentence_says_so(tmp_path: Path) -> 
     (tmp_path / "bad").write_text("in the way")
     with pytest.raises(SaunetError, match=r"NaN or infinite at step 1 .*cannot write"):
         fit(tmp_path, Spoil(1), NonFinite(str(tmp_path / "bad")))
-
-
-def test_an_unknown_action_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"action is 'skp'; did you mean 'skip'"):
-        NonFinite("x", action="skp")  # type: ignore[arg-type]

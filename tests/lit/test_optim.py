@@ -67,11 +67,11 @@ def test_its_saved_state_is_plain_and_continues_where_it_was() -> None:
 
 def test_one_cycle_rises_to_the_rate_and_falls_to_almost_nothing() -> None:
     recipe = Recipe(schedule="one_cycle", lr=1.0, warmup=0.25)
-    assert recipe.factor(0) == pytest.approx(1 / 25)
+    assert recipe.factor(0.0) == pytest.approx(1 / 25)
     assert recipe.factor(0.125) == pytest.approx((1 + 1 / 25) / 2)
     assert recipe.factor(0.25) == pytest.approx(1)
     assert recipe.factor(0.625) == pytest.approx((1 + 1 / 25e4) / 2)
-    assert recipe.factor(1) == pytest.approx(1 / 25e4)
+    assert recipe.factor(1.0) == pytest.approx(1 / 25e4)
     rates = _rates(recipe, 40)
     assert max(rates) == rates[9] == 1
     assert rates[:10] == sorted(rates[:10])

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.fabric.plugins.environments import LightningEnvironment
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from torch import distributed
 
 from saunet.checks import SaunetError, positive
@@ -144,12 +144,16 @@ class ProcessWatch(Callback):
             for rank, process in enumerate(started, start=1):
                 code = process.poll()
                 if code:
-                    time.sleep(1 if code > 0 else 0)  # what ended a child by itself may be ending this process too
-                    if self._own_end:
+                    if code > 0 and self._ends_by_itself():
                         return
                     how = f"was killed (signal {-code})" if code < 0 else f"ended with code {code}, see its message"
                     self._end(f"process {rank} of {len(started) + 1} {how}, so the run ends", started)
             time.sleep(0.2)
+
+    def _ends_by_itself(self) -> bool:
+        """Wait a moment: what ended another process may be ending this one too, with a better message."""
+        time.sleep(1)
+        return self._own_end
 
     def _watch_parent(self, parent: int) -> None:
         while not self._own_end:

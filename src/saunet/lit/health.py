@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+
 from jaxtyping import Bool, Float
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_info
@@ -96,13 +99,24 @@ class HealthMonitor(Callback):
         step = trainer.global_step
         if step < self.after or step % self.every_n_steps or not trainer.is_global_zero:
             return
-        figures = {name: trainer.callback_metrics.get(f"health/{name}") for name in (*self.least, *self.most)}
-        for name, value in figures.items():
-            if value is None or name in self._said:
-                continue
-            if float(value) < self.least.get(name, -1) or float(value) > self.most.get(name, float("inf")):
-                self._said.add(name)
-                rank_zero_info(f"step {step}: {_SENTENCES[name].format(float(value))}")
+        names = [name for name in (*self.least, *self.most) if f"health/{name}" in trainer.callback_metrics]
+        for said in self.judge({name: float(trainer.callback_metrics[f"health/{name}"]) for name in names}):
+            rank_zero_info(f"step {step}: {said}")
+
+    def judge(self, figures: Mapping[str, float]) -> list[str]:
+        """Return a sentence for each figure that is outside its healthy range for the first time.
+
+        Args:
+            figures: Figures of `health`, by name.
+        """
+        sick = [
+            name
+            for name, value in figures.items()
+            if name not in self._said
+            and (value < self.least.get(name, -math.inf) or value > self.most.get(name, math.inf))
+        ]
+        self._said.update(sick)
+        return [_SENTENCES[name].format(figures[name]) for name in sick]
 
 
 _SENTENCES = {

@@ -77,7 +77,8 @@ class LoaderMonitor(Callback):
             return
         loading = Loading(self._images, now - self._since[0], waited - self._since[1])
         self._since = None
-        self.log_dict({"loader/images_per_second": loading.reached, "loader/share": loading.share}, batch_size=1)
+        figures = {"loader/images_per_second": loading.reached, "loader/share": loading.share}
+        pl_module.log_dict(figures, batch_size=1)
         if loading.share > self.share and not self._said:
             self._said = True
             rank_zero_info(sentence(loading, trainer))

@@ -104,7 +104,7 @@ class NonFinite(Callback):
         arrived = None
         if bad.is_cuda:
             host = torch.empty_like(bad, device="cpu", pin_memory=True).copy_(bad, non_blocking=True)
-            arrived = torch.cuda.Event()
+            arrived = torch.cuda.Event()  # type: ignore[no-untyped-call]
             arrived.record()
             bad = host
         self._pending.append(_Pending(trainer.global_step, batch, bad, arrived))
@@ -125,7 +125,7 @@ class NonFinite(Callback):
     def _read(self, trainer: Trainer, everything: bool = True) -> None:
         while self._pending:
             oldest = self._pending[0]
-            if oldest.arrived is not None and not oldest.arrived.query():
+            if oldest.arrived is not None and not oldest.arrived.query():  # type: ignore[no-untyped-call]
                 if not everything and len(self._pending) <= AHEAD:
                     return
                 oldest.arrived.synchronize()

@@ -134,9 +134,10 @@ class Recipe:
             parameters: What is optimised, or groups of it.
             total_steps: Optimiser steps in the whole training.
         """
+        groups: list[Any] = list(parameters)
         kind = torch.optim.AdamW if self.optimizer == "adamw" else torch.optim.Adam
         optimizer = kind(
-            list(parameters),
+            groups,
             lr=self.lr,
             betas=(self.betas[0], self.betas[1]),
             weight_decay=self.weight_decay,

@@ -32,20 +32,20 @@ class Speed:
     compile: bool = False
     checkpoint_activations: bool = False
 
-    def apply(self, model: nn.Module) -> None:
+    def apply(self, model: Any) -> None:
         """Switch on what is wanted, in place; names of weights stay as they are.
 
         Args:
-            model: With the parts ``depth``, ``pose`` (or None) and ``objective``, and the function ``synthesize``.
+            model: A module with parts ``depth``, ``pose`` (or None), ``objective``, and the function ``synthesize``.
         """
         parts: list[nn.Module] = [part for part in (model.depth, model.pose) if isinstance(part, nn.Module)]
         if self.checkpoint_activations:
             for part in parts:
                 for block in blocks(part):
-                    block.forward = functools.partial(_recomputed, block, block.forward)  # type: ignore[method-assign]
+                    block.forward = functools.partial(_recomputed, block, block.forward)
         if self.compile:
             for part in (*parts, model.objective):
-                part.compile()  # type: ignore[operator, union-attr]
+                part.compile()
             model.synthesize = torch.compile(model.synthesize)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -50,7 +51,8 @@ class TrainedModule(LightningModule):
             return
         self._prepared = True
         for part in self.recipe.frozen(self):
-            part.requires_grad_(False)
+            part.requires_grad_(False).eval()
+            warnings.filterwarnings("ignore", message=r"Found \d+ module\(s\) in eval mode")  # as it is meant to be
         self.speed.apply(self)
 
     def train(self, mode: bool = True) -> TrainedModule:
@@ -106,7 +108,7 @@ class TrainedModule(LightningModule):
         """
         trainer = self.trainer
         data = getattr(trainer, "datamodule", None)
-        if data is None or trainer.overfit_batches or trainer.max_epochs in (None, -1):
+        if data is None or getattr(trainer, "overfit_batches", 0) or trainer.max_epochs in (None, -1):
             return int(trainer.estimated_stepping_batches)
         batches, limit = len(data.train_dataloader()), trainer.limit_train_batches
         batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
