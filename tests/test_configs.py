@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from saunet.config import config_dir, plain, register_configs, register_training_configs
 from saunet.registry import REGISTRIES
 
-ROOTS = {"train", "evaluate", "predict", "benchmark"}
+ROOTS = {"train", "evaluate", "odometry", "predict", "benchmark"}
 GROUPS = ("model", "trainer", "callbacks", "logger")
 REGISTERED = [
     (registry.group, name)

@@ -39,6 +39,8 @@ def odometry(cfg: DictConfig) -> None:
         predicted = predict_trajectory(
             pose.to(device), drive, offsets=record.offsets, device=device, batch_size=cfg.batch_size, **size
         )
+        if record.scale is not None:
+            predicted[:, :3, 3] *= record.scale.factor
         path = Path3d(drive.name, predicted, _times(drive), _truth(drive))
         folder = output / file_stem(drive.name)
         write_path(path, folder)
@@ -48,7 +50,8 @@ def odometry(cfg: DictConfig) -> None:
             print(f"{drive.name}: no true poses, so the path is written and not compared")
         else:
             errors.append(path_errors(path, cfg.snippet, list(cfg.lengths) if cfg.lengths else None))
-    write_errors(errors, output, {"checkpoint": str(cfg.checkpoint)})
+    scale = None if record.scale is None else {"factor": record.scale.factor, "source": record.scale.source}
+    write_errors(errors, output, {"checkpoint": str(cfg.checkpoint), "scale": scale})
     if errors:
         Console().print(path_table(errors))
     print(f"results: {output}")
