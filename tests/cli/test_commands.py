@@ -14,6 +14,8 @@ import pytest
 
 import saunet
 from saunet.checkpoint import read_checkpoint
+from saunet.prepare.densify import densify
+from saunet.prepare.recordings import kitti_recordings
 
 Tool = Callable[..., Any]
 SMALL = ("data.height=64", "data.width=96", "data.batch_size=2", "data.workers=0", "trainer=smoke")
@@ -99,7 +101,8 @@ def test_the_kitti_path_from_disk(tool: Tool, raw_root: Path, tmp_path: Path) ->
     assert protocols == {"eigen_camera_z", "metric"}
 
 
-def test_the_papers_experiment_trains_with_lidar(tool: Tool, raw_root: Path) -> None:
+def test_the_papers_experiment_trains_with_interpolated_lidar(tool: Tool, raw_root: Path) -> None:
+    densify(kitti_recordings(raw_root, ["left"]), ["linear"])
     outcome = tool(
         "train",
         "experiment=paper",

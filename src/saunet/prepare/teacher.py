@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -30,6 +30,7 @@ _TYPICAL = 16.0
 """Depth of which 16-bit steps of 1/256 are fine enough, and which leaves room for what is farther."""
 
 
+@runtime_checkable
 class DepthSource(Protocol):
     """Gives depth for a frame, at whatever size it has it."""
 
