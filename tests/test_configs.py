@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from saunet.config import config_dir, plain, register_configs, register_training_configs
 from saunet.registry import REGISTRIES
 
-ROOTS = {"train", "evaluate", "odometry", "predict", "benchmark"}
+ROOTS = {"train", "evaluate", "odometry", "predict", "benchmark", "calibrate", "doctor"}
 GROUPS = ("model", "trainer", "callbacks", "logger")
 REGISTERED = [
     (registry.group, name)
@@ -38,7 +38,7 @@ def _hydra() -> Iterator[None]:
 
 
 def _compose(*overrides: str, root: str = "train") -> object:
-    return compose(root, overrides=["output_dir=/tmp/x", *overrides] if root != "predict" else list(overrides))
+    return compose(root, overrides=["output_dir=/tmp/x", *overrides] if root not in ("predict", "calibrate") else list(overrides))
 
 
 def _resolved(*overrides: str) -> dict[str, object]:

@@ -14,13 +14,15 @@ import pytest
 
 from saunet import config
 from saunet.cli._app import run
+from saunet.cli.calibrate import calibrate
+from saunet.cli.doctor import doctor
 from saunet.cli.evaluate import evaluate
 from saunet.cli.predict import predict
 from saunet.cli.train import train
 from saunet.data.synthetic import SyntheticDrive
 from saunet.data.synthetic.kitti_writer import write_raw
 
-TASKS = {"train": train, "evaluate": evaluate, "predict": predict}
+TASKS = {"train": train, "evaluate": evaluate, "predict": predict, "calibrate": calibrate, "doctor": doctor}
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,7 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
     return camera
 
 
-def check_crop(crop: Sequence[float], what: str, error: type[SaunetError] = DataError) -> None:
+def check_crop(crop: Sequence[float | int], what: str, error: type[SaunetError] = DataError) -> None:
     """Check the shares to cut off at the top, bottom, left and right.
 
     Raises:

@@ -38,7 +38,7 @@ class CampusDrive:
         self,
         clip: Clip,
         recording: Recording,
-        crop: Sequence[float] | None = None,
+        crop: Sequence[float | int] | None = None,
         motion: Motion | None = None,
         parallax: float = 0.0,
         settings: str = "",

@@ -40,7 +40,7 @@ class Lens:
         camera: CameraFile,
         height: int,
         width: int,
-        crop: Sequence[float] | None = None,
+        crop: Sequence[float | int] | None = None,
         what: str = "the frames",
     ) -> None:
         self.recorded = (height, width)

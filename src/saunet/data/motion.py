@@ -52,7 +52,7 @@ def compare(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> tuple[float,
     return median_flow(before, after), float(difference / max(1.0, float(after.std())))
 
 
-def shrink(image: NDArray[np.uint8], crop: Sequence[float] = (0, 0, 0, 0)) -> NDArray[np.uint8]:
+def shrink(image: NDArray[np.uint8], crop: Sequence[float | int] = (0, 0, 0, 0)) -> NDArray[np.uint8]:
     """Return an image cut by shares of its top, bottom, left and right, and made 320 pixels wide."""
     height, width = image.shape[:2]
     top, bottom, left, right = crop
@@ -64,7 +64,7 @@ def shrink(image: NDArray[np.uint8], crop: Sequence[float] = (0, 0, 0, 0)) -> ND
 
 def measure(
     paths: Sequence[Path],
-    crop: Sequence[float],
+    crop: Sequence[float | int],
     *,
     skip_unreadable: bool = False,
     cache: Path | None = None,
@@ -123,7 +123,7 @@ def even_steps(flow: NDArray[np.float64], parallax: float) -> NDArray[np.bool_]:
     return chosen
 
 
-def _key(paths: Sequence[Path], crop: Sequence[float]) -> str:
+def _key(paths: Sequence[Path], crop: Sequence[float | int]) -> str:
     text = [str([round(float(share), 6) for share in crop])]
     for path in paths:
         try:

@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from saunet.checks import DataError
+from saunet.data.camera_file import CameraFile, read_camera, write_camera
+from saunet.data.lens import Lens
+
+GOOD = "image_size: [640, 480]\nK: [500, 510, 321, 242]\n"
+
+
+def write(tmp_path, text):
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_what_is_written_down_is_read(tmp_path):
+    text = (
+        GOOD
+        + "distortion: [-0.3, 0.1, 0, 0, 0]\nfps: 30\ncamera_height: 1.4\ncondition: cloudy\ncrop: [0, 0.1, 0, 0]\n"
+    )
+    camera = read_camera(write(tmp_path, text))
+    assert camera.image_size == (480, 640)
+    assert camera.K.tolist() == [[500, 0, 321], [0, 510, 242], [0, 0, 1]]
+    assert (camera.fps, camera.camera_height, camera.condition, camera.model) == (30, 1.4, "cloudy", "pinhole")
+    assert camera.distortion == (-0.3, 0.1, 0, 0, 0)
+    assert camera.crop == (0, 0.1, 0, 0)
+    write_camera(tmp_path / "again.yaml", camera, "two\nlines")
+    again = read_camera(tmp_path / "again.yaml")
+    assert (again.K == camera.K).all()
+    assert (again.distortion, again.crop, again.fps) == (camera.distortion, camera.crop, camera.fps)
+    rows = read_camera(write(tmp_path, "image_size: [640, 480]\nK: [[500, 0, 321], [0, 510, 242], [0, 0, 1]]\n"))
+    assert (rows.K == camera.K).all()
+
+
+def test_intrinsics_follow_the_size_of_the_frames(tmp_path):
+    camera = read_camera(write(tmp_path, GOOD))
+    half = camera.intrinsics(240, 320)
+    np.testing.assert_allclose(half, [[250, 0, 160.25], [0, 255, 120.75], [0, 0, 1]])
+    normalised = read_camera(write(tmp_path, "normalised: true\nK: [0.78125, 1.0625, 0.5, 0.5]\n"))
+    np.testing.assert_allclose(normalised.intrinsics(480, 640), [[500, 0, 319.5], [0, 510, 239.5], [0, 0, 1]])
+    with pytest.raises(DataError, match=r"the frames are 640x360 .*camera.yaml is for 640x480; give frames of the"):
+        camera.intrinsics(360, 640)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("image_size: [640, 480]\n", "camera.yaml lacks K; expected 'K: "),
+        ("K: [500, 500, 320, 240]\n", "camera.yaml lacks image_size"),
+        ("image_size: [640, 480]\nK: [500, 500, 320]\n", "K needs a list of 4 or 9 numbers, got 3"),
+        ("image_size: [640, 480]\nK: 500\n", "K needs a list of 4 or 9 numbers, got 500"),
+        ("image_size: [640, 480]\nK: [500, .nan, 320, 240]\n", "K needs 4 or 9 finite numbers, got 'nan' among them"),
+        ("image_size: [640, 480]\nK: [500, x, 320, 240]\n", "finite numbers, got 'x' among them"),
+        ("image_size: [640]\nK: [500, 500, 320, 240]\n", "image_size needs a list of 2 numbers, got 1"),
+        ("image_size: [640, 0]\nK: [500, 500, 320, 240]\n", r"image_size is \[640, 0\]; expected whole numbers"),
+        ("image_size: [640, 480]\nK: [500, 500, 700, 240]\n", "the centre must lie inside"),
+        ("image_size: [640, 480]\nK: [0.8, 1.0, 0.5, 0.5]\n", "or normalised \\(then set normalised: true\\)"),
+        ("normalised: true\nK: [500, 500, 320, 240]\n", "normalised K has fx 500 and centre 320, 240"),
+        ("normalised: maybe\nK: [1, 1, 0.5, 0.5]\n", "normalised is 'maybe'"),
+        (GOOD + "distortion: [0.1, 0.2]\n", "distortion needs a list of 0 or 4 or 5 or 8"),
+        (
+            GOOD + "distortion: [0.1, 0.2, 0, 0, 0]\nmodel: fisheye\n",
+            "distortion needs a list of 0 or 4 numbers, got 5",
+        ),
+        (GOOD + "model: fish\n", "model is 'fish'; did you mean 'fisheye'"),
+        (GOOD + "fsp: 10\n", "unknown key 'fsp'; did you mean 'fps'"),
+        (GOOD + "fps: 0\n", "fps is 0; it must be greater than 0"),
+        (GOOD + "camera_height: tall\n", "camera_height needs 1 finite numbers, got 'tall'"),
+        (GOOD + "crop: [0.6, 0.5, 0, 0]\n", "crop is .* that leave a tenth"),
+        ("image_size: [640, 480]\nK: [[500, 0, 320], [3, 500, 240], [0, 0, 1]]\n", r"expected \[\[fx, skew, cx\]"),
+        ("- 1\n- 2\n", "camera.yaml holds list; expected keys"),
+        ("K: [1, 2\n", "camera.yaml cannot be read as YAML"),
+        ("", "camera.yaml holds NoneType"),
+    ],
+)
+def test_mistakes_are_one_sentence(tmp_path, text, message):
+    with pytest.raises(DataError, match=message):
+        read_camera(write(tmp_path, text))
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"no camera file at .*gone.yaml; make one with saunet-calibrate"):
+        read_camera(tmp_path / "gone.yaml")
+
+
+def camera(distortion, model="pinhole"):
+    K = np.array([[200.0, 0, 160], [0, 201, 98], [0, 0, 1]])
+    from pathlib import Path
+
+    return CameraFile(Path("camera.yaml"), K, (200, 320), tuple(distortion), model)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "fisheye"])
+@settings(max_examples=15, deadline=None)
+@given(
+    st.floats(-0.25, 0.1),
+    st.floats(-0.4, 0.4),
+    st.floats(-0.25, 0.25),
+    st.sampled_from([(0, 0, 0, 0), (0.1, 0.2, 0.05, 0.15)]),
+    st.sampled_from([1.0, 0.5, 2.0]),
+)
+def test_a_point_is_found_where_k_says_after_undistortion_crop_and_size(model, k1, x, y, crop, size):
+    """A bright dot where the distorting lens shows a direction lies, straightened, where K projects that direction."""
+    numbers = [k1, 0.02, 0.0, 0.0] if model == "fisheye" else [k1, 0.02, 0.001, -0.001, 0.0]
+    described = camera(numbers, model)
+    height, width = round(200 * size), round(320 * size)
+    lens = Lens(described, height, width, crop)
+    K = described.intrinsics(height, width)
+    ray, still, dist = np.array([[[x, y, 1.0]]]), np.zeros(3), np.array(numbers)
+    project = cv2.fisheye.projectPoints if model == "fisheye" else cv2.projectPoints
+    seen = np.ravel(project(ray, still, still, K, dist)[0])
+    expected = (lens.K @ [x, y, 1])[:2]
+    v, u = np.mgrid[:height, :width]
+    blob = np.exp(-((u - seen[0]) ** 2 + (v - seen[1]) ** 2) / (2 * (3 * size) ** 2))
+    straight = lens(np.repeat(np.round(255 * blob)[..., None], 3, axis=2).astype(np.uint8))[..., 0].astype(float)
+    inside = (12 * size < expected[0] < lens.width - 12 * size) and (12 * size < expected[1] < lens.height - 12 * size)
+    assert straight.shape == (lens.height, lens.width)
+    if inside:
+        v, u = np.mgrid[: lens.height, : lens.width]
+        peak = np.array([(straight * u).sum(), (straight * v).sum()]) / straight.sum()
+        np.testing.assert_allclose(peak, expected, atol=0.6 * max(1, size))
+
+
+def test_frames_of_another_size_are_named():
+    lens = Lens(camera([]), 200, 320)
+    with pytest.raises(DataError, match=r"a.png is 100x50 .* first frame of its clip is 320x200"):
+        lens(np.zeros((50, 100, 3), np.uint8), "a.png")
