@@ -38,7 +38,8 @@ def _hydra() -> Iterator[None]:
 
 
 def _compose(*overrides: str, root: str = "train") -> object:
-    return compose(root, overrides=["output_dir=/tmp/x", *overrides] if root not in ("predict", "calibrate") else list(overrides))
+    given = list(overrides) if root in ("predict", "calibrate") else ["output_dir=/tmp/x", *overrides]
+    return compose(root, overrides=given)
 
 
 def _resolved(*overrides: str) -> dict[str, object]:
