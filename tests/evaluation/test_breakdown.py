@@ -131,3 +131,15 @@ def test_in_an_evaluation(tmp_path):
 def test_bad_buckets(change, message):
     with pytest.raises(ConfigError, match=message):
         Buckets(**change)
+
+
+@pytest.mark.parametrize("radius", [1, 2, 3, 4, 7, 60])
+def test_edges_are_those_of_a_plain_search(radius):
+    truth = torch.rand(6, 40) * 30 * (torch.rand(6, 40) > 0.6)
+    expected = torch.zeros_like(truth, dtype=torch.bool)
+    for row in range(6):
+        for column in range(40):
+            near = truth[row, max(0, column - radius) : column + radius + 1]
+            known = near[near > 0]
+            expected[row, column] = len(known) > 0 and known.max() / known.min() > 1.5
+    assert torch.equal(near_edge(truth, radius, 1.5), expected)

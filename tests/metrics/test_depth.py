@@ -41,7 +41,7 @@ def test_reference(reference):
     values = metric.compute()
     expected = data["eigen_metrics_median_scaled"].mean(0)
     for name, value in zip(ERROR_NAMES, expected, strict=True):
-        tolerance = {"abs": 3e-4} if name in ("a1", "a2", "a3") else {"rel": 1e-5}
+        tolerance = {"abs": 1e-6} if name in ("a1", "a2", "a3") else {"rel": 1e-6}
         assert values[name].item() == pytest.approx(value, **tolerance), name
     ratios = data["eigen_median_ratio"]
     assert values["scale"].item() == pytest.approx(ratios.mean(), rel=1e-5)

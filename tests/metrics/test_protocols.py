@@ -17,8 +17,8 @@ EIGEN = protocol("eigen_camera_z")
 
 
 def close_to_reference(errors, expected):
-    np.testing.assert_allclose(errors[:4], expected[:4], rtol=1e-5)
-    np.testing.assert_allclose(errors[4:], expected[4:], atol=3e-4)
+    np.testing.assert_allclose(errors[:4], expected[:4], rtol=1e-6)
+    np.testing.assert_allclose(errors[4:], expected[4:], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ def test_eigen_reference(reference, rules, key):
         image = evaluate_image(disparity, truth, rules)
         assert image.pixels == data["eigen_count"][i]
         close_to_reference(image.errors, data[key][i])
-        np.testing.assert_allclose(image.ratio * rules.factor, data["eigen_median_ratio"][i], rtol=1e-5)
+        np.testing.assert_allclose(image.ratio * rules.factor, data["eigen_median_ratio"][i], rtol=1e-6)
 
 
 def test_eigen_reference_blended(reference):

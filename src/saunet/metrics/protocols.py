@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from saunet.checks import ConfigError, one_of, positive
-from saunet.metrics.functional import depth_errors, garg_crop, median
+from saunet.metrics.functional import error_terms, garg_crop, median, root_terms
 
 GROUND_TRUTHS: tuple[str, ...] = ("lidar_x", "camera_z", "improved", "exact", "none")
 """The LiDAR's own forward coordinate; the camera's z of the same points; KITTI's accumulated maps; a renderer's; none.
@@ -85,7 +85,11 @@ _PROTOCOLS = (
     Protocol("metric", "camera z, Garg crop, metres as predicted: no scaling", "camera_z", scaling="none"),
     Protocol("synthetic", "a renderer's dense depth, whole image, 0.1 to 80 m", "exact", min_depth=0.1, crop="none"),
     Protocol(
-        "campus", "no ground truth: how well depth and motion explain the neighbours", "none", crop="none", scaling="none"
+        "campus",
+        "no ground truth: how well depth and motion explain the neighbours",
+        "none",
+        crop="none",
+        scaling="none",
     ),
 )
 PROTOCOLS: dict[str, Protocol] = {protocol.name: protocol for protocol in _PROTOCOLS}
@@ -171,6 +175,5 @@ def evaluate_image(
 
 def sample_errors(sample: Sample) -> ImageErrors:
     """Compute the seven errors over the pixels of a sample."""
-    everywhere = torch.ones_like(sample.target, dtype=torch.bool)
-    errors = depth_errors(sample.prediction[None], sample.target[None], everywhere[None])[0]
+    errors = root_terms(error_terms(sample.prediction, sample.target).mean(-1))
     return ImageErrors(errors, sample.ratio, sample.target.numel())
