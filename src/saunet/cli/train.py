@@ -29,6 +29,7 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
 
     from saunet.lit.assemble import assemble
     from saunet.lit.callbacks import BestCheckpoint, SplitsRecorded
+    from saunet.lit.durable import way_on
     from saunet.lit.run_record import recording
     from saunet.lit.start import check_resume, resume_path, warm_start
     from saunet.lit.storage import AtomicCheckpointIO
@@ -58,21 +59,13 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
             trainer.fit(model, datamodule=data, ckpt_path=resume, weights_only=True)
         except RuntimeError as error:
             if trainer.world_size > 1 and re.search(r"Connection|NCCL|Gloo|gloo|store", str(error)):
-                raise SaunetError(
-                    "the connection to another process of this run broke, most likely because it died (see its "
-                    "message); " + _way_on(cfg)
-                ) from error
+                lost = "the connection to another process of this run broke, most likely because it died"
+                raise SaunetError(f"{lost}; {way_on(Path(cfg.output_dir) / 'checkpoints')}") from error
             raise
     if trainer.is_global_zero:
         print(f"results: {cfg.output_dir}")
     scores = [each.best_model_score for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint)]
     return data, next((float(score) for score in scores if score is not None), None)
-
-
-def _way_on(cfg: DictConfig) -> str:
-    from saunet.lit.durable import way_on
-
-    return way_on(Path(cfg.output_dir) / "checkpoints")
 
 
 def main() -> None:

@@ -108,7 +108,7 @@ class TrainedModule(LightningModule):
         """
         trainer = self.trainer
         data = getattr(trainer, "datamodule", None)
-        if data is None or getattr(trainer, "overfit_batches", 0) or trainer.max_epochs in (None, -1):
+        if data is None or float(getattr(trainer, "overfit_batches", 0.0)) > 0 or trainer.max_epochs in (None, -1):
             return int(trainer.estimated_stepping_batches)
         batches, limit = len(data.train_dataloader()), trainer.limit_train_batches
         batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
