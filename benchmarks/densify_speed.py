@@ -29,7 +29,7 @@ from saunet.prepare.densify import interpolate
 
 def usual(image: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Write the equations down pixel by pixel and give them to a general sparse solver."""
-    grey = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2GRAY).astype(np.float64)
+    grey = image @ (np.array([0.299, 0.587, 0.114]) / 255)
     height, width = grey.shape
     numbers = np.arange(grey.size).reshape(grey.shape)
     rows, columns, values = [], [], []

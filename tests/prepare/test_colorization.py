@@ -52,7 +52,7 @@ def scene(height, width, share, seed=0):
 
 
 def grey_of(image):
-    return image.astype(np.float64) / 255 @ [0.299, 0.587, 0.114]
+    return image @ (np.array([0.299, 0.587, 0.114]) / 255)
 
 
 @pytest.mark.parametrize(("size", "share"), [((24, 37), 0.05), ((40, 11), 0.3), ((2, 5), 0.5), ((30, 50), 0.002)])

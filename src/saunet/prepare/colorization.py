@@ -6,7 +6,6 @@ numbers, and the rounding is then taken out with residuals in 64 bits.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
@@ -30,16 +29,20 @@ def affinity(grey: Float[ndarray, "h w"]) -> Float[ndarray, "9 h w"]:
         grey: Brightness in [0, 1], at least two pixels.
     """
     height, width = grey.shape
-    padded = np.pad(grey, 1, constant_values=np.nan)
-    difference = np.stack([padded[1 + r : 1 + r + height, 1 + c : 1 + c + width] for r, c in NEIGHBOURS])
-    difference -= grey
-    outside = np.isnan(difference)
-    difference[outside] = 0
-    count = 9.0 - outside.sum(0)
+    difference = np.zeros((9, height, width))
+    for plane, (row, column) in zip(difference, NEIGHBOURS, strict=True):
+        here = _shifted(height, row), _shifted(width, column)
+        there = _shifted(height, -row), _shifted(width, -column)
+        np.subtract(grey[there], grey[here], out=plane[here])
+    count = np.outer(_reach(height), _reach(width))
     mean = difference.sum(0) / count
     difference *= difference
     variance = difference.sum(0) / count - mean * mean
-    difference[outside] = np.inf
+    for plane, (row, column) in zip(difference, NEIGHBOURS, strict=True):
+        if row:
+            plane[0 if row < 0 else -1] = np.inf
+        if column:
+            plane[:, 0 if column < 0 else -1] = np.inf
     difference[4] = np.inf
     spread = np.maximum(np.maximum(0.6 * variance, difference.min(0) / -np.log(0.01)), 2e-6)
     difference /= -spread
@@ -48,7 +51,18 @@ def affinity(grey: Float[ndarray, "h w"]) -> Float[ndarray, "9 h w"]:
     return weights
 
 
-def colorize(image: UInt8[ndarray, "h w 3"], depth: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
+def _shifted(length: int, step: int) -> slice:
+    """Return the places from which a step stays inside."""
+    return slice(max(0, -step), length - max(0, step))
+
+
+def _reach(length: int) -> Float[ndarray, " {length}"]:
+    """Return how many of a place and its two neighbours exist."""
+    places = np.arange(length)
+    return 1.0 + (places > 0) + (places < length - 1)
+
+
+def colorize(image: UInt8[ndarray, "_ _ 3"], depth: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
     """Return depth at every pixel: measured where it is known, spread along similar brightness elsewhere.
 
     Solves (I - W + diag(known)) x = known depth, with W of `affinity`.
@@ -65,7 +79,7 @@ def colorize(image: UInt8[ndarray, "h w 3"], depth: Float32[ndarray, "h w"]) -> 
     known = depth > 0
     if not known.any():
         raise DataError("the depth map has no known pixel, so there is nothing to spread")
-    grey = cv2.cvtColor(image.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2GRAY).astype(np.float64)
+    grey = image @ (np.array([0.299, 0.587, 0.114]) / 255)
     stencil = -affinity(grey)
     stencil[4] = 1.0 + known
     top = float(depth.max())

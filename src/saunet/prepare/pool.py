@@ -8,6 +8,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Generic, Literal, TypeVar
 
 import cv2
@@ -69,6 +70,10 @@ class Work(Generic[Item, Result]):
             waiting: dict[Future[Any], Item] = {pool.submit(_work, item): item for item in items}
             for future in as_completed(list(waiting)):
                 yield waiting.pop(future), future.result()
+        except BrokenProcessPool as reason:
+            raise DataError(
+                f"one of the {count} processes was killed, most often for want of memory; run again with fewer workers"
+            ) from reason
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
