@@ -96,6 +96,11 @@ def _clip_batches(cfg: DictConfig, predictor: Any, method: str, offsets: Any) ->
     from saunet.scale.clips import clip_batches
     from saunet.scale.speeds import read_speeds
 
+    if str(cfg.input).isdecimal() and not Path(cfg.input).exists():
+        raise ConfigError(
+            f"scale.method={method} measures over a whole recording and a live camera cannot be looked at beforehand; "
+            "measure with scale.store=true on recorded frames, then leave scale.method out"
+        )
     options: dict[str, Any] = {"offsets": offsets, "most": cfg.scale.frames}
     with contextlib.ExitStack() as stack:
         clip = open_clip(cfg.input)

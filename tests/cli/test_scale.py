@@ -1,0 +1,202 @@
+"""Metric scale on the command line: measured, reported, applied, stored, and refused in one sentence."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from saunet.checkpoint import read_checkpoint, store_scale
+from saunet.checks import CheckpointError, ConfigError
+from saunet.cli._scale import scale_predictor
+from saunet.config import PredictConfig
+from saunet.data.synthetic import SyntheticDrive
+from saunet.infer.pipeline import ImagePredictor
+from saunet.record import Scale
+
+Tool = Callable[..., Any]
+UNKNOWN = 0.037
+
+
+class TrueDepth(ImagePredictor):
+    """Knows the depth of a drive's frames by heart, in a unit of its own."""
+
+    def __init__(self, drive: SyntheticDrive) -> None:
+        super().__init__(64, 192)
+        self.drive = drive
+        self.seen = [drive.image(i).transpose(2, 0, 1) for i in drive.indices]
+
+    def disparity(self, images: Any) -> Any:
+        found = []
+        for image in np.rint(255 * images):
+            index = int(np.argmin([np.abs(image - known).mean() for known in self.seen]))
+            depth = self.drive.depth(index)
+            found.append(1 / (UNKNOWN * np.where(depth > 0, depth, 1000.0)))
+        return np.array(found, np.float32)
+
+    @property
+    def fingerprint(self) -> str:
+        return "true"
+
+
+@pytest.fixture(scope="module")
+def street() -> SyntheticDrive:
+    return SyntheticDrive(seed=31, frames=3, height=64, width=192)
+
+
+@pytest.fixture
+def recording(street: SyntheticDrive, tmp_path: Path) -> Path:
+    """Both cameras' frames as folders."""
+    for drive, folder in ((street, "left"), (street.partner(), "right")):
+        (tmp_path / folder).mkdir()
+        for index in drive.indices:
+            cv2.imwrite(str(tmp_path / folder / f"{index}.png"), drive.image(index)[..., ::-1])
+    return tmp_path
+
+
+def configured(recording: Path, street: SyntheticDrive, **scale: Any) -> Any:
+    K = street.intrinsics()
+    cfg = OmegaConf.structured(PredictConfig)
+    cfg.input, cfg.output, cfg.checkpoint = str(recording / "left"), str(recording / "out"), "unused.ckpt"
+    cfg.camera = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
+    cfg.scale = OmegaConf.merge(cfg.scale, scale)
+    return cfg
+
+
+@pytest.mark.parametrize(
+    ("scale", "tolerance"),
+    [
+        ({"method": "camera_height", "camera_height": 1.65}, 0.03),
+        ({"method": "stereo", "partner": "right", "baseline": 0.54}, 0.08),
+    ],
+)
+def test_predict_finds_the_unknown_factor(
+    recording: Path, street: SyntheticDrive, scale: dict[str, Any], tolerance: float, capsys: Any
+) -> None:
+    if "partner" in scale:
+        scale = {**scale, "partner": str(recording / scale["partner"])}
+    predictor = TrueDepth(street)
+    scale_predictor(configured(recording, street, **scale), predictor)
+    assert predictor.scale is not None
+    assert predictor.scale.factor == pytest.approx(1 / UNKNOWN, rel=tolerance)
+    assert "middle half" in capsys.readouterr().out
+    report = json.loads((recording / "out" / "scale.json").read_text())
+    assert report["factor"] == predictor.scale.factor
+    assert report["frames"] == 3
+    true, found = street.depth(1), predictor.predict(recording / "left" / "1.png")
+    near = (true > 0) & (true < 50)
+    np.testing.assert_allclose(found.depth[near], true[near], rtol=tolerance)
+    assert found.unit.startswith("metres (scale from ")
+
+
+@pytest.mark.parametrize(
+    ("scale", "message"),
+    [
+        ({"method": "hight"}, r"scale.method is 'hight'.*allowed: auto, none, stored, camera_height, speed, stereo"),
+        ({"method": "camera_height"}, r"needs scale.camera_height"),
+        ({"method": "stereo"}, r"scale.method=stereo needs scale.partner: the other camera's images"),
+        ({"method": "stored"}, r"the checkpoint stores no scale; measure one"),
+        ({"method": "auto", "store": True}, r"scale.store=true stores what is measured and scale.method is 'auto'"),
+        ({"method": "none", "frames": 0}, r"scale.frames is 0"),
+    ],
+)
+def test_what_is_missing_is_one_sentence(
+    recording: Path, street: SyntheticDrive, scale: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message) as raised:
+        scale_predictor(configured(recording, street, **scale), TrueDepth(street))
+    assert "\n" not in str(raised.value)
+
+
+def test_camera_height_needs_the_camera(recording: Path, street: SyntheticDrive) -> None:
+    cfg = configured(recording, street, method="camera_height", camera_height=1.65)
+    cfg.camera = None
+    with pytest.raises(ConfigError, match="needs camera: fx,fy,cx,cy in pixels of the images"):
+        scale_predictor(cfg, TrueDepth(street))
+
+
+def test_a_live_camera_is_not_measured(recording: Path, street: SyntheticDrive) -> None:
+    cfg = configured(recording, street, method="camera_height", camera_height=1.65)
+    cfg.input = "0"
+    with pytest.raises(ConfigError, match="a live camera cannot be looked at beforehand"):
+        scale_predictor(cfg, TrueDepth(street))
+
+
+def test_stored_scale_is_used_or_left_out(recording: Path, street: SyntheticDrive) -> None:
+    for method, expected in (("auto", 2.0), ("stored", 2.0), ("none", None)):
+        predictor = TrueDepth(street)
+        predictor.scale = Scale(2.0, "speed")
+        scale_predictor(configured(recording, street, method=method), predictor)
+        assert (predictor.scale and predictor.scale.factor) == expected
+
+
+@pytest.fixture
+def checkpoint(smoke_run: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "model.ckpt"
+    shutil.copyfile(smoke_run / "checkpoints" / "last.ckpt", path)
+    return path
+
+
+def test_a_stored_scale_changes_nothing_else(checkpoint: Path) -> None:
+    before = read_checkpoint(checkpoint)
+    store_scale(checkpoint, Scale(3.0, "speed"))
+    after = read_checkpoint(checkpoint)
+    assert after.record.scale == Scale(3.0, "speed")
+    assert after.global_step == before.global_step
+    assert all((after.state[key] == value).all() for key, value in before.state.items())
+    with pytest.raises(CheckpointError, match="no checkpoint at"):
+        store_scale(checkpoint.with_name("nowhere.ckpt"), Scale(3.0, "speed"))
+
+
+def test_evaluate_measures_stores_and_predict_uses_it(tool: Tool, checkpoint: Path, tmp_path: Path) -> None:
+    common = (f"checkpoint={checkpoint}", "data=synthetic_tiny", "baselines=false", "output_dir=results")
+    outcome = tool("evaluate", *common, "scale.method=speed", "scale.store=true")
+    assert outcome.code == 0, outcome.err
+    assert "from speed: median of 4 frames" in outcome.out
+    assert f"stored in {checkpoint}" in outcome.out
+    report = json.loads((tmp_path / "results" / "scale.json").read_text())
+    stored = read_checkpoint(checkpoint).record.scale
+    assert stored is not None
+    assert stored.factor == report["factor"]
+    outcome = tool("evaluate", *common)
+    assert outcome.code == 0, outcome.err
+    settings = json.loads((tmp_path / "results" / "metrics.json").read_text())["settings"]
+    assert settings["scale"]["factor"] == stored.factor
+    cv2.imwrite(str(tmp_path / "road.png"), np.full((64, 96, 3), 99, np.uint8))
+    outcome = tool("predict", f"checkpoint={checkpoint}", "input=road.png", "output=out", "outputs=[npy]")
+    assert outcome.code == 0, outcome.err
+    assert "depth is metres (scale from speed)" in outcome.out
+
+
+def test_evaluate_with_a_table_of_speeds_and_with_stereo(tool: Tool, checkpoint: Path, tmp_path: Path) -> None:
+    common = (f"checkpoint={checkpoint}", "data=synthetic_tiny", "baselines=false", "output_dir=results")
+    (tmp_path / "speeds.csv").write_text("frame,speed\n0,8\n5,8\n")
+    outcome = tool("evaluate", *common, "scale.method=speed", "scale.speeds=speeds.csv")
+    assert outcome.code == 0, outcome.err
+    outcome = tool("evaluate", *common, "scale.method=stereo", "scale.frames=3")
+    assert outcome.code == 0, outcome.err
+    assert "from stereo baseline: median of" in outcome.out
+
+
+@pytest.mark.parametrize("offsets", ["[]", "[-1,1]"])
+def test_stereo_trainings_are_config_swaps(tool: Tool, offsets: str, tmp_path: Path) -> None:
+    outcome = tool(
+        "train", "experiment=smoke", "data.stereo=true", f"data.offsets={offsets}", "logger=none", "output_dir=run"
+    )
+    assert outcome.code == 0, outcome.err
+    record = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt").record
+    assert (record.pose is None) == (offsets == "[]")
+    assert record.scale == Scale(1.0, "stereo training")
+
+
+def test_no_source_at_all_is_one_sentence(tool: Tool) -> None:
+    outcome = tool("train", "experiment=smoke", "data.offsets=[]")
+    assert outcome.code == 1
+    assert "data.offsets is empty and data.stereo is false" in outcome.err
