@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from saunet.evaluation.odometry import Path3d, path_errors, path_table, write_errors, write_path
+from saunet.evaluation.odometry import Path3d, path_errors, path_of, path_table, write_errors, write_path
 from saunet.evaluation.plot import draw_path
 from saunet.evaluation.trajectories import read_kitti, read_tum
 
@@ -79,6 +79,30 @@ def test_a_short_path_gets_shorter_segments_and_says_so():
     text = stream.export_text()
     assert "segments of 12 to 48 m" in text
     assert "odometry/99 l" in text
+
+
+class Recording:
+    name = "odometry/99 l"
+    indices = (4, 5, 6)
+
+    def __init__(self, times, poses):
+        self.times, self.poses = times, poses
+
+    def time(self, index):
+        return self.times.get(index)
+
+    def pose(self, index):
+        return self.poses.get(index)
+
+
+def test_a_path_takes_truth_and_times_where_the_recording_has_them_all():
+    poses = dict(zip((4, 5, 6), winding(3), strict=True))
+    path = path_of(Recording({4: 0.5, 5: 0.6, 6: 0.75}, poses), predicted(3))
+    assert path.times.tolist() == [0.5, 0.6, 0.75]
+    np.testing.assert_array_equal(path.true, winding(3))
+    path = path_of(Recording({4: 0.5}, {4: np.eye(4)}), predicted(3))
+    assert path.times.tolist() == pytest.approx([0.4, 0.5, 0.6])
+    assert path.true is None
 
 
 def test_files_are_read_back(tmp_path):

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from omegaconf import DictConfig
 
 from saunet import config
@@ -20,7 +18,7 @@ def odometry(cfg: DictConfig) -> None:
     from saunet.checkpoint import read_checkpoint
     from saunet.evaluation.foreign import file_stem
     from saunet.evaluation.motion import predict_trajectory
-    from saunet.evaluation.odometry import Path3d, path_errors, path_table, write_errors, write_path
+    from saunet.evaluation.odometry import path_errors, path_of, path_table, write_errors, write_path
     from saunet.evaluation.plot import check_plotting, draw_path
     from saunet.registry import instantiate
 
@@ -31,17 +29,23 @@ def odometry(cfg: DictConfig) -> None:
     pose = checkpoint.networks()[1]
     if pose is None:
         raise ConfigError(f"{cfg.checkpoint} has no pose network (it was trained on stereo pairs); a path needs one")
-    size = {"height": record.height, "width": record.width}
-    data = instantiate({**config.plain(cfg.data), **size, "offsets": list(record.offsets)})
+    fixed = {"height": record.height, "width": record.width, "offsets": list(record.offsets)}
+    data = instantiate({**config.plain(cfg.data), **fixed})
     data.setup("test")
     errors = []
     for drive in data.datasets["test"].drives:
         predicted = predict_trajectory(
-            pose.to(device), drive, offsets=record.offsets, device=device, batch_size=cfg.batch_size, **size
+            pose.to(device),
+            drive,
+            offsets=record.offsets,
+            height=record.height,
+            width=record.width,
+            device=device,
+            batch_size=cfg.batch_size,
         )
         if record.scale is not None:
             predicted[:, :3, 3] *= record.scale.factor
-        path = Path3d(drive.name, predicted, _times(drive), _truth(drive))
+        path = path_of(drive, predicted)
         folder = output / file_stem(drive.name)
         write_path(path, folder)
         if cfg.figure:
@@ -55,18 +59,6 @@ def odometry(cfg: DictConfig) -> None:
     if errors:
         Console().print(path_table(errors))
     print(f"results: {output}")
-
-
-def _times(drive: Any) -> Any:
-    """Return seconds by the recording, or ten frames a second where it does not say."""
-    numbers = list(drive.indices)
-    known = [drive.time(number) for number in numbers] if hasattr(drive, "time") else [None]
-    return np.array(numbers) * 0.1 if None in known else np.array(known, dtype=np.float64)
-
-
-def _truth(drive: Any) -> Any:
-    poses = [drive.pose(number) for number in drive.indices]
-    return None if any(pose is None for pose in poses) else np.stack(poses)
 
 
 def main() -> None:

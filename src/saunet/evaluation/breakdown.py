@@ -98,7 +98,7 @@ def near_edge(truth: Float[Tensor, "h w"], radius: int, ratio: float) -> Bool[Te
 
 
 def _row_maximum(values: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
-    """Largest of the non-negative values within ``radius`` columns; windows that double are faster than a pooling layer."""
+    """Largest of the non-negative values within ``radius`` columns, by windows that double: faster than pooling."""
     found, window, wanted = pad(values, (radius, radius)), 1, 2 * radius + 1
     while window < wanted:
         step = min(window, wanted - window)

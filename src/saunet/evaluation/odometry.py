@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -81,6 +82,22 @@ class Path3d:
     def aligned(self) -> Float64[ndarray, "n 4 4"]:
         """The predicted poses, aligned."""
         return self.alignment.poses(self.predicted)
+
+
+def path_of(drive: Any, predicted: Float64[ndarray, "n 4 4"]) -> Path3d:
+    """Return a predicted path beside what its recording knows: true poses of all frames, and when they were taken.
+
+    Where the recording does not say when, frames are taken to be a tenth of a second apart.
+    """
+    numbers = list(drive.indices)
+    times = [drive.time(number) for number in numbers] if hasattr(drive, "time") else [None]
+    poses = [drive.pose(number) for number in numbers]
+    return Path3d(
+        drive.name,
+        predicted,
+        np.array(numbers) * 0.1 if None in times else np.array(times, dtype=np.float64),
+        None if any(pose is None for pose in poses) else np.stack(poses),
+    )
 
 
 def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None = None) -> PathErrors:
@@ -182,5 +199,6 @@ def write_errors(errors: Sequence[PathErrors], folder: Path, settings: dict[str,
         table = io.StringIO(newline="")
         writer = csv.DictWriter(table, list(rows[0]))
         writer.writeheader()
-        writer.writerows({**row, "lengths": " ".join(map(str, row["lengths"]))} for row in rows)  # type: ignore[call-overload]
+        for row, plain in zip(errors, rows, strict=True):
+            writer.writerow({**plain, "lengths": " ".join(map(str, row.lengths))})
         write_bytes(folder / "odometry.csv", table.getvalue().encode())
