@@ -83,6 +83,9 @@ def test_results_are_not_replaced_unasked(predictor: Predictor, video: Path, tmp
         with pytest.raises(ConfigError, match=f"{name} exists; choose another output folder, or set overwrite=true"):
             predict_clip(predictor, video, tmp_path / "out", outputs)
         assert predict_clip(predictor, video, tmp_path / "out", outputs, overwrite=True).frames == 5
+    (tmp_path / "out" / "drive" / "notes_of_mine.txt").touch()
+    predict_clip(predictor, video, tmp_path / "out", ["png16"], overwrite=True, max_frames=1)
+    assert names(tmp_path / "out" / "drive") == ["000000_depth.png", "notes_of_mine.txt"]
 
 
 def test_folder_whose_results_lie_inside(predictor: Predictor, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ OUTPUTS: tuple[str, ...] = ("colour", "png16", "npy", "ply")
 MANIFEST = "predictions.json"
 """Written into the output folder: which model and settings its files come from."""
 
-_ENDINGS = {"colour": "_disparity.png", "png16": "_depth.png", "npy": "_depth.npy", "ply": "_points.ply"}
+ENDINGS = {"colour": "_disparity.png", "png16": "_depth.png", "npy": "_depth.npy", "ply": "_points.ply"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,12 @@ def predict_files(
     if camera is not None and not isinstance(camera, Camera):
         camera = Camera.from_numbers(camera, *_first_size(sources))
     style = Style(palette, limits, camera, max_depth)
-    settings = {"model": predictor.fingerprint, "unit": predictor.unit, **style.plain()}
+    settings = {
+        "model": predictor.fingerprint,
+        "unit": predictor.unit,
+        "straightened": predictor.straightened_by,
+        **style.plain(),
+    }
     claimed = _claimed(folder, settings, overwrite)
     todo = [source for source in sources if overwrite or _missing(source, folder, outputs)]
     written: list[Path] = []
@@ -142,7 +147,7 @@ def write_output(output: str, stem: Path, result: Prediction, style: Style) -> P
     Raises:
         DataError: if the system refuses to write.
     """
-    path = stem.with_name(f"{stem.name}{_ENDINGS[output]}")
+    path = stem.with_name(f"{stem.name}{ENDINGS[output]}")
     _WRITERS[output](path, result, style)
     return path
 
@@ -194,7 +199,7 @@ def _claimed(folder: Path, settings: Mapping[str, object], overwrite: bool) -> b
 def _missing(source: Source, folder: Path, outputs: Sequence[str]) -> list[str]:
     """Return the outputs that are not there yet or older than their image; files appear only when they are complete."""
     changed = source.path.stat().st_mtime
-    paths = {output: folder / f"{source.stem}{_ENDINGS[output]}" for output in outputs}
+    paths = {output: folder / f"{source.stem}{ENDINGS[output]}" for output in outputs}
     return [output for output, path in paths.items() if not path.is_file() or path.stat().st_mtime < changed]
 
 

@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 from saunet.checks import one_of
 from saunet.infer.clips import VideoWriter
 from saunet.infer.colour import PALETTES, colourise
-from saunet.infer.files import Style, write_output
+from saunet.infer.files import ENDINGS, Style, write_output
 from saunet.infer.panel import fit, label
 from saunet.infer.pointcloud import Camera
 from saunet.infer.prediction import Prediction
@@ -73,13 +73,22 @@ class VideoSink(Sink):
 
 
 class FrameSink(Sink):
-    """Files a frame, ``000000_depth.png`` and so on, in a folder of their own; each is complete once it is there."""
+    """Files a frame, ``000000_depth.png`` and so on, in a folder of their own; each is complete once it is there.
+
+    Frames that an earlier clip left in the folder are removed first: they would be taken for this one's.
+    """
 
     def __init__(
         self, folder: Path, outputs: Sequence[str], style: Style, camera: Camera | Sequence[float | int] | None = None
     ) -> None:
         self._outputs, self._style, self._camera = tuple(outputs), style, camera
         self._count, self.paths = 0, (folder,)
+
+    def __enter__(self) -> FrameSink:
+        for path in self.paths[0].glob("[0-9][0-9][0-9][0-9][0-9][0-9]_*"):
+            if path.name[6:] in ENDINGS.values():
+                path.unlink()
+        return self
 
     def add(self, result: Prediction, limits: tuple[float, float]) -> None:
         """Write the frame's files."""

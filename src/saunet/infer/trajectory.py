@@ -156,7 +156,7 @@ def draw_from_above(
     for index, colour in ((0, _START), (-1, _END)):
         cv2.circle(canvas, (int(points[index, 0]), int(points[index, 1])), 6 * 16, colour, -1, cv2.LINE_AA, 4)
     length = float(np.linalg.norm(np.diff(T_world_cam[:, :3, 3], axis=0), axis=1).sum())
-    unit = "m" if metric else "(relative unit)"
+    unit = "m" if metric else "relative units"
     canvas[: top - 8] = _PAPER
     for row, text in enumerate(
         (f"{len(x)} frames, {length:.4g} {unit} along the path; a square is {step:g} {unit}",
