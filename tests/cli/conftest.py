@@ -17,12 +17,20 @@ from saunet.cli._app import run
 from saunet.cli.calibrate import calibrate
 from saunet.cli.doctor import doctor
 from saunet.cli.evaluate import evaluate
+from saunet.cli.odometry import odometry
 from saunet.cli.predict import predict
 from saunet.cli.train import train
 from saunet.data.synthetic import SyntheticDrive
 from saunet.data.synthetic.kitti_writer import write_raw
 
-TASKS = {"train": train, "evaluate": evaluate, "predict": predict, "calibrate": calibrate, "doctor": doctor}
+TASKS = {
+    "train": train,
+    "evaluate": evaluate,
+    "odometry": odometry,
+    "predict": predict,
+    "calibrate": calibrate,
+    "doctor": doctor,
+}
 
 
 @dataclass(frozen=True)

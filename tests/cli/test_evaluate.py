@@ -1,0 +1,172 @@
+"""``saunet-evaluate`` and ``saunet-odometry``: protocols side by side, predictions of other systems, paths."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from saunet.data.kitti import KittiRaw
+from saunet.evaluation.trajectories import read_kitti
+from saunet.metrics.functional import ERROR_NAMES
+
+Tool = Callable[..., Any]
+RAW = ("data=kitti", "data.split=all", "data.cameras=[left]", "data.workers=0", "baselines=false")
+
+
+def checkpoint(run: Path) -> str:
+    return f"checkpoint={run / 'checkpoints' / 'best.ckpt'}"
+
+
+def results(folder: Path) -> dict[str, dict[str, Any]]:
+    content = json.loads((folder / "metrics.json").read_text())
+    return {row["protocol"]: row for row in content["results"] if row["predictor"] in ("model", "predictions")}
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_protocols_side_by_side_each_on_its_own_truth(
+    tool: Tool, smoke_run: Path, raw_root: Path, tmp_path: Path
+) -> None:
+    outcome = tool(
+        "evaluate",
+        checkpoint(smoke_run),
+        *RAW,
+        f"data.root={raw_root}",
+        "data.test_split=all",
+        "protocols=[eigen_lidar_x,eigen_camera_z]",
+        "truth_cache=truth",
+        "buckets=true",
+        "flip=true",
+        "output_dir=out",
+    )
+    assert outcome.code == 0, outcome.err
+    assert outcome.out.index("eigen_lidar_x") < outcome.out.index("eigen_camera_z")
+    assert "±" in outcome.out
+    assert "near an edge" in outcome.out
+    found = results(tmp_path / "out")
+    assert list(found) == ["eigen_lidar_x", "eigen_camera_z"]
+    assert found["eigen_lidar_x"]["abs_rel"] != found["eigen_camera_z"]["abs_rel"]
+    for row in found.values():
+        assert row["abs_rel_low"] <= row["abs_rel"] <= row["abs_rel_high"]
+        assert row["images"] == 12
+    assert {row["protocol"] for row in table(tmp_path / "out" / "buckets.csv")} == set(found)
+    assert len(list((tmp_path / "truth").rglob("*.npz"))) == 24
+    settings = json.loads((tmp_path / "out" / "metrics.json").read_text())["settings"]
+    assert settings["post_processing"] == "monodepth blend of two flips"
+
+
+def test_an_array_in_the_order_of_a_list_of_frames(tool: Tool, raw_root: Path, tmp_path: Path) -> None:
+    """Every prediction is right but for its own factor, which only the right order gives back to its image."""
+    raw = KittiRaw(raw_root)
+    name = next(iter(raw.drives))
+    drive = raw.drive(name)
+    frames = [3, 0, 5, 1]
+    (tmp_path / "test_files.txt").write_text("".join(f"{name} {frame:010d} l\n" for frame in frames))
+    truths = [drive.depth(frame) for frame in frames]
+    factors = np.array([0.9, 0.7, 0.98, 0.8])  # below 1, so that the cap at 80 m does not bite
+    disparities = [1 / np.where(t > 0, f * t, 1.0) for t, f in zip(truths, factors, strict=True) if t is not None]
+    np.save(tmp_path / "disps.npy", np.stack(disparities).astype(np.float32))
+    arguments = (
+        "evaluate",
+        "predictions=disps.npy",
+        *RAW,
+        f"data.root={raw_root}",
+        "data.test_split=test_files.txt",
+        "protocols=[metric]",
+        "output_dir=out",
+    )
+    outcome = tool(*arguments)
+    assert outcome.code == 0, outcome.err
+    rows = table(tmp_path / "out" / "per_image.csv")
+    assert [row["name"] for row in rows] == [f"{name} {frame:010d} l" for frame in frames]
+    for row, factor in zip(rows, factors, strict=True):
+        assert float(row["abs_rel"]) == pytest.approx(1 - factor, rel=1e-4)
+    drive.depth_file(0).unlink()  # an image without ground truth is left out and does not shift the others
+    assert tool(*arguments).code == 0
+    left = table(tmp_path / "out" / "per_image.csv")
+    assert [float(row["abs_rel"]) for row in left] == pytest.approx([0.1, 0.02, 0.2], rel=1e-4)
+
+
+def test_exported_predictions_score_the_same_and_compare(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    data = ("data=synthetic_tiny", "baselines=false")
+    outcome = tool("evaluate", checkpoint(smoke_run), *data, "export=png", "output_dir=a")
+    assert outcome.code == 0, outcome.err
+    assert len(list((tmp_path / "png").glob("*.png"))) == 6
+    outcome = tool("evaluate", "predictions=png", "match=name", *data, "compare=a", "output_dir=b")
+    assert outcome.code == 0, outcome.err
+    first, second = results(tmp_path / "a")["synthetic"], results(tmp_path / "b")["synthetic"]
+    assert [second[name] for name in ERROR_NAMES] == pytest.approx([first[name] for name in ERROR_NAMES], rel=2e-3)
+    assert "'predictions' against 'model of a'" in outcome.out
+    assert [row["error"] for row in table(tmp_path / "b" / "comparison.csv")] == list(ERROR_NAMES)
+
+
+def test_without_ground_truth_by_how_the_neighbours_are_explained(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    outcome = tool(
+        "evaluate", checkpoint(smoke_run), "data=synthetic_tiny", "protocols=[campus,synthetic]", "output_dir=out"
+    )
+    assert outcome.code == 0, outcome.err
+    assert "explained ↑" in outcome.out
+    rows = table(tmp_path / "out" / "views.csv")
+    assert len(rows) == 4
+    assert all(0 < float(row["warped"]) < 1 and 0 <= float(row["explained"]) <= 1 for row in rows)
+    assert {row["condition"] for row in rows} == {"synthetic/020000 l"} or len({row["condition"] for row in rows}) == 1
+    assert results(tmp_path / "out")["synthetic"]["images"] == 6
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ((), "neither is set"),
+        (("checkpoint=x.ckpt", "predictions=y.npy"), "both are set"),
+        (("predictions=y.npy", "flip=true"), "leave it out with predictions"),
+        (("predictions=y.npy", "baselines=false"), "no predictions at 'y.npy'"),
+        (("predictions=y.npy", "protocols=[eigen_lidar]"), "did you mean 'eigen_lidar_x'?"),
+        (("predictions=y.npy", "protocols=[campus]", "baselines=false"), "no predictions at 'y.npy'"),
+    ],
+)
+def test_what_cannot_be_evaluated(tool: Tool, overrides: tuple[str, ...], words: str) -> None:
+    outcome = tool("evaluate", "data=synthetic_tiny", *overrides)
+    assert outcome.code == 1
+    assert "Traceback" not in outcome.err
+    assert words in outcome.err
+
+
+def test_an_evaluation_of_other_images_is_not_compared(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    (tmp_path / "per_image.csv").write_text(
+        f"predictor,protocol,name,pixels,scale,{','.join(ERROR_NAMES)}\nmodel,metric,x 1 l,9,1,1,1,1,1,1,1,1\n"
+    )
+    arguments = (checkpoint(smoke_run), "data=synthetic_tiny", "baselines=false", "compare=per_image.csv")
+    outcome = tool("evaluate", *arguments)
+    assert outcome.code == 1
+    assert "has no protocol in common with this evaluation (its protocols: metric)" in outcome.err
+
+
+def test_odometry_writes_paths_errors_and_a_picture(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    outcome = tool("odometry", checkpoint(smoke_run), "data=synthetic_tiny", "output_dir=out")
+    assert outcome.code == 0, outcome.err
+    (row,) = json.loads((tmp_path / "out" / "odometry.json").read_text())["results"]
+    assert (row["frames"], row["snippet"]) == (6, 5)
+    assert row["ate"] > 0
+    (folder,) = (path for path in (tmp_path / "out").iterdir() if path.is_dir())
+    names = {f"{kind}_{style}.txt" for kind in ("predicted", "aligned", "true") for style in ("kitti", "tum")}
+    assert {path.name for path in folder.iterdir()} == names | {"path.png"} | {p.name for p in folder.glob(".hydra")}
+    assert len(read_kitti(folder / "predicted_kitti.txt")) == 6
+    assert "ATE" in outcome.out
+
+
+def test_odometry_of_a_recording_without_poses(tool: Tool, smoke_run: Path, raw_root: Path, tmp_path: Path) -> None:
+    outcome = tool("odometry", checkpoint(smoke_run), *RAW[:4], f"data.root={raw_root}", "figure=false", "output_dir=o")
+    assert outcome.code == 0, outcome.err
+    assert "no true poses, so the path is written and not compared" in outcome.out
+    assert len(list((tmp_path / "o").rglob("predicted_tum.txt"))) == 2
+    assert json.loads((tmp_path / "o" / "odometry.json").read_text())["results"] == []
