@@ -12,7 +12,8 @@ import yaml
 
 from saunet.checks import ConfigError
 from saunet.cli._app import run
-from saunet.cli.report import arguments, planned_jobs, report
+from saunet.cli._runs import arguments, planned_jobs
+from saunet.cli.report import report
 
 
 def tool(*given: str) -> tuple[int, str, str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from made_runs import add_checkpoint, make_evaluation, make_run
 
-from saunet.checks import DataError
+from saunet.checks import ConfigError, DataError
 from saunet.report.inputs import collect
 from saunet.report.tables import explained_table
 
@@ -22,6 +22,13 @@ def test_a_sweep_holds_its_jobs_in_order_and_the_one_that_left_nothing(sweep: Pa
     assert found.runs[3].error is not None
     assert "left no folder" in found.runs[3].error
     assert found.runs[3].overrides == {"objective.beta": "0.01"}
+
+
+def test_jobs_of_a_running_sweep_wait(sweep: Path) -> None:
+    make_run(sweep / "3", job=3, status="running", host="another-machine")
+    (found,) = collect([sweep], jobs=lambda folder: [[f"seed={job}"] for job in range(5)]).sweeps
+    assert [run.status for run in found.runs[3:]] == ["running", "unfinished"]
+    assert found.runs[4].error == "it is not started yet"
 
 
 def test_a_gap_in_a_sweep_is_a_failed_job_even_without_its_plan(sweep: Path) -> None:
@@ -107,6 +114,11 @@ def test_a_path_without_a_run_is_refused(tmp_path: Path, name: str, words: str) 
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=words):
         collect([tmp_path / name])
+
+
+def test_another_checkpoint_than_best_or_last_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="checkpoint is 'first'"):
+        collect([make_run(tmp_path / "a")], "first")
 
 
 def test_no_path_at_all_is_refused() -> None:

@@ -14,15 +14,15 @@ from saunet.report.scenes import View, edge_boxes, read_views, scene
 
 
 def test_training_lies_within_epochs_and_validation_at_their_ends() -> None:
-    history = [{"epoch": step // 4, "step": step, "train/loss": float(step)} for step in range(8)]
-    history += [{"epoch": epoch, "step": 4 * epoch + 3, "val/a1": 0.5} for epoch in (0, 1)]
+    history = [{"epoch": step // 4.0, "step": float(step), "train/loss": float(step)} for step in range(8)]
+    history += [{"epoch": epoch, "step": 4 * epoch + 3, "val/a1": 0.5} for epoch in (0.0, 1.0)]
     assert curve(history, "train/loss") == ([(step + 1) / 4 for step in range(8)], [float(step) for step in range(8)])
     assert curve(history, "val/a1") == ([1, 2], [0.5, 0.5])
     assert curve(history, "val/none") == ([], [])
 
 
 def test_a_long_curve_is_thinned_by_means() -> None:
-    history = [{"epoch": 0, "step": step, "train/loss": float(step % 2)} for step in range(1000)]
+    history = [{"epoch": 0.0, "step": float(step), "train/loss": step % 2.0} for step in range(1000)]
     x, y = curve(history, "train/loss", points=100)
     assert len(x) == 100
     assert set(y) == {0.5}
@@ -30,14 +30,13 @@ def test_a_long_curve_is_thinned_by_means() -> None:
 
 def test_boxes_lie_on_depth_edges_within_the_image_and_apart() -> None:
     disparity = np.full((60, 240), 0.1, np.float32)
-    disparity[20:40, 100:120] = 1.0
-    image = np.zeros((60, 240, 3), np.uint8)
-    first, second = edge_boxes([disparity], image, 2)
-    covering = [box for box in (first, second) if box.left <= 110 <= box.left + box.width]
-    assert covering
-    assert all(0 <= box.left <= 240 - box.width and 0 <= box.top <= 60 - box.height for box in (first, second))
-    apart = first.left + first.width <= second.left or abs(first.top - second.top) >= first.height
-    assert apart
+    disparity[20:40, 60:80] = 1.0
+    disparity[30:50, 180:200] = 0.5
+    first, second = edge_boxes([disparity], np.zeros((60, 240, 3), np.uint8), 2)
+    for box, middle in ((first, 70), (second, 190)):
+        assert box.left < middle < box.left + box.width
+        assert 0 <= box.left <= 240 - box.width
+        assert 0 <= box.top <= 60 - box.height
 
 
 def test_a_scene_without_any_edge_has_no_boxes() -> None:

@@ -3,30 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from saunet import config
 from saunet.checks import ConfigError
 from saunet.cli._app import pick_device, run
-
-HYDRA = (
-    "--config-dir",
-    "-cd",
-    "--config-path",
-    "-cp",
-    "--config-name",
-    "-cn",
-    "--package",
-    "-p",
-    "--cfg",
-    "-c",
-    "--info",
-)
-"""Hydra's own options that are followed by a word."""
+from saunet.cli._runs import arguments, planned_jobs
 
 
 def report(cfg: DictConfig) -> None:
@@ -73,50 +58,6 @@ def scenes(node: Any) -> dict[str, Any]:
     if not isinstance(given, dict):
         raise ConfigError(f"scenes is {given!r}; give images by condition, such as scenes={{kitti: FOLDER}}")
     return {str(key): value for key, value in given.items()}
-
-
-def planned_jobs(sweep: Path) -> list[list[str]] | None:
-    """Return the overrides of every job that a multirun folder was to hold; None if another sweeper chose them."""
-    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    try:
-        hydra = OmegaConf.load(sweep / "multirun.yaml").hydra
-        if "BasicSweeper" not in hydra.sweeper._target_:
-            return None
-        params = [f"{key}={value}" for key, value in (hydra.sweeper.params or {}).items()]
-        parsed = OverridesParser.create().parse_overrides([*params, *hydra.overrides.task])
-        return [job for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]
-    except (OSError, AttributeError, HydraException):
-        return None
-
-
-def arguments(given: Sequence[str]) -> list[str]:
-    """Turn plain folders and files into ``runs=[...]``, and the word ``compare`` in front into ``compare=true``.
-
-    Raises:
-        ConfigError: if runs are named both ways.
-    """
-    words = list(given)
-    extra = []
-    if words[:1] == ["compare"]:  # it prints, and leaves no folder behind
-        words = words[1:]
-        extra = [
-            "compare=true",
-            "hydra.run.dir=.",
-            "hydra.output_subdir=null",
-            "hydra.job_logging.root.handlers=[console]",
-        ]
-    plain = [
-        word
-        for before, word in zip(["", *words], words, strict=False)
-        if word[:1] not in ("-", "~", "+") and before not in HYDRA and ("=" not in word or Path(word).exists())
-    ]
-    if plain and any(word.startswith("runs=") for word in words):
-        raise ConfigError(f"runs are named twice, as runs=... and as {plain[0]}; name them in one way")
-    quoted = ",".join("'" + word.replace("\\", "\\\\").replace("'", "\\'") + "'" for word in plain)
-    return [*(word for word in words if word not in plain), *extra, *([f"runs=[{quoted}]"] if plain else [])]
 
 
 def main() -> None:

@@ -195,10 +195,16 @@ def _curves(group: _Group, missing: list[Missing]) -> list[Figure]:
     for number, what, panels, caption in wanted:
         drawing = figures.draw_curves(group.runs, panels, ordered=ordered)
         if drawing is None:
-            missing.append(Missing(f"{number}, {what} of {group.title.lower()}", "no run has logged it"))
+            missing.append(
+                Missing(
+                    f"{number}, {what} of {group.title.lower() if not group.swept else group.title}",
+                    "no run has logged it",
+                )
+            )
             continue
         picture = Picture(f"{group.name}_{what}.svg", drawing, f"{what} against epoch")
-        found.append(Figure(f"{number}. {what.capitalize()} against epoch: {group.title.lower()}", picture, caption))
+        place = f": {group.title}" if group.swept else ""
+        found.append(Figure(f"{number}. {what.capitalize()} against epoch{place}", picture, caption))
     return found
 
 
@@ -221,32 +227,30 @@ def _galleries(group: _Group, views: Sequence[View], seen: Mapping[str, Seen], z
         for count, (place, view) in enumerate(members):
             maps = {name: seen[name].disparities[place] for name in names}
             scenes.append(scene(view, maps, f"{group.name}_{_slug(condition)}_{count}", zooms))
-        what = "loss functions" if losses else "models"
-        title = f"{number}. {what.capitalize()} side by side: {condition.replace('_', ' ')}"
-        found.append(
-            Gallery(title, tuple(scenes), f"{len(names)} {'settings' if losses else 'models'}, {group.title.lower()}.")
-        )
+        what = "loss functions" if losses else "models" if len(networks) > 1 or not group.swept else "settings"
+        heading = f"{what.capitalize()} side by side: {condition.replace('_', ' ')}"
+        title = heading if what == "settings" else f"{number}. {heading}"
+        count_words = f"{len(names)} {'models' if what == 'models' else 'settings'}"
+        count_words += f" of {group.title}." if group.swept else "."
+        found.append(Gallery(title, tuple(scenes), count_words))
     return found
 
 
 def _no_pictures(views: Sequence[View], galleries: Sequence[Gallery]) -> list[Missing]:
     if not views:
-        return [
-            Missing("Figs. 7, 8, 9 and 11", "no scenes given, such as scenes.kitti=FOLDER scenes.campus_sunny=FOLDER")
-        ]
+        why = "no scenes given; name images, such as 'scenes={kitti: FOLDER, campus_sunny: FOLDER}'"
+        return [Missing("Figs. 7, 8, 9 and 11", why)]
     if not galleries:
         return [Missing("Figs. 7, 8, 9 and 11", "no run has a checkpoint that can be used")]
-    found = " ".join(gallery.title.partition(". ")[0] for gallery in galleries)
-    found += " ".join(gallery.title for gallery in galleries)
-    why = {
+    numbered = [re.match(r"Figs?\. ([\d and]+)\.", gallery.title) for gallery in galleries]
+    found = {number for match in numbered if match for number in re.findall(r"\d+", match[1])}
+    reasons = {
         "7": "no group of runs differs in its loss alone",
         "8": "no scenes but those of the campus, or runs that differ in their loss alone",
         "9": "no scenes named campus_CONDITION",
         "11": "no runs of different networks",
     }
-    return [
-        Missing(f"Fig. {number}", reason) for number, reason in why.items() if not re.search(rf"\b{number}\b", found)
-    ]
+    return [Missing(f"Fig. {number}", reason) for number, reason in reasons.items() if number not in found]
 
 
 def _speed(points: Sequence[tuple[str, float, float]], draw: bool) -> list[Figure]:

@@ -19,8 +19,6 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7
 """Okabe and Ito's colours, which colour-blind readers can tell apart, the yellow left out on white paper."""
 _STYLE = {
     "font.size": 9.5,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
     "axes.labelcolor": "#444444",
     "axes.edgecolor": "#b9bec5",
     "axes.linewidth": 0.8,
@@ -76,7 +74,7 @@ def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, o
             if x:
                 few = len(x) <= 25
                 axis.plot(x, y, color=colour, label=name, marker="o" if few else None, markersize=3.5)
-        axis.set_title(title)
+        axis.set_title(title, loc="left", fontsize=10)
         axis.set_xlabel("epoch")
         axis.set_xlim(left=0)
     if len(runs) > 1:
@@ -100,7 +98,7 @@ def draw_ratio(runs: Mapping[str, Run]) -> bytes | None:
         axis.axvspan(95, 105, color="#fff1c9", zorder=0, label="the paper's best, 95 to 105")
         axis.plot([p[0] for p in points], [p[column] for p in points], "o-", color=COLOURS[0], markersize=4.5)
         axis.set_xscale("log")
-        axis.set_title(title)
+        axis.set_title(title, loc="left", fontsize=10)
         axis.set_xlabel(RATIO)
     axes[0].legend(loc="best")
     return _svg(figure)

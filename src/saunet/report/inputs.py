@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from saunet.checks import DataError
+from saunet.checks import DataError, one_of
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.report.files import read_json, read_mapping
-from saunet.report.runs import Explained, Run, Score, read_run, split_overrides
+from saunet.report.runs import Explained, Run, Score, Status, read_run, split_overrides
 
 Jobs = Callable[[Path], "list[list[str]] | None"]
 """Returns the overrides of every job that a sweep folder was to hold; None where that cannot be told."""
@@ -58,8 +58,10 @@ def collect(paths: Sequence[str | Path], checkpoint: str = "best", jobs: Jobs | 
         jobs: Tells which jobs a sweep should have, so that those without a folder are not forgotten.
 
     Raises:
+        ConfigError: if the checkpoint is neither.
         DataError: if a path does not exist or holds nothing of the kind.
     """
+    one_of("checkpoint", checkpoint, ("best", "last"))
     if not paths:
         raise DataError("no run given; name folders of runs or sweeps, or checkpoints: saunet-report outputs/train/...")
     runs: dict[Path, Run] = {}
@@ -142,15 +144,19 @@ def _read_sweep(folder: Path, checkpoint: str, jobs: Jobs | None) -> Sweep:
         number = number if isinstance(number, int) and number not in found else len(found)
         found[number] = read_run(place, checkpoint, number)
     planned = jobs(folder) if jobs else None
+    going_on = any(run.status == "running" for run in found.values())
+    last = max(found, default=-1)
     for number in range(max([*found, len(planned or ()) - 1, -1]) + 1):
         if number not in found:
             overrides = split_overrides(planned[number]) if planned and number < len(planned) else {}
-            error = "it left no folder: it failed before it began, or was never started"
-            found[number] = Run(folder / str(number), "failed", error, str(number), overrides=overrides, job=number)
+            waiting = going_on and number > last
+            error = "it is not started yet" if waiting else "it left no folder: it failed before it began"
+            status: Status = "unfinished" if waiting else "failed"
+            found[number] = Run(folder / str(number), status, error, str(number), overrides=overrides, job=number)
     runs = tuple(found[number] for number in sorted(found))
     config = read_mapping(folder / "multirun.yaml")
-    names = [run.name for run in runs if run.config] or [str(config.get("name") or folder.name)]
-    return Sweep(folder, names[0], runs)
+    names = [str(config["name"])] if config.get("name") else [run.name for run in runs if run.config]
+    return Sweep(folder, (names or [folder.name])[0], runs)
 
 
 def _read_checkpoint(file: Path) -> Run:
