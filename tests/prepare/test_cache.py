@@ -37,7 +37,7 @@ def test_copies_are_small_and_listed_and_originals_untouched(tree, tmp_path):
         assert listed["frames"][f"{number:010d}"] == [len(data), hashlib.sha256(data).hexdigest()]
     copy = read_image(home / "0000000003.jpg")
     assert copy.shape == (10, 32, 3)
-    assert np.abs(copy.astype(int) - resize(recordings[0][0].image(3), 10, 32)).mean() < 12
+    assert np.abs(copy.astype(int) - resize(recordings[0][0].image(3), 10, 32)).mean() < 25
     assert build_cache(recordings, tmp_path / "cache", SMALL).verified == 10
 
 
@@ -78,27 +78,27 @@ def test_killed_at_random_moments_it_ends_like_a_clean_run(tree, tmp_path):
     """SIGKILL while files are being written, then again, until a run gets through."""
     recordings, folder = kitti_recordings(tree, ["left"]), tmp_path / "cache"
     build_cache(recordings, tmp_path / "clean", SMALL)
-    random, fork = np.random.default_rng(0), multiprocessing.get_context("fork")
-    states = set()
-    for _ in range(200):
+    random, fork = np.random.default_rng(), multiprocessing.get_context("fork")
+    interrupted = 0
+    for files in (1, 3, 6, 9, 11):
         run = fork.Process(target=_build, args=(recordings, folder))
         run.start()
-        run.join(float(random.uniform(0, 0.06)))
+        while run.is_alive() and len(list(folder.rglob("*.jp*"))) < files:
+            time.sleep(0.0002)
+        time.sleep(float(random.uniform(0, 0.003)))
         run.kill()
         run.join()
-        finished = {path for path in content(folder) if ".partial" not in path} if folder.is_dir() else set()
-        assert finished <= set(content(tmp_path / "clean"))  # never a file that does not belong
-        states.add(len(finished))
-        if run.exitcode == 0:
-            break
+        interrupted += run.exitcode != 0
+        finished = {path: data for path, data in content(folder).items() if ".partial" not in path}
+        clean = content(tmp_path / "clean")
+        assert finished.items() <= clean.items()  # never half a file, never one that does not belong
     build_cache(recordings, folder, SMALL)
-    assert content(folder) == content(tmp_path / "clean")
-    assert len(states) > 2  # it really was interrupted in between
+    assert content(folder) == clean
+    assert interrupted >= 2
 
 
 def _build(recordings, folder):
     cv2.setNumThreads(0)
-    time.sleep(0.01)
     build_cache(recordings, folder, SMALL)
 
 

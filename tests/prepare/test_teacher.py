@@ -57,16 +57,17 @@ def test_files_of_other_systems(tree, tmp_path):
     for folder, values, factor in ((flat, "disparity", 3), (nested, "depth", 1), (single, "disparity", 3)):
         out = tmp_path / f"maps_{folder.name}"
         assert teach(recordings, FileTeacher(folder, values), str(out)).made == 4
-        assert np.abs(DepthMaps("teacher", out).read(drive, 1) * factor / depth - 1).max() < 2e-3
+        assert np.abs(DepthMaps("teacher", out).read(drive, 1) * factor / depth - 1).max() < 5e-3
 
 
 def test_unknown_pixels_stay_unknown(tree, tmp_path):
     values = np.full((20, 60), 0.5, np.float32)
     values[0], values[1], values[2] = 0, np.nan, -1
+    (tmp_path / "files").mkdir()
     for frame in range(4):
-        np.save(tmp_path / f"{frame:010d}.npy", values)
+        np.save(tmp_path / "files" / f"{frame:010d}.npy", values)
     recordings = kitti_recordings(tree, ["left"], ["0002_sync"])
-    teach(recordings, FileTeacher(tmp_path, "disparity"), str(tmp_path / "maps"))
+    teach(recordings, FileTeacher(tmp_path / "files", "disparity"), str(tmp_path / "maps"))
     stored = DepthMaps("teacher", tmp_path / "maps").read(recordings[0][0], 0)
     assert (stored[:3] == 0).all()
     assert np.allclose(stored[3:], 2.0)

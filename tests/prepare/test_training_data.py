@@ -83,7 +83,8 @@ def test_the_cache_is_read_in_training_and_intrinsics_follow(tree, tmp_path):
     for split in ("train", "val"):
         first, second = plain.datasets[split][0], cached.datasets[split][0]
         assert np.allclose(first["K"], second["K"], atol=1e-4)
-        assert np.abs(first["frames"].float() - second["frames"].float()).mean() < 15
+        pixels = np.stack([each["frames"].numpy().ravel() for each in (first, second)])
+        assert np.corrcoef(pixels)[0, 1] > 0.85
         assert cached.datasets[split].fingerprint() == plain.datasets[split].fingerprint()
     drive = cached.datasets["train"].drives[0]
     assert drive.image(1).shape == (10, 36, 3)

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -113,7 +113,8 @@ class ImageCache:
         frames = self.frames(drive)
         if not frames:
             raise DataError(f"the cache at {self.folder} does not hold '{drive.name}'; complete it: {self._command()}")
-        kind = CachedStereoDrive if isinstance(drive, StereoDrive) else CachedDrive
+        # Not isinstance: that would ask the drive where its partner is, and a recording of one camera may not know.
+        kind = CachedStereoDrive if hasattr(type(drive), "partner") else CachedDrive
         missing = sorted(f"{frame:010d}" for frame in needed if f"{frame:010d}" not in frames["frames"])
         if missing:
             raise DataError(
@@ -198,5 +199,4 @@ class CachedStereoDrive(CachedDrive):
 
     @property
     def _stereo(self) -> StereoDrive:
-        assert isinstance(self._drive, StereoDrive)  # ImageCache.drive chose this class for it
-        return self._drive
+        return cast(StereoDrive, self._drive)  # ImageCache.drive chose this class for it
