@@ -36,6 +36,9 @@ PUBLISHED: dict[str, Published] = {
 """The paper's rows by the names of our models."""
 
 
+_MARKERS = "os^Dv<>Pp*hX"
+
+
 def size_table(results: Sequence[Measurement]) -> Table:
     """Return parameters and FLOPs by model and image size, with the paper's Table 2 where it has the system."""
     table = Table(title="Size (M = 10^6 parameters; GFLOP of the depth network for one image)")
@@ -96,10 +99,10 @@ def write_json(results: Sequence[Measurement], path: Path) -> None:
 
 
 def draw_figure(results: Sequence[Measurement], path: Path, abs_rel: Mapping[str, float] | None = None) -> None:
-    """Draw accuracy (x) against time per image (y), as the paper's Fig. 10; a model of unknown accuracy is a line.
+    """Draw accuracy (x) against time per image (y), as the paper's Fig. 10; models of unknown accuracy stand beside.
 
     Args:
-        results: Measurements; a model that was measured more than once gets one point each.
+        results: Measurements. A colour is a model, a marker a setting (size, device, precision, mode, batch).
         path: Picture file to write.
         abs_rel: Accuracy by model; the paper's Table 1 where a model is not named.
 
@@ -112,22 +115,44 @@ def draw_figure(results: Sequence[Measurement], path: Path, abs_rel: Mapping[str
         raise ConfigError(
             "figure=true needs matplotlib; run `pip install 'saunet[plot]'` or set figure=false"
         ) from reason
-    known = {name: row.abs_rel for name, row in PUBLISHED.items()} | dict(abs_rel or {})
-    figure = Figure(figsize=(7, 5), layout="constrained")
-    axes = figure.add_subplot()
-    for row in results:
-        label = f"{row.model} ({row.device} {row.precision} {row.mode} x{row.batch_size}, {row.size})"
-        seconds = row.median / row.batch_size
-        if row.model in known:
-            points = axes.plot([known[row.model]], [seconds], "o", label=label)
-            axes.annotate(row.model, (known[row.model], seconds), textcoords="offset points", xytext=(6, 4))
-            points[0].set_markersize(8)
+    accuracy = {name: row.abs_rel for name, row in PUBLISHED.items()} | dict(abs_rel or {})
+    models = list(dict.fromkeys(row.model for row in results))
+    settings = list(dict.fromkeys(_setting(row) for row in results))
+    known, unknown = ([name for name in models if (name in accuracy) is wanted] for wanted in (True, False))
+    panels = [names for names in (known, unknown) if names]
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    widths = [max(3, len(names)) if names is known else len(names) for names in panels]
+    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, width_ratios=widths)[0]
+    for names, panel in zip(panels, axes, strict=True):
+        places = accuracy if names is known else {name: float(index) for index, name in enumerate(names)}
+        for name in names:
+            colour = f"C{models.index(name) % 10}"
+            rows = [row for row in results if row.model == name]
+            seconds = [row.median / row.batch_size for row in rows]
+            panel.plot([places[name]] * len(rows), seconds, "-", color=colour, linewidth=1, alpha=0.5)
+            for row, value in zip(rows, seconds, strict=True):
+                marker = _MARKERS[settings.index(_setting(row)) % len(_MARKERS)]
+                panel.plot([places[name]], [value], marker, color=colour, markersize=8)
+            if names is known:
+                panel.annotate(
+                    name, (places[name], max(seconds)), textcoords="offset points", xytext=(0, 9), ha="center"
+                )
+        panel.set_yscale("log")
+        panel.margins(x=0.2, y=0.12)
+        panel.grid(alpha=0.3)
+        if names is known:
+            panel.set_xlabel("Abs Rel, KITTI Eigen (as published unless given)")
         else:
-            axes.axhline(seconds, linestyle="--", linewidth=1, label=label)
-    axes.set_xlabel("Abs Rel, KITTI Eigen (as published unless given)")
-    axes.set_ylabel("seconds per image")
-    axes.set_yscale("log")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=7)
+            panel.set_xticks(range(len(names)), names, rotation=30, ha="right")
+            panel.set_xlim(-0.6, len(names) - 0.4)
+            panel.set_xlabel("accuracy unknown")
+    axes[0].set_ylabel("seconds per image")
+    for index, setting in enumerate(settings):
+        axes[0].plot([], [], _MARKERS[index % len(_MARKERS)], color="0.3", label=setting)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=8)
     with replacing(path) as partial:
         figure.savefig(partial, dpi=150)
+
+
+def _setting(row: Measurement) -> str:
+    return f"{row.size}, {row.device} {row.precision} {row.mode}, batch {row.batch_size}"
