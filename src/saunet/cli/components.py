@@ -1,4 +1,4 @@
-"""``saunet-components``: print every registered component with its parameters, defaults and one-line description."""
+"""``saunet-components``: print every registered component with its options, defaults and one-line description."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from saunet import schema
-from saunet.checks import SaunetError
+from saunet.checks import ConfigError, SaunetError
 from saunet.registry import REGISTRIES, Entry, Registry, registry
+
+NETWORKS = ["encoder", "decoder", "attention", "pose"]
+"""Kinds whose components are networks."""
 
 
 def describe(owner: Registry, entry: Entry) -> str:
@@ -32,18 +35,43 @@ def _default(name: str, parameter: inspect.Parameter, preset: Mapping[str, Any])
     return "  (required)" if value is inspect.Parameter.empty else f" = {value!r}"
 
 
+def count(owner: Registry, entry: Entry) -> str:
+    """Return the number of parameters of a network, in millions or as it is.
+
+    Decoders follow the features of ``stratified_tiny``, attention sees 64 channels, AU-Net's width.
+    """
+    import torch
+
+    from saunet.benchmarking import count_parameters
+
+    with torch.device("meta"):  # shapes without memory
+        late: dict[str, Any] = {"channels": 64} if "channels" in owner.late else {}
+        if "features" in owner.late:
+            late["features"] = registry("encoder").build("stratified_tiny").features
+        network = owner.build(entry.name, **late)
+    number = count_parameters(network)
+    return f"{number / 1e6:.2f} M" if number > 9999 else str(number)
+
+
 def main() -> None:
     """Entry point of ``saunet-components``."""
     parser = argparse.ArgumentParser(prog="saunet-components", description=__doc__.partition("``: ")[2])
     parser.add_argument("kind", nargs="?", help=f"one of: {', '.join(REGISTRIES)}; all by default")
     parser.add_argument("name", nargs="?", help="one component of that kind")
+    parser.add_argument("--count", action="store_true", help="only names and numbers of trainable weights, of networks")
     arguments = parser.parse_args()
     try:
-        owners = [registry(arguments.kind)] if arguments.kind else list(REGISTRIES.values())
+        kinds = NETWORKS if arguments.count and not arguments.kind else list(REGISTRIES)
+        owners = [registry(kind) for kind in ([arguments.kind] if arguments.kind else kinds)]
         for owner in owners:
             entries = [owner.entry(arguments.name)] if arguments.name else list(owner)
+            if arguments.count and owner.kind not in NETWORKS:
+                raise ConfigError(f"--count is for networks: {', '.join(NETWORKS)}; got '{owner.kind}'")
             print(f"{owner.kind} ({len(list(owner))} registered)")
-            print("\n".join(describe(owner, entry) for entry in entries) + "\n")
+            if arguments.count:
+                print("\n".join(f"  {entry.name:20}{count(owner, entry):>12}" for entry in entries) + "\n")
+            else:
+                print("\n".join(describe(owner, entry) for entry in entries) + "\n")
     except SaunetError as error:
         sys.exit(f"saunet-components: {error}")
 

@@ -1,0 +1,48 @@
+"""``saunet-components``: what there is, its options, and its size."""
+
+from __future__ import annotations
+
+import pytest
+
+import saunet
+from saunet.cli.components import main
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
+    monkeypatch.setattr("sys.argv", ["saunet-components", *arguments])
+    main()
+
+
+def test_every_component_is_listed_with_its_options(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(monkeypatch)
+    text = capsys.readouterr().out
+    for kind in ("encoder", "decoder", "attention", "pose", "objective", "data"):
+        assert f"\n{kind} (" in f"\n{text}"
+        assert all(f"\n  {name}\n" in text for name in saunet.available(kind))
+    assert "choose: model/encoder=resnet18" in text
+    assert "mlp_ratio: float = 3.0" in text  # a preset's own value
+
+
+def test_sizes_are_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    run(monkeypatch, "attention", "--count")
+    counts = dict(line.split() for line in capsys.readouterr().out.splitlines()[1:] if line)
+    assert counts == {"cbam": "610", "eca": "3", "gct": "192", "none": "0", "se": "512"}
+    run(monkeypatch, "decoder", "aunet", "--count")
+    assert "0.30 M" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("encodr",), "did you mean 'encoder'"),
+        (("encoder", "resnet19"), "did you mean 'resnet18'"),
+        (("objective", "--count"), "--count is for networks"),
+    ],
+)
+def test_mistakes_are_one_sentence(arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run(monkeypatch, *arguments)
+    assert str(stop.value).startswith("saunet-components: ")
+    assert message in str(stop.value)
