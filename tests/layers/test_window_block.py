@@ -92,3 +92,16 @@ def test_what_watches_or_replaces_a_layer_is_respected() -> None:
         handle.remove()
         block.mlp.fc1 = torch.nn.Sequential(block.mlp.fc1)  # type: ignore[assignment]
         assert not streams(x, block)
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_streamed_mlp_gives_the_same_fused_or_in_two_passes(fused: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if fused and not window_stream._FUSED:
+        pytest.skip("this PyTorch has no oneDNN")
+    monkeypatch.setattr(window_stream, "_FUSED", fused)
+    monkeypatch.setattr(window_stream, "_CACHED_ELEMENTS", 64 * 32)  # several pieces
+    block = SwinBlock(8, 2, 4).eval()
+    x = torch.randn(2, 8, 12, 8)
+    with torch.no_grad():
+        streamed = window_stream.add_mlp(x, block.norm2, block.mlp.fc1, block.mlp.fc2)
+        torch.testing.assert_close(streamed, x + block.mlp(block.norm2(x)))

@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from saunet.layers.window_attention import WindowAttention
 from saunet.layers.window_plan import window_groups, window_order
 
+_FUSED = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")  # type: ignore[no-untyped-call]
+"""Whether oneDNN applies a linear layer and GELU in one pass; what torch.compile uses too."""
 _CACHED_ELEMENTS = 1_500_000
 """Elements of the widest intermediate result of a piece: a few MB, about the cache of two cores."""
 
@@ -73,9 +75,16 @@ def add_mlp(x: Float[Tensor, "*n c"], norm: nn.LayerNorm, fc1: nn.Linear, fc2: n
     out, size = torch.empty_like(rows), rows_per_piece(fc1.out_features)
     buffer = rows.new_empty(min(size, len(rows)), fc1.out_features)
     for piece, target in zip(torch.split(rows, size), torch.split(out, size), strict=True):
-        hidden = _into(buffer[: len(piece)], fc1, norm(piece))
-        _add(target, piece, fc2, torch.ops.aten.gelu_(hidden))
+        _add(target, piece, fc2, _hidden(norm(piece), fc1, buffer))
     return out.view(x.shape)
+
+
+def _hidden(rows: Tensor, layer: nn.Linear, buffer: Tensor) -> Tensor:
+    """Return ``gelu(layer(rows))``; where it takes two passes, both work on ``buffer``."""
+    if _FUSED and rows.dtype == torch.float32:
+        fused: Tensor = torch.ops.mkldnn._linear_pointwise(rows, layer.weight, layer.bias, "gelu", [], "none")
+        return fused
+    return torch.ops.aten.gelu_(_into(buffer[: len(rows)], layer, rows))  # type: ignore[no-any-return]
 
 
 def _into(out: Tensor, layer: nn.Linear, rows: Tensor) -> Tensor:
