@@ -13,7 +13,7 @@ import torch
 from saunet.checks import ConfigError, DataError
 from saunet.geometry.pose import pose_matrix
 from saunet.record import Scale
-from saunet.scale import MetricDepth, ScaleEstimate, estimate_scale
+from saunet.scale import MetricDepth, MetricMotion, ScaleEstimate, estimate_scale
 from saunet.scale.clips import clip_batches
 from saunet.scale.speeds import read_speeds
 from saunet.types import DepthPyramid
@@ -166,3 +166,13 @@ def test_missing_table_and_bad_rate(tmp_path: Path) -> None:
         read_speeds(tmp_path / "nowhere.csv", fps=10)
     with pytest.raises(ConfigError, match=r"scale.fps is 0"):
         read_speeds(tmp_path / "nowhere.csv", fps=0)
+
+
+def test_metric_motion_scales_the_way_and_not_the_turn() -> None:
+    class Turning(torch.nn.Module):
+        def forward(self, target: torch.Tensor, sources: torch.Tensor) -> torch.Tensor:
+            return pose_matrix(torch.tensor([[[0.1, 0.2, 0.3]]]), torch.tensor([[[1.0, 2.0, 3.0]]]))
+
+    images = torch.zeros(1, 3, 4, 4)
+    T = MetricMotion(Turning(), Scale(2.0, "speed"))(images, images[None])
+    torch.testing.assert_close(T, pose_matrix(torch.tensor([[[0.1, 0.2, 0.3]]]), torch.tensor([[[2.0, 4.0, 6.0]]])))
