@@ -78,7 +78,10 @@ def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path:
     } <= files.keys()
     rows = list(csv.DictReader(io.StringIO(files["tables/figure10.csv"].read_text())))
     assert [(row["Method"], row["ms an image"]) for row in rows] == [("Mono R18", "2.8"), ("run", "10.0")]
+    methods = [row["Method"] for row in csv.DictReader(io.StringIO(files["tables/table1.csv"].read_text()))]
+    assert not any(method.startswith("α/β") for method in methods)
     missing = {one.what: one.why for one in document.missing}
+    assert "in the tables of their sweeps" in missing["Table 1, jobs of sweeps"]
     assert missing["Fig. 7"] == "no group of runs differs in its loss alone"
     assert "Fig. 8" not in missing
     text = files["report.md"].read_text()

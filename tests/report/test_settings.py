@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 from made_runs import make_run
@@ -21,6 +22,14 @@ def test_other_keys_are_named_by_their_last_part(tmp_path: Path) -> None:
     runs = [read_run(make_run(tmp_path / str(beta), beta=beta)) for beta in (0.1, 0.2)]
     assert differing(runs) == ["objective.beta"]
     assert labels([runs]) == [["beta = 0.1", "beta = 0.2"]]
+
+
+def test_a_key_that_older_versions_lack_is_no_difference_while_it_is_off(tmp_path: Path) -> None:
+    old, new = (read_run(make_run(tmp_path / name)) for name in ("old", "new"))
+    newer = dataclasses.replace(new, config={**new.config, "speed": {"compile": False, "ema": 0.0, "freeze": []}})
+    assert differing([old, newer]) == []
+    newest = dataclasses.replace(new, config={**new.config, "speed": {"compile": True}})
+    assert differing([old, newest]) == ["speed.compile"]
 
 
 def test_runs_alike_go_by_their_own_names_and_never_twice_by_one(tmp_path: Path) -> None:

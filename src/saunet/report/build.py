@@ -94,9 +94,10 @@ def build(
             missing.append(Missing(f"Size and pictures of {name}", found))
     progress("drawing")
     sizes = {name: one.parameters for name, one in seen.items()}
-    table1, no_rows = tables.table1(everyone)
+    shown = {name: run for name, run in everyone.items() if run.job is None or _evaluated(run)}
+    table1, no_rows = tables.table1(shown)
     table2, no_sizes = tables.table2(_by_networks(everyone, sizes))
-    table3, no_ablation = tables.table3(everyone)
+    table3, no_ablation = tables.table3({name: run for group in groups for name, run in _varied(group).items()})
     explained = tables.explained_table(everyone)
     sections = [
         Section(
@@ -116,11 +117,14 @@ def build(
     if galleries:
         sections.append(Section("Depth side by side", galleries, _READING))
     missing += _no_pictures(views, galleries)
-    points, table10, no_speed = speed(inputs.benchmarks, everyone, sizes)
+    points, table10, no_speed = speed(inputs.benchmarks, shown, {name: sizes[name] for name in shown if name in sizes})
     if table10:
         sections.append(Section("Accuracy and time", [*_speed(points, options.figures), table10]))
     missing += [*no_rows, *no_sizes, *no_ablation, *no_speed]
     missing.append(Missing("Published curves and pictures", "the paper prints them as images only"))
+    if len(shown) < len(everyone):
+        why = "they are in the tables of their sweeps; saunet-evaluate puts their checkpoints here too"
+        missing.append(Missing("Table 1, jobs of sweeps", why))
     return Document(options.title, _facts(everyone), tuple(sections), tuple(missing))
 
 
@@ -158,18 +162,33 @@ def _groups(inputs: Inputs, wanted: Sequence[str]) -> list[_Group]:
         raise ConfigError(f"labels {list(wanted)} name two runs alike; give each its own name")
     groups = []
     if inputs.runs:
-        groups.append(_Group("runs", "Runs", dict(zip(names[0], inputs.runs, strict=True)), swept=False))
+        groups.append(_Group("runs", "runs", dict(zip(names[0], inputs.runs, strict=True)), swept=False))
+    counts = Counter(sweep.name for sweep in inputs.sweeps)
     for number, (sweep, row) in enumerate(zip(inputs.sweeps, names[len(groups) :], strict=True)):
-        slug = _slug(f"sweep_{sweep.name}") + (f"_{number}" if len(inputs.sweeps) > 1 else "")
-        title = f"Sweep {sweep.name}, {len(sweep.runs)} jobs"
-        groups.append(_Group(slug, title, dict(zip(row, sweep.runs, strict=True)), swept=True))
+        slug = _slug(f"sweep_{sweep.name}") + (f"_{number}" if counts[sweep.name] > 1 else "")
+        jobs = dict(zip(row, sweep.runs, strict=True))
+        groups.append(_Group(slug, f"sweep {sweep.name}", jobs, swept=True))
     return groups
+
+
+def _heading(group: _Group) -> str:
+    return f"{group.title[0].upper()}{group.title[1:]}" + (f": {len(group.runs)} jobs" if group.swept else "")
+
+
+def _evaluated(run: Run) -> bool:
+    return any(not score.validation for score in run.scores)
+
+
+def _varied(group: _Group) -> Named:
+    """Return the runs of a group whose runs have different networks; nothing of one that varies something else."""
+    kinds = {tables.networks(run) for run in group.runs.values() if run.component("model/encoder")}
+    return group.runs if len(kinds) > 1 or not group.swept else {}
 
 
 def _runs(groups: Sequence[_Group], draw: bool, missing: list[Missing]) -> list[Table | Figure]:
     blocks: list[Table | Figure] = []
     for group in groups:
-        blocks.append(tables.runs_table(group.name, group.title, group.runs, swept=group.swept))
+        blocks.append(tables.runs_table(group.name, _heading(group), group.runs, swept=group.swept))
         if sweeps_ratio(list(group.runs.values())) and draw:
             drawing = figures.draw_ratio(group.runs)
             if drawing is None:
@@ -197,7 +216,7 @@ def _curves(group: _Group, missing: list[Missing]) -> list[Figure]:
         if drawing is None:
             missing.append(
                 Missing(
-                    f"{number}, {what} of {group.title.lower() if not group.swept else group.title}",
+                    f"{number}, {what} of {group.title}",
                     "no run has logged it",
                 )
             )

@@ -69,14 +69,16 @@ def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, o
     figure, axes = _figure(len(drawn), legend=len(runs) > 1)
     colours = _colours(len(runs), ordered)
     for axis, (key, title) in zip(axes, drawn, strict=True):
+        few = max(len(curve(run.history, key)[0]) for run in runs.values()) <= 25
         for (name, run), colour in zip(runs.items(), colours, strict=True):
             x, y = curve(run.history, key)
             if x:
-                few = len(x) <= 25
                 axis.plot(x, y, color=colour, label=name, marker="o" if few else None, markersize=3.5)
         axis.set_title(title, loc="left", fontsize=10)
         axis.set_xlabel("epoch")
         axis.set_xlim(left=0)
+        if axis.get_xlim()[1] > 2:
+            axis.xaxis.get_major_locator().set_params(integer=True)
     if len(runs) > 1:
         _legend(figure, axes)
     return _svg(figure)
@@ -98,6 +100,7 @@ def draw_ratio(runs: Mapping[str, Run]) -> bytes | None:
         axis.axvspan(95, 105, color="#fff1c9", zorder=0, label="the paper's best, 95 to 105")
         axis.plot([p[0] for p in points], [p[column] for p in points], "o-", color=COLOURS[0], markersize=4.5)
         axis.set_xscale("log")
+        axis.xaxis.set_major_formatter(lambda value, place: f"{value:g}")
         axis.set_title(title, loc="left", fontsize=10)
         axis.set_xlabel(RATIO)
     axes[0].legend(loc="best")
@@ -131,7 +134,7 @@ def _figure(panels: int, *, legend: bool, height: float = 3.3) -> tuple[Any, lis
     from matplotlib.figure import Figure
 
     with rc_context(_STYLE):  # type: ignore[arg-type]
-        figure = Figure(figsize=(10.6 if panels > 1 else 7.2, height + 0.5 * legend), layout="constrained")
+        figure = Figure(figsize=(11.7 if panels > 1 else 7.6, height + 0.5 * legend), layout="constrained")
         axes = figure.subplots(1, panels, squeeze=False)[0]
     return figure, list(axes)
 

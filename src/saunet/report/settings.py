@@ -16,6 +16,10 @@ _UNTOLD = ("output_dir", "callbacks", "logger", "resume", "name")
 """Keys of a config that say where a run writes and what it is called, not what it computes."""
 
 
+_OFF = (None, "null", "false", "[]", "{}", "0.0", "0")
+"""What a key that is not there may as well be."""
+
+
 def settings(run: Run) -> dict[str, str]:
     """Return all that decides what a run computes, as text by dotted key; a chosen component is one key more."""
     found = {slot.replace("/", "."): run.component(slot) for slot in _SLOTS if run.component(slot)}
@@ -35,7 +39,7 @@ def differing(runs: Sequence[Run], *, by_overrides: bool = False) -> list[str]:
     tables = [dict(run.overrides) if by_overrides else settings(run) for run in runs]
     tables = [table for table in tables if table]  # a job that left nothing says nothing
     keys = dict.fromkeys(key for table in tables for key in table)
-    different = [key for key in keys if len({table.get(key) for table in tables}) > 1]
+    different = [key for key in keys if len({_given(table, key) for table in tables}) > 1]
     chosen = [slot.replace("/", ".") for slot in _SLOTS if slot.replace("/", ".") in different]
     return [key for key in different if not any(key.startswith(f"{slot}.") for slot in chosen)]
 
@@ -80,6 +84,12 @@ def labels(groups: Sequence[Sequence[Run]]) -> list[list[str]]:
             row.append(unique if taken[unique] == 1 else f"{unique} {taken[unique]}")
         result.append(row)
     return result
+
+
+def _given(table: Mapping[str, str], key: str) -> str | None:
+    """Return a value; None where it is absent or off, for older versions lack keys that newer ones leave off."""
+    value = table.get(key)
+    return None if value in _OFF else value
 
 
 def _labels(runs: Sequence[Run]) -> list[str]:
