@@ -50,6 +50,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
+    height, width = arguments.size
     predictors = {f"constant {i}": NetworkPredictor(ConstantDepth(5.0 + i)) for i in range(arguments.predictors)}
     if arguments.model != "none":
         encoder, decoder = arguments.model.split("+")
@@ -59,7 +60,7 @@ def main() -> None:
     wall, cpu = time.perf_counter(), time.process_time()
     result = evaluate(
         predictors,
-        batches(arguments.samples, arguments.batch, *arguments.size, arguments.known, memory),
+        batches(arguments.samples, arguments.batch, height, width, arguments.known, memory),
         [protocol("eigen_camera_z"), protocol("metric")],
         buckets=Buckets() if arguments.buckets else None,
         total=arguments.samples,
@@ -69,7 +70,7 @@ def main() -> None:
     early = memory[min(len(memory) - 1, 3)]  # once everything has been allocated once
     print(
         f"{arguments.samples} samples, {len(predictors)} predictors, 2 protocols, {arguments.model}, "
-        f"{arguments.size[0]}x{arguments.size[1]}, threads {arguments.threads}: {wall:.0f} s wall, {cpu:.0f} s CPU "
+        f"{height}x{width}, threads {arguments.threads}: {wall:.0f} s wall, {cpu:.0f} s CPU "
         f"({cpu / arguments.samples * 1e3:.0f} ms a sample); peak memory {early:.0f} MB after four batches, "
         f"{memory[-1]:.0f} MB at the end"
     )

@@ -40,7 +40,7 @@ def depth_errors(
     return root_terms(((terms * weight).sum(-1) / weight.sum(-1)).T)
 
 
-def error_terms(prediction: Float[Tensor, " *shape"], target: Float[Tensor, " *shape"]) -> Float[Tensor, "7 *shape"]:
+def error_terms(prediction: Float[Tensor, " *shape"], target: Float[Tensor, " *shape"]) -> Float[Tensor, "k=7 *shape"]:
     """Compute what each pixel adds to the seven errors, float64; RMSE and RMSE log still squared (see `root_terms`).
 
     Args:
