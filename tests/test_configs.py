@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from saunet.config import config_dir, plain, register_configs, register_training_configs
 from saunet.registry import REGISTRIES
 
-ROOTS = {"train", "evaluate", "odometry", "predict", "benchmark", "calibrate", "doctor"}
+ROOTS = {"train", "evaluate", "odometry", "predict", "benchmark", "calibrate", "doctor", "prepare"}
 GROUPS = ("model", "trainer", "callbacks", "logger")
 REGISTERED = [
     (registry.group, name)
@@ -38,7 +38,7 @@ def _hydra() -> Iterator[None]:
 
 
 def _compose(*overrides: str, root: str = "train") -> object:
-    given = list(overrides) if root in ("predict", "calibrate") else ["output_dir=/tmp/x", *overrides]
+    given = list(overrides) if root in ("predict", "calibrate", "prepare") else ["output_dir=/tmp/x", *overrides]
     return compose(root, overrides=given)
 
 

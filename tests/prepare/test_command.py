@@ -32,7 +32,7 @@ def command(monkeypatch, tmp_path, capsys):
 
 def test_each_job_runs_and_leaves_only_its_results(command, tree, tmp_path):
     where = (f"root={tree}", "cameras=[left]")
-    code, out, err = command("densify", *where, "kinds=[linear,colorization]", "workers=0", "folder=maps")
+    code, out, err = command("densify", *where, "workers=0", "folder=maps")
     assert (code, out.strip()) == (0, "10 frames made, 0 were there, 0 have no scan, 0 skipped"), err
     code, out, err = command("cache", *where, "folder=cache", "height=10", "width=30", "workers=0", "format=webp")
     assert code == 0, err
