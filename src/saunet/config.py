@@ -111,6 +111,7 @@ class PredictConfig:
     outputs: list[str] | None = None
     palette: str = "magma"
     camera: list[float] | None = None
+    rectify: str | None = None
     max_depth: float | None = None
     max_frames: int | None = None
     flip: bool = False

@@ -14,6 +14,7 @@ from saunet.cli._app import pick_device, run
 
 def predict(cfg: DictConfig) -> None:
     """Predict the input into the output folder."""
+    from saunet.cli._rectify import rectify
     from saunet.cli._scale import scale_predictor
     from saunet.infer.files import OUTPUTS
     from saunet.infer.load import load
@@ -26,11 +27,12 @@ def predict(cfg: DictConfig) -> None:
     for output in outputs:
         one_of("outputs", output, (*OUTPUTS, *CLIP_OUTPUTS))
     predictor = load(cfg.checkpoint, device=pick_device(cfg.device), flip=cfg.flip, keep_aspect=cfg.keep_aspect)
+    rectified = rectify(cfg, predictor)
     scale_predictor(cfg, predictor)
     print(f"depth is {predictor.unit}")
     shared = {
         "palette": cfg.palette,
-        "camera": None if cfg.camera is None else list(cfg.camera),
+        "camera": rectified if cfg.camera is None else list(cfg.camera),
         "max_depth": cfg.max_depth,
         "batch_size": cfg.batch_size,
         "overwrite": cfg.overwrite,

@@ -74,6 +74,33 @@ class Lens:
         return np.ascontiguousarray(image[self._rows, self._columns])
 
 
+class Straightener:
+    """Undistorts and crops images of any size that the camera takes, as training on its clips does.
+
+    Args:
+        camera: Its description.
+        crop: Shares to cut off at the top, bottom, left and right; the camera's own by default.
+    """
+
+    def __init__(self, camera: CameraFile, crop: Sequence[float | int] | None = None) -> None:
+        self.camera, self._crop = camera, crop
+        self._lenses: dict[tuple[int, int], Lens] = {}
+
+    def lens(self, height: int, width: int) -> Lens:
+        """Return the lens for images of a size.
+
+        Raises:
+            DataError: if images of that size do not belong to the camera.
+        """
+        if (height, width) not in self._lenses:
+            self._lenses[height, width] = Lens(self.camera, height, width, self._crop, "the images")
+        return self._lenses[height, width]
+
+    def __call__(self, image: UInt8[np.ndarray, "_ _ 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+        """Return an image, straightened and cut."""
+        return self.lens(image.shape[0], image.shape[1])(image)
+
+
 def _undistortion(
     camera: CameraFile, K: NDArray[np.float64], height: int, width: int
 ) -> tuple[NDArray[np.float64], tuple[NDArray[np.int16], NDArray[np.uint16]]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,14 @@ class ImagePredictor(abc.ABC):
         scale: Factor to metres; None leaves depth relative.
         keep_aspect: Feed each image at its own aspect ratio, with about height x width pixels, not exactly that size.
         size_divisor: What the network's input sides must be multiples of.
+
+    Attributes:
+        straighten: Applied to every image first, such as undistortion; predictions are of the image that it returns.
+        straightened_by: What that is, in words; None without.
     """
+
+    straighten: Callable[[UInt8[np.ndarray, "_ _ 3"]], UInt8[np.ndarray, "_ _ 3"]] | None = None
+    straightened_by: str | None = None
 
     def __init__(
         self, height: int, width: int, scale: Scale | None = None, keep_aspect: bool = False, size_divisor: int = 1
@@ -76,6 +83,8 @@ class ImagePredictor(abc.ABC):
             One prediction an image, in order, each at its image's own size.
         """
         arrays = [as_image(image) for image in images]
+        if self.straighten is not None:
+            arrays = [self.straighten(array) for array in arrays]
         titles = names or [str(image) if isinstance(image, str | Path) else "image" for image in images]
         groups: dict[tuple[int, int], list[int]] = {}
         for index, array in enumerate(arrays):

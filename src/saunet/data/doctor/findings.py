@@ -19,7 +19,7 @@ DARK, BRIGHT = 0.08, 0.92
 """Mean brightness outside which a frame shows nothing."""
 FLAT = 0.03
 """Contrast under which a frame shows nothing (fog on the lens, a wall, a cap)."""
-_STILL_BAND = 0.15
+_STILL_BAND = 0.5
 """A band that moves less than this share of the whole picture is part of the car."""
 
 
@@ -176,7 +176,7 @@ def _parallax(survey: Survey) -> Iterator[Finding]:
 
 
 def _doubled(survey: Survey) -> Iterator[Finding]:
-    doubled = sum((frame.change or 1) < SAME_PICTURE for frame in survey.moving() if frame.change is not None)
+    doubled = sum(frame.change is not None and frame.change < SAME_PICTURE for frame in survey.moving())
     if doubled > 0.02 * len(survey.moving()):
         yield Finding(
             "warning",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -133,7 +134,7 @@ def survey(
         for position, frame in dataset.windows:
             drive = dataset.drives[position]
             drives[drive.name] = drive
-            wanted.setdefault(drive.name, set()).add(frame)
+            wanted.setdefault(drive.name, set()).update(frame + offset for offset in (0, *dataset.offsets))
     for name in wanted:
         found.numbering[name] = str(getattr(drives[name], "numbering", ""))
     plan = _spread([(name, frame) for name, numbers in wanted.items() for frame in sorted(numbers)], frames)
@@ -223,7 +224,7 @@ def _facts(
         lengths = np.linalg.norm(optical_flow(before, small), axis=-1)
         flow = float(np.median(lengths))
         change = float(np.abs(before.astype(np.float32) - small).mean() / max(1.0, float(small.std())))
-        bands = np.array([band.mean() for band in np.array_split(lengths, BANDS)])
+        bands = np.array([band.mean() for band in np.array_split(lengths, BANDS)], dtype=np.float64)
     return FrameFacts(
         drive.name,
         index,
@@ -247,7 +248,7 @@ def _file_bytes(drive: Drive, index: int) -> int | None:
 
 
 def _look_at_camera(found: Survey, drive: Drive, index: int) -> None:
-    sizes = {frame.size for frame in found.readable() if frame.drive == drive.name}
+    sizes = Counter(frame.size for frame in found.readable() if frame.drive == drive.name)
     try:
         K = np.asarray(drive.intrinsics(index), dtype=np.float64)
     except DataError as error:
@@ -255,7 +256,7 @@ def _look_at_camera(found: Survey, drive: Drive, index: int) -> None:
         return
     if sizes:
         fps, height = getattr(drive, "fps", None), getattr(drive, "camera_height", None)
-        found.cameras.append(CameraFacts(drive.name, K, sorted(sizes)[0], fps, height))
+        found.cameras.append(CameraFacts(drive.name, K, sizes.most_common(1)[0][0], fps, height))
 
 
 def _read_truths(found: Survey, dataset: WindowDataset) -> None:

@@ -126,10 +126,12 @@ class MixedDataModule(DepthDataModule):
 
     def _fitted(self, name: str, source: DepthDataModule) -> DepthDataModule:
         """Give a source the mixture's settings; refuse those it was given that contradict."""
-        defaults = inspect.signature(type(source)).parameters
+        plain = inspect.signature(type(source)).parameters
+        presets = [entry.preset for entry in datamodules if entry.target is type(source)]
         for key in ("height", "width", "offsets"):
-            given, ours, default = getattr(source, key), getattr(self, key), defaults[key].default
-            if given != ours and given != (tuple(default) if key == "offsets" else default):
+            given, ours = getattr(source, key), getattr(self, key)
+            defaults = [plain[key].default, *(preset[key] for preset in presets if key in preset)]
+            if given not in (ours, *(tuple(each) if key == "offsets" else each for each in defaults)):
                 raise ConfigError(
                     f"data.sources.{name}.{key} is {given} and the mixture's is {ours}; set data.{key} only, "
                     "which holds for all sources"

@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import pickle
+
+import pytest
+from campus_tree import frames, make_clip
+from kitti_tree import make_drive, name
+
+from saunet.checks import ConfigError
+from saunet.registry import datamodules
+
+SIZE = {"height": 20, "width": 40, "batch_size": 4, "workers": 0}
+
+
+def sources(tmp_path, **options):
+    make_drive(tmp_path / "raw", 1, frames=range(12))
+    make_clip(tmp_path / "clips", "a", frames(12))
+    kitti = datamodules.build(
+        "kitti", root=str(tmp_path / "raw"), split="all", cameras=["left"], val_share=0.2, **options
+    )
+    campus = datamodules.build(
+        "campus", root=str(tmp_path / "clips"), frames_cache=str(tmp_path / "cache"), static="keep", val_share=0.2
+    )
+    return {"town": kitti, "campus": campus}
+
+
+def names(data, split):
+    return [data.datasets[split].name(index) for index in range(len(data.datasets[split]))]
+
+
+def test_two_data_sets_are_one(tmp_path):
+    data = datamodules.build("mixed", sources=sources(tmp_path), **SIZE)
+    data.setup()
+    assert {each.partition("/")[0] for each in names(data, "train")} == {"town", "campus"}
+    assert f"town/{name(1)} 0000000003 l" in names(data, "train")
+    assert "campus/a 0000000003" in names(data, "train")
+    assert (data.ground_truth, data.protocol) == ("camera_z", "eigen_camera_z")
+    batches = list(data.train_dataloader())
+    assert {batch["frames"].shape[2:] for batch in batches} == {(3, 21, 42)}
+    by_name = {each: K for batch in batches for each, K in zip(batch["name"], batch["K"], strict=True)}
+    focal = {each.partition("/")[0]: float(K[0, 0]) for each, K in by_name.items()}
+    assert focal["town"] == pytest.approx(50 * 42 / 60)
+    assert focal["campus"] == pytest.approx(250 * 42 / 320)
+    test = next(iter(data.test_dataloader()))
+    assert "depth" in test  # KITTI's; campus clips have none, which is counted by the evaluation
+    assert test["depth"].shape[0] == len(test["name"])
+    drive = data.datasets["train"].drives[0]
+    assert pickle.loads(pickle.dumps(drive)).name == drive.name == f"town/{name(1)} l"
+
+
+def test_sources_can_serve_training_or_test_alone(tmp_path):
+    data = datamodules.build("mixed", sources=sources(tmp_path), train=["town"], test=["campus"], **SIZE)
+    data.setup()
+    assert all(each.startswith("town/") for each in names(data, "train") + names(data, "val"))
+    assert all(each.startswith("campus/") for each in names(data, "test"))
+    assert (data.ground_truth, data.protocol) == ("none", "campus")
+
+
+def test_what_does_not_go_together_is_refused(tmp_path):
+    made = sources(tmp_path)
+    with pytest.raises(ConfigError, match=r"data=mixed has no sources; add them with \+data@data.sources.NAME=kitti"):
+        datamodules.build("mixed", **SIZE)
+    with pytest.raises(ConfigError, match=r"train names the source 'twon'; sources: town, campus"):
+        datamodules.build("mixed", sources=made, train=["twon"], **SIZE)
+    with pytest.raises(ConfigError, match=r"data.sources.x is int; it must be a data module"):
+        datamodules.build("mixed", sources={"x": 3}, **SIZE)
+    exact = datamodules.build("synthetic_tiny")
+    assert datamodules.build("mixed", sources={**made, "made": exact}, **SIZE).ground_truth == "camera_z"
+    other = datamodules.build("kitti", root=str(tmp_path / "raw"), split="all", depth="lidar_x")
+    with pytest.raises(ConfigError, match=r"ground truth of different kinds \(camera_z, lidar_x\)"):
+        datamodules.build("mixed", sources={**made, "x": other}, **SIZE)
+    small = datamodules.build("kitti", root=str(tmp_path / "raw"), split="all", height=96)
+    with pytest.raises(ConfigError, match=r"data.sources.x.height is 96 and the mixture's is 20; set data.height only"):
+        datamodules.build("mixed", sources={"x": small}, **SIZE)
