@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from saunet.config import config_dir, plain, register_configs, register_training_configs
 from saunet.registry import REGISTRIES
 
-ROOTS = {"train", "evaluate", "odometry", "predict", "benchmark", "calibrate", "doctor", "prepare"}
+ROOTS = {"train", "evaluate", "odometry", "predict", "benchmark", "report", "calibrate", "doctor", "prepare"}
 GROUPS = ("model", "trainer", "callbacks", "logger")
 REGISTERED = [
     (registry.group, name)

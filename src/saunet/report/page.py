@@ -79,7 +79,8 @@ def _table(table: Table) -> str:
 
 def _scene(scene: Scene) -> str:
     tiles = "".join(map(_tile, scene.tiles))
-    return f"<div class=scene><h4>{escape(scene.title)}</h4><div class=tiles>{tiles}</div></div>"
+    pairs = " pairs" if len(scene.tiles) in (1, 2, 4) else ""
+    return f'<div class=scene><h4>{escape(scene.title)}</h4><div class="tiles{pairs}">{tiles}</div></div>'
 
 
 def _tile(tile: Tile) -> str:
