@@ -255,10 +255,10 @@ def _truth(survey: Survey) -> Iterator[Finding]:
 
 
 def _speed(survey: Survey) -> Iterator[Finding]:
-    frames = [frame for frame in survey.readable() if frame.seconds > 0]
-    if not frames:
+    frames = survey.readable()
+    seconds = float(np.median([frame.seconds for frame in frames])) if frames else 0.0
+    if seconds < 1e-4:  # nothing, or kept in memory
         return
-    seconds = float(np.median([frame.seconds for frame in frames]))
     sized = [frame for frame in frames if frame.file_bytes]
     rate = sum(f.file_bytes or 0 for f in sized) / max(1e-9, sum(f.seconds for f in sized)) / 1e6
     disk = f", {rate:.0f} MB/s" if sized else ""
