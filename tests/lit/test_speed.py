@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+import json
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +59,10 @@ def test_the_fused_optimiser_trains_alike(tmp_path: Path) -> None:
 @pytest.fixture
 def network() -> DepthNet:
     torch.manual_seed(0)
-    decoder = saunet.registry.registry("decoder")  # type: ignore[attr-defined]
-    return DepthNet(saunet.build("encoder", "resnet18"), lambda features: decoder.build("unet", features=features))
+    return DepthNet(saunet.build("encoder", "resnet18"), partial(saunet.build, "decoder", "unet"))
 
 
 def test_recomputed_activations_give_the_same_gradients_and_statistics(network: DepthNet) -> None:
-    import copy
-
     twin = copy.deepcopy(network)
     holder: Any = torch.nn.Module()
     holder.depth, holder.pose, holder.objective = twin, None, None
@@ -94,8 +94,6 @@ print(json.dumps([test_speed.losses(folder), test_speed.losses(folder, speed=Spe
 
 @pytest.mark.slow
 def test_fifty_compiled_steps_follow_those_in_eager_mode(tmp_path: Path) -> None:
-    import json
-
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "TORCHINDUCTOR_COMPILE_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-c", COMPILED, str(Path(__file__).parent), str(tmp_path)],

@@ -74,11 +74,10 @@ def _recomputed(block: nn.Module, forward: Any, *args: Any, **kwargs: Any) -> An
 @contextmanager
 def _statistics_kept(block: nn.Module) -> Iterator[None]:
     """Let batch norm use a batch's statistics without counting it a second time."""
-    norms = [module for module in block.modules() if isinstance(module, _BatchNorm) and module.track_running_stats]
-    for norm in norms:
-        norm.track_running_stats = False
+    norms = [module for module in block.modules() if isinstance(module, _BatchNorm)]
+    kept = [(buffer, buffer.clone()) for norm in norms for buffer in norm.buffers(recurse=False)]
     try:
         yield
     finally:
-        for norm in norms:
-            norm.track_running_stats = True
+        for buffer, before in kept:
+            buffer.copy_(before)
