@@ -82,3 +82,11 @@ def notebooks(session: nox.Session) -> None:
     """Execute the notebooks on synthetic data."""
     install(session, "-e", ".[dev]")
     session.run("python", "notebooks/execute.py", *session.posargs)
+
+
+@nox.session
+def docs(session: nox.Session) -> None:
+    """Build the site strictly into ``.nox/site`` and run the commands and the Python that its pages print."""
+    install(session, "-e", ".[dev,docs]")
+    session.run("mkdocs", "build", "--strict", env={"NO_MKDOCS_2_WARNING": "1"})
+    session.run("pytest", "-m", "not gpu", "tests/docs", *session.posargs)

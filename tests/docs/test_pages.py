@@ -1,0 +1,93 @@
+"""What the pages print is true: commands compose or run, Python runs."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from saunet.config import config_dir, register_configs, register_training_configs
+
+from .pages import PAGES, ROOT, blocks, commands
+
+NOT_CONFIGURED = {"saunet-components"}  # takes names, no configuration
+NOT_INSTALLED = ("hydra/launcher", "hydra/sweeper", "hydra.launcher", "hydra.sweeper")  # plugins of the sweep extra
+
+
+def _overrides(command: str) -> list[str]:
+    """Return the overrides of a printed command: no dots for "and so on", one job of a sweep, no job word or file."""
+    tool, *words = shlex.split(command)
+    kept = [word for word in words if "=" in word and not word.startswith(NOT_INSTALLED)]
+    single = []
+    for override in OverridesParser.create().parse_overrides(kept):
+        if override.is_sweep_override():
+            if override.is_choice_sweep():  # a glob or an interval has no first value to take
+                single.append(f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}")
+        else:
+            single.append(str(override.input_line))
+    return single
+
+
+@pytest.mark.parametrize(("page", "command"), commands("", "bash"), ids=lambda value: str(value)[:60])
+def test_every_printed_command_composes(page: str, command: str) -> None:
+    """A key that was renamed, or never was, fails here."""
+    tool = shlex.split(command)[0].removesuffix(":")
+    if tool in NOT_CONFIGURED or command.split()[0].endswith(":"):  # the second is a tool's own answer
+        return
+    register_configs()
+    register_training_configs()
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        assert compose(tool.removeprefix("saunet-"), overrides=_overrides(command), return_hydra_config=True)
+
+
+def _scripts() -> dict[str, list[str]]:
+    """Return each page's runnable blocks as one shell script; later Python blocks build on earlier ones."""
+    scripts: dict[str, list[str]] = defaultdict(list)
+    python: dict[str, str] = defaultdict(str)
+    for block in blocks("bash", "python"):
+        if block.kind == "bash":
+            scripts[block.page].append(block.text)
+        else:
+            python[block.page] += block.text
+            scripts[block.page].append(f"{shlex.quote(sys.executable)} - <<'END'\n{python[block.page]}\nEND\n")
+    return scripts
+
+
+SCRIPTS = _scripts()
+QUICK = sorted(page for page in SCRIPTS if not any(block.page == page for block in blocks("bash")))
+
+
+def _run(page: str, folder: Path) -> None:
+    # The pages speak from a clone's root; the copy keeps the clone clean.
+    (folder / "docs").symlink_to(ROOT / "docs")
+    # A README reader has a model by then; the other pages make theirs.
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    script = "set -eu\n" + "\n".join(SCRIPTS[page])
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=folder, env=environment, capture_output=True, text=True, timeout=900, check=False
+    )
+    assert done.returncode == 0, f"{page}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+
+
+@pytest.mark.parametrize("page", [page for page in QUICK if page != "README.md"])
+def test_the_python_of_a_page_runs(page: str, tmp_path: Path) -> None:
+    _run(page, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in SCRIPTS if page not in QUICK])
+def test_the_commands_of_a_page_run(page: str, tmp_path: Path) -> None:
+    _run(page, tmp_path)
+
+
+def test_every_page_is_on_the_site() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    missing = [page.name for page in PAGES if page.parent.name == "docs" and page.name not in navigation]
+    assert not missing
