@@ -23,7 +23,7 @@ NOT_INSTALLED = ("hydra/launcher", "hydra/sweeper", "hydra.launcher", "hydra.swe
 
 def _overrides(command: str) -> list[str]:
     """Return the overrides of a printed command: no dots for "and so on", one job of a sweep, no job word or file."""
-    tool, *words = shlex.split(command)
+    _, *words = shlex.split(command)
     kept = [word for word in words if "=" in word and not word.startswith(NOT_INSTALLED)]
     single = []
     for override in OverridesParser.create().parse_overrides(kept):
