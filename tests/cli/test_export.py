@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -42,11 +43,13 @@ def test_a_trained_model_becomes_a_folder(
     code, out, err = export(*arguments)
     assert code == 0, err
     assert "so only random images are compared" in err
-    assert "model.safetensors" in out
-    assert "2 random, 0 real" in out
+    assert re.search(r"model\.safetensors +\d+\.\d +any +0\.0e\+00 +2 +0 +\d+\.\d +\d+\.\d", out), out
     assert saunet.load(tmp_path / "model").fingerprint == saunet.load(checkpoint).fingerprint
     assert json.loads((tmp_path / "model" / "report.json").read_text())["files"][0]["difference"] == 0
-    assert "synthetic" in (tmp_path / "model" / "README.md").read_text()
+    card = (tmp_path / "model" / "README.md").read_text()
+    assert "synthetic" in card
+    splits = json.loads((smoke_run / "run.json").read_text())["splits"]
+    assert f"frames of split 'train': `{splits['train']}`" in card
     assert not (tmp_path / "outputs").exists()
     code, _, err = export(*arguments)
     assert code == 1

@@ -15,13 +15,19 @@ _ERRORS = {"abs_rel": "Abs Rel ↓", "sq_rel": "Sq Rel ↓", "rmse": "RMSE ↓",
 _ERRORS |= {"a1": "δ1 ↑", "a2": "δ2 ↑", "a3": "δ3 ↑"}
 
 
-def model_card(record: ModelRecord, reports: Sequence[Parity] = (), metrics: Mapping[str, Any] | None = None) -> str:
+def model_card(
+    record: ModelRecord,
+    reports: Sequence[Parity] = (),
+    metrics: Mapping[str, Any] | None = None,
+    splits: Mapping[str, str] | None = None,
+) -> str:
     """Return the card as Markdown.
 
     Args:
         record: The model's record.
         reports: How the exported files compare with the original.
         metrics: Content of an evaluation's ``metrics.json``.
+        splits: Fingerprints of the frames of each split.
     """
     parts = {"encoder": record.encoder, "decoder": record.decoder, "pose": record.pose}
     data = record.to_plain()["data"]
@@ -54,6 +60,7 @@ def model_card(record: ModelRecord, reports: Sequence[Parity] = (), metrics: Map
         "## Trained on",
         "",
         f"Fingerprint of this description: `{fingerprint(data)}` (sha256).",
+        *(f"Fingerprint of the frames of split '{name}': `{value}`." for name, value in (splits or {}).items()),
         "",
         "```json",
         json.dumps(data, indent=2),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,8 @@ FILES = {"onnx": "model.onnx", "program": "model.pt2", "compiled": "model.aoti.p
 REPORT, CARD = "report.json", "README.md"
 
 _REAL_AT_MOST = 8
+_PLACES = ("root", "cache")
+"""Where the training data lay: nobody's business but the trainer's, and it says nothing about them."""
 
 
 def export_model(
@@ -81,7 +83,9 @@ def export_model(
     if read.path.name == WEIGHTS and read.path.resolve().parent == folder.resolve():
         raise ConfigError(f"the output folder {folder} holds the model itself; choose another")
     metrics = read_metrics(evaluation) if evaluation is not None else None
-    (network, pose), record = read.networks(), read.record
+    splits = _splits(read.path)
+    network, pose = read.networks()
+    record = replace(read.record, data={key: value for key, value in read.record.data.items() if key not in _PLACES})
     network.eval()
     random, real = _random(record), _real(record, images)
     _clear(folder, overwrite)
@@ -111,7 +115,7 @@ def export_model(
     about = {"threads": torch.get_num_threads(), "machine": platform.machine(), "versions": _versions()}
     content = {"tolerance": TOLERANCE, **about, "files": [asdict(report) for report in reports]}
     write_bytes(folder / REPORT, _json(content))
-    write_bytes(folder / CARD, model_card(record, reports, metrics).encode())
+    write_bytes(folder / CARD, model_card(record, reports, metrics, splits).encode())
     write_bytes(folder / CONFIG, _json(record.to_plain()))  # last: with it, the folder is a model
     return reports
 
@@ -133,6 +137,17 @@ def read_metrics(path: str | Path) -> Mapping[str, Any]:
     except (ValueError, TypeError, KeyError) as reason:
         raise DataError(f"{path} is not an evaluation ({reason}); give the metrics.json of saunet-evaluate") from reason
     return content  # type: ignore[no-any-return]
+
+
+def _splits(checkpoint: Path) -> Mapping[str, str]:
+    """Return the fingerprints of the frames that a model was trained on, where its run's folder still has them."""
+    path = checkpoint.parent.parent / "run.json"
+    if not path.is_file():
+        return {}
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")).get("splits") or {})
+    except (OSError, ValueError, AttributeError, TypeError) as reason:
+        raise DataError(f"{path} cannot be read ({reason}); it belongs to the run, or move the checkpoint") from reason
 
 
 def _clear(folder: Path, overwrite: bool) -> None:

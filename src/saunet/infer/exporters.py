@@ -34,7 +34,11 @@ _TRACING_ERRORS = (UserError, RuntimeError, ValueError)
 
 
 class FinestDisparity(nn.Module):
-    """A depth network that returns only its full-resolution disparity: what is exported."""
+    """A depth network that returns only its full-resolution disparity: what is exported.
+
+    Args:
+        network: The depth network.
+    """
 
     def __init__(self, network: DepthNet) -> None:
         super().__init__()

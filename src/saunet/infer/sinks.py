@@ -49,7 +49,18 @@ class Sink(abc.ABC):
 
 
 class VideoSink(Sink):
-    """A side-by-side video; see `saunet.infer.video.render_video`."""
+    """A side-by-side video; see `saunet.infer.video.render_video`.
+
+    Args:
+        path: The mp4 to write.
+        fps: Frames per second.
+        layout: How image and disparity are arranged, one of ``LAYOUTS``.
+        palette: Colours of the disparity, one of ``PALETTES``.
+        labels: Write what is shown into the picture.
+
+    Raises:
+        ConfigError: for a layout or palette that does not exist.
+    """
 
     def __init__(self, path: Path, fps: float | int, layout: str = "auto", palette: str = "magma", labels: bool = True):
         self._layout = one_of("layout", layout, LAYOUTS)
@@ -76,6 +87,12 @@ class FrameSink(Sink):
     """Files a frame, ``000000_depth.png`` and so on, in a folder of their own; each is complete once it is there.
 
     Frames that an earlier clip left in the folder are removed first: they would be taken for this one's.
+
+    Args:
+        folder: Where the files go.
+        outputs: What is written of each frame, keys of ``ENDINGS``.
+        style: Colours and limits of pictures.
+        camera: Intrinsics, for point clouds.
     """
 
     def __init__(
@@ -106,7 +123,15 @@ class FrameSink(Sink):
 
 
 class ViewerSink(Sink):
-    """A page to orbit the points and scrub through the clip; see `ViewerWriter`."""
+    """A page to orbit the points and scrub through the clip; see `ViewerWriter`.
+
+    Args:
+        path: The HTML file to write.
+        camera: Intrinsics, see `saunet.infer.pointcloud`.
+        fps: Frames per second.
+        max_depth: Points further away are left out, in the unit of the depth; None keeps all.
+        title: Title of the page.
+    """
 
     def __init__(
         self,
@@ -134,7 +159,12 @@ class ViewerSink(Sink):
 
 
 class TrajectorySink(Sink):
-    """The camera's path, drawn from above and as KITTI poses."""
+    """The camera's path, drawn from above and as KITTI poses.
+
+    Args:
+        path: The picture to write; the poses go beside it as ``.txt``.
+        odometer: Follows the camera from frame to frame.
+    """
 
     def __init__(self, path: Path, odometer: Odometer) -> None:
         self._odometer, self.paths = odometer, (path, path.with_suffix(".txt"))
