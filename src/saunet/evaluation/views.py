@@ -25,7 +25,11 @@ Motion: TypeAlias = Callable[[EvalBatch], Tensor]
 
 
 class PoseNetwork:
-    """A pose network as something that `evaluate_views` can call; put into evaluation mode."""
+    """A pose network as something that `evaluate_views` can call; put into evaluation mode.
+
+    Args:
+        network: Called with target and sources, as in `saunet.models.poses`.
+    """
 
     def __init__(self, network: nn.Module) -> None:
         self.network = network.eval()

@@ -14,7 +14,12 @@ START = 0.3
 
 
 class Conv3x3(nn.Conv2d):
-    """3×3 convolution with one pixel of reflection padding, as in Monodepth2's decoder: no frame along the border."""
+    """3×3 convolution with one pixel of reflection padding, as in Monodepth2's decoder: no frame along the border.
+
+    Args:
+        inputs: Channels in.
+        outputs: Channels out.
+    """
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(inputs, outputs, 3)
@@ -26,7 +31,12 @@ class Conv3x3(nn.Conv2d):
 
 
 class ConvELU(nn.Sequential):
-    """Reflection-padded 3×3 convolution and ELU, Monodepth2's decoder block."""
+    """Reflection-padded 3×3 convolution and ELU, Monodepth2's decoder block.
+
+    Args:
+        inputs: Channels in.
+        outputs: Channels out.
+    """
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(Conv3x3(inputs, outputs), nn.ELU(inplace=True))

@@ -13,7 +13,13 @@ FOLDS = 8
 
 
 class ConvNormELU(nn.Module):
-    """2-D convolution, group normalisation over 16 groups, ELU."""
+    """2-D convolution, group normalisation over 16 groups, ELU.
+
+    Args:
+        inputs: Channels in.
+        outputs: Channels out.
+        kernel: Side of the kernel, odd.
+    """
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3) -> None:
         super().__init__()
@@ -26,7 +32,12 @@ class ConvNormELU(nn.Module):
 
 
 class ResidualConv(nn.Module):
-    """Two 3×3 convolutions beside a 1×1, summed, normalised and activated: PackNet's residual block."""
+    """Two 3×3 convolutions beside a 1×1, summed, normalised and activated: PackNet's residual block.
+
+    Args:
+        inputs: Channels in.
+        outputs: Channels out.
+    """
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()

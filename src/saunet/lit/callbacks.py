@@ -148,7 +148,11 @@ class PicturePanel(Callback):
 
 
 class Progress(TQDMProgressBar):
-    """One bar with what matters, after one line that says how large the networks are."""
+    """One bar with what matters, after one line that says how large the networks are.
+
+    Args:
+        refresh_rate: Steps between two updates of the bar.
+    """
 
     def __init__(self, refresh_rate: int = 5) -> None:
         super().__init__(refresh_rate=refresh_rate)

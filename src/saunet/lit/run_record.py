@@ -28,7 +28,12 @@ Status = Literal["running", "finished", "failed", "interrupted"]
 
 
 class Stopped(SystemExit):
-    """A run that was asked to stop and did so in good order; the message says how to go on."""
+    """A run that was asked to stop and did so in good order; the message says how to go on.
+
+    Args:
+        message: What the user is told.
+        code: The exit status.
+    """
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(code)

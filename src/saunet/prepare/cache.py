@@ -48,6 +48,9 @@ def encode(image: np.ndarray, settings: CacheSettings) -> bytes:
     Args:
         image: h x w x 3, RGB.
         settings: Size, format and quality.
+
+    Raises:
+        DataError: if this OpenCV lacks the format.
     """
     small = cv2.cvtColor(resize(image, settings.height, settings.width), cv2.COLOR_RGB2BGR)
     flag = cv2.IMWRITE_JPEG_QUALITY if settings.format == "jpg" else cv2.IMWRITE_WEBP_QUALITY

@@ -88,7 +88,11 @@ def look(surface: Surface, period: tuple[float, float], offset: float) -> list[f
 
 
 class Mesh:
-    """Collects surfaces; `polygons` and `quadrics` return them as arrays."""
+    """Collects surfaces; `polygons` and `quadrics` return them as arrays.
+
+    Args:
+        rng: Source of each surface's own pattern.
+    """
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng

@@ -115,6 +115,9 @@ class Mapping(nn.Module):
 
     Padded with zeros, not by reflection: a window encoder has no notion of where in the image it looks, and the border
     is what tells the decoder; on a road the height in the image says much about depth.
+
+    Args:
+        channels: Channels in and out.
     """
 
     def __init__(self, channels: int) -> None:

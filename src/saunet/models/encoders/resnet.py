@@ -18,7 +18,13 @@ _WIDTHS = (64, 128, 256, 512)
 
 
 class BasicBlock(nn.Module):
-    """Two 3×3 convolutions with a shortcut, the block of ResNet-18 and 34 (He et al. 2016, fig. 5 left)."""
+    """Two 3×3 convolutions with a shortcut, the block of ResNet-18 and 34 (He et al. 2016, fig. 5 left).
+
+    Args:
+        inputs: Channels in.
+        width: Channels of the 3×3 convolutions.
+        stride: 1, or 2 to halve the map.
+    """
 
     expansion = 1
 
@@ -39,7 +45,13 @@ class BasicBlock(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """1×1, 3×3, 1×1 convolutions with a shortcut, the block of ResNet-50 and up; it strides in the 3×3."""
+    """1×1, 3×3, 1×1 convolutions with a shortcut, the block of ResNet-50 and up; it strides in the 3×3.
+
+    Args:
+        inputs: Channels in.
+        width: Channels of the 3×3 convolutions.
+        stride: 1, or 2 to halve the map.
+    """
 
     expansion = 4
 
