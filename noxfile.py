@@ -30,9 +30,19 @@ def demo(session: nox.Session) -> None:
 
 @nox.session
 def tests(session: nox.Session) -> None:
-    """Run the test suite (without the slow and gpu tests)."""
+    """Run the test suite (without the slow and gpu tests), a process a core; torch shares no core between tests."""
     install(session, "-e", ".[dev]")
-    session.run("pytest", *session.posargs)
+    session.run(
+        "pytest",
+        "-n",
+        "logical",
+        "--maxprocesses",
+        "8",
+        "--dist",
+        "worksteal",
+        *session.posargs,
+        env={"OMP_NUM_THREADS": "1"},
+    )
 
 
 @nox.session

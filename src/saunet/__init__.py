@@ -40,8 +40,8 @@ def load(source: Any, *, device: str = "cpu", flip: bool = False, keep_aspect: b
     """Load a trained model for prediction: ``saunet.load("last.ckpt").predict(image)``.
 
     Args:
-        source: A checkpoint, a folder or ``model.onnx`` written by ``saunet-export``, or a model on the Hugging Face hub
-            (``hf://organisation/name``).
+        source: A checkpoint, a folder or ``model.onnx`` written by ``saunet-export``, or a model on the Hugging Face
+            hub (``hf://organisation/name``).
         device: Where to run, such as ``"cpu"`` or ``"cuda"``.
         flip: Average with the prediction of the mirrored image.
         keep_aspect: Feed each image at its own aspect ratio.

@@ -303,8 +303,8 @@ def check(cfg: DictConfig) -> None:
     if cfg.optim.fused and str(cfg.trainer.precision).startswith("16") and cfg.trainer.gradient_clip_val:
         raise ConfigError(
             "optim.fused=true, trainer.precision=16-mixed and trainer.gradient_clip_val do not go together: the fused "
-            "optimiser unscales gradients after they would have been clipped; use trainer.precision=bf16-mixed, or leave "
-            "one out"
+            "optimiser unscales gradients after they would have been clipped; use trainer.precision=bf16-mixed, or "
+            "leave one out"
         )
     if cfg.trainer.max_epochs == -1 and cfg.trainer.max_steps == -1:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Every public name says what it is, what it takes, and what it raises; read from the source, so that nothing is missed."""
+"""Every public name says what it is, what it takes, and what it raises; read from the source, so nothing is missed."""
 
 from __future__ import annotations
 
