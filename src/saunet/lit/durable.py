@@ -37,7 +37,7 @@ class GracefulStop(Callback):
 
     Args:
         folder: Where ``last.ckpt`` goes.
-        every_n_steps: How often several processes ask each other.
+        every_n_steps: How often several processes ask each other; they also do at the end of an epoch.
     """
 
     def __init__(self, folder: str, every_n_steps: int = 4) -> None:
@@ -59,12 +59,11 @@ class GracefulStop(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Stop if anybody was asked to, where no accumulated gradient is lost."""
-        accumulated = trainer.accumulate_grad_batches
-        if (batch_idx + 1) % accumulated and not trainer.is_last_batch:
+        if (batch_idx + 1) % trainer.accumulate_grad_batches and not trainer.is_last_batch:
             return
         number = self.received or 0
         if trainer.world_size > 1:
-            if (batch_idx + 1) % (self.every_n_steps * accumulated):
+            if trainer.global_step % self.every_n_steps and not trainer.is_last_batch:
                 return
             asked = torch.tensor(number, device=pl_module.device)
             distributed.all_reduce(asked, distributed.ReduceOp.MAX)
