@@ -37,11 +37,12 @@ def test_features_are_as_announced(size: tuple[int, int], window: tuple[int, ...
 
 
 def test_tiny_is_the_papers() -> None:
-    encoder = encoders.build("stratified_tiny")
+    with torch.device("meta"):
+        encoder, small = encoders.build("stratified_tiny"), encoders.build("stratified_small")
     assert [spec.channels for spec in encoder.features] == [96, 192, 384, 768]
     assert [len(stage.blocks) for stage in encoder.layers] == [2, 2, 6, 2]
     assert encoder.size_divisor == 32
-    assert len(encoders.build("stratified_small").layers[2].blocks) == 18
+    assert len(small.layers[2].blocks) == 18
 
 
 def test_stem_by_hand() -> None:
@@ -116,7 +117,7 @@ with torch.no_grad():
 
 def test_compiles_as_one_graph_for_any_batch_and_size_and_traces() -> None:
     # in a process of its own: the shape checks that run under pytest cannot be traced
-    done = subprocess.run([sys.executable, "-c", COMPILE], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", COMPILE], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
 
 

@@ -1,0 +1,87 @@
+"""DepthNet: encoder and decoder together, sizes and limits, export, and coarse arithmetic."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from networks import assert_all_have_gradients
+
+from saunet.checks import ConfigError
+from saunet.models.depth import DepthNet
+from saunet.registry import decoders, encoders, poses
+from saunet.types import DepthPyramid
+
+HEIGHT, WIDTH = 64, 96
+
+
+def _small(decoder: str = "aunet", **kwargs) -> DepthNet:
+    return DepthNet(encoders.build("resnet18", blocks=(1, 1, 1, 1)), decoders.partial(decoder), **kwargs)
+
+
+def test_depth_pyramid():
+    net = _small(min_depth=0.5, max_depth=50.0)
+    pyramid = net(torch.rand(2, 3, HEIGHT, WIDTH))
+    assert isinstance(pyramid, DepthPyramid)
+    assert net.features == net.encoder.features
+    assert net.size_divisor == 32
+    for scale in range(4):
+        assert pyramid.depth[scale].shape == (2, 1, HEIGHT // 2**scale, WIDTH // 2**scale)
+        torch.testing.assert_close(pyramid.disparity[scale], 0.02 + (2 - 0.02) * pyramid.sigmoid[scale])
+        torch.testing.assert_close(
+            pyramid.depth[scale] * pyramid.disparity[scale],
+            torch.ones(()).expand(2, 1, *pyramid.depth[scale].shape[-2:]),
+        )
+    (pyramid.depth[0].mean() + sum(d.mean() for d in pyramid.disparity)).backward()
+    assert_all_have_gradients(net)
+
+
+def test_sau_net_is_no_larger_than_the_papers():
+    with torch.device("meta"):
+        depth = DepthNet(encoders.build("stratified_tiny"), decoders.partial("aunet"))
+        pose = poses.build("resnet34")
+    assert sum(p.numel() for part in (depth, pose) for p in part.parameters()) <= 58.8e6  # SAU-Net's Table 2
+
+
+@pytest.mark.parametrize("name", ["unet", "aunet"])
+def test_starts_at_mid_disparity(name):
+    with torch.no_grad():
+        for sigmoid in _small(name)(torch.rand(2, 3, HEIGHT, WIDTH)).sigmoid:
+            assert 0.2 < sigmoid.mean() < 0.42
+            assert sigmoid.min() > 0.05
+            assert sigmoid.max() < 0.8
+
+
+@pytest.mark.parametrize(
+    ("size", "valid"),
+    [((190, 640), "192x640"), ((192, 650), "192x640"), ((10, 10), "32x32")],
+)
+def test_size_error(size, valid):
+    net = DepthNet(encoders.build("resnet18", blocks=(1, 1, 1, 1)), decoders.partial("unet"))
+    with pytest.raises(
+        ConfigError, match=rf"image {size[0]}x{size[1]} .* stride 32; the nearest valid size is {valid}"
+    ):
+        net(torch.zeros(1, 3, *size))
+
+
+@pytest.mark.parametrize("decoder", ["unet", "aunet"])
+def test_smallest_image(decoder):
+    net = _small(decoder).eval()
+    with torch.no_grad():
+        assert net(torch.rand(1, 3, 32, 32)).depth[0].shape == (1, 1, 32, 32)
+
+
+@pytest.mark.parametrize("limits", [(0.0, 80.0), (5.0, 5.0), (-1.0, 80.0)])
+def test_depth_limits(limits):
+    with pytest.raises(ConfigError, match="needed: 0 < min_depth < max_depth"):
+        _small(min_depth=limits[0], max_depth=limits[1])
+
+
+def test_half_precision_keeps_disparity_fine():
+    net = _small().eval()
+    image = torch.rand(1, 3, HEIGHT, WIDTH)
+    with torch.no_grad():
+        full = net(image)
+        with torch.autocast("cpu", torch.bfloat16):
+            half = net(image)
+    assert half.depth[0].dtype == torch.float32
+    assert (half.sigmoid[0] - full.sigmoid[0]).abs().max() < 0.02
