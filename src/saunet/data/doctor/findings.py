@@ -257,7 +257,7 @@ def _truth(survey: Survey) -> Iterator[Finding]:
 def _speed(survey: Survey) -> Iterator[Finding]:
     frames = survey.readable()
     seconds = float(np.median([frame.seconds for frame in frames])) if frames else 0.0
-    if seconds < 1e-4:  # nothing, or kept in memory
+    if seconds < 2e-5:  # nothing, or kept in memory
         return
     sized = [frame for frame in frames if frame.file_bytes]
     rate = sum(f.file_bytes or 0 for f in sized) / max(1e-9, sum(f.seconds for f in sized)) / 1e6
