@@ -93,6 +93,14 @@ def test_an_evaluation_without_its_run_stands_alone(tmp_path: Path) -> None:
     assert (run.name, run.checkpoint, len(run.scores)) == ("e", None, 2)
 
 
+def test_a_comparison_of_named_runs_takes_no_others(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / name) for name in "ab"]
+    foreign = make_evaluation(tmp_path / "e", "/gone/best.ckpt")
+    assert len(collect([*runs, foreign], strangers=False).runs) == 2
+    assert len(collect([*runs, foreign]).runs) == 3
+    assert len(collect([runs[0], foreign], strangers=False).runs) == 2
+
+
 def test_a_folder_of_runs_is_looked_through(tmp_path: Path, sweep: Path) -> None:
     make_run(tmp_path / "outputs" / "train" / "b")
     make_run(tmp_path / "outputs" / "train" / "a")

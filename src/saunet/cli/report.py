@@ -20,7 +20,7 @@ def report(cfg: DictConfig) -> None:
 
     from saunet.report import Options, build, collect, write
 
-    inputs = collect(list(cfg.runs or []), cfg.checkpoint, planned_jobs)
+    inputs = collect(list(cfg.runs or []), cfg.checkpoint, planned_jobs, strangers=not cfg.compare)
     if cfg.compare:
         from saunet.report.compare import print_comparison
 

@@ -77,7 +77,7 @@ def comparison_table(comparison: Comparison) -> Table:
         Column(f"{comparison.level:.0%} low", 4),
         Column(f"{comparison.level:.0%} high", 4),
         Column("second better", None),
-        Column("p", 3),
+        Column("p", 4),
     )
     rows = tuple(
         Row(

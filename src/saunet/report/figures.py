@@ -103,7 +103,7 @@ def draw_ratio(runs: Mapping[str, Run]) -> bytes | None:
         axis.xaxis.set_major_formatter(lambda value, place: f"{value:g}")
         axis.set_title(title, loc="left", fontsize=10)
         axis.set_xlabel(RATIO)
-    axes[0].legend(loc="best")
+    axes[0].legend(loc="best", frameon=False, fontsize=9)
     return _svg(figure)
 
 
@@ -120,8 +120,12 @@ def draw_speed(ours: Sequence[tuple[str, float, float]], printed: Sequence[tuple
     )
     for (name, accuracy, seconds), colour in zip(ours, _colours(len(ours), ordered=False), strict=True):
         axis.plot([accuracy], [seconds], "o", color=colour, markersize=8, label=name)
-    for name, accuracy, seconds in (*printed, *ours):
-        axis.annotate(name, (accuracy, seconds), textcoords="offset points", xytext=(8, 5), fontsize=9, color="#333333")
+    points = (*printed, *ours)
+    middle = (min(point[1] for point in points) + max(point[1] for point in points)) / 2
+    for name, accuracy, seconds in points:  # names grow towards the middle, where there is room
+        side, offset = ("right", -9) if accuracy > middle else ("left", 9)
+        place = {"textcoords": "offset points", "xytext": (offset, 5), "ha": side}
+        axis.annotate(name, (accuracy, seconds), fontsize=9, color="#333333", **place)
     axis.set_yscale("log")
     axis.margins(x=0.25, y=0.25)
     axis.set_xlabel("accuracy, δ < 1.25")

@@ -49,13 +49,17 @@ class _Evaluation:
     explained: tuple[Explained, ...]
 
 
-def collect(paths: Sequence[str | Path], checkpoint: str = "best", jobs: Jobs | None = None) -> Inputs:
+def collect(
+    paths: Sequence[str | Path], checkpoint: str = "best", jobs: Jobs | None = None, *, strangers: bool = True
+) -> Inputs:
     """Read everything that the paths name.
 
     Args:
         paths: Folders of runs, sweeps, evaluations and benchmarks, folders that hold such folders, checkpoint files.
         checkpoint: Which checkpoint of a run is meant, ``best`` or ``last``.
         jobs: Tells which jobs a sweep should have, so that those without a folder are not forgotten.
+        strangers: An evaluation of a run that is not named stands for that run; otherwise it does so only where fewer
+            than two runs are named.
 
     Raises:
         ConfigError: if the checkpoint is neither.
@@ -88,7 +92,8 @@ def collect(paths: Sequence[str | Path], checkpoint: str = "best", jobs: Jobs | 
     for run in known:  # evaluations written into the run's own folder
         for file in sorted(run.path.rglob("metrics.json")) if run.path.is_dir() else ():
             evaluations.setdefault(file.parent, _read_evaluation(file.parent))
-    for evaluation in evaluations.values():
+    take = strangers or len(known) < 2
+    for evaluation in evaluations.values() if take else ():
         if not any(_belongs(evaluation, run) for run in known):
             origin = evaluation.checkpoint
             if origin and origin.is_file():
