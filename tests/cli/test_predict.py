@@ -92,6 +92,7 @@ def test_palette_and_keep_aspect(tool: Callable[..., Any], checkpoint: Path, ima
 
     expected = Predictor.from_checkpoint(checkpoint, keep_aspect=True).predict(image).colour(None, "turbo")
     assert np.array_equal(read_image(tmp_path / "out" / "a_disparity.png"), expected)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "out"]  # no run folder, no log
     assert "did you mean 'turbo'" in tool("predict", *arguments, "palette=turbi", "output=out2").err
     assert not (tmp_path / "out2").exists()
 
