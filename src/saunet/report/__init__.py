@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from saunet.report.build import Options, build, write
+from saunet.report.build import Options, build
 from saunet.report.inputs import Inputs, Sweep, collect
+from saunet.report.output import write
 from saunet.report.published import published
 from saunet.report.runs import Run, Score, read_run
 

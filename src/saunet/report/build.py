@@ -7,17 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
-from pathlib import Path
 
 from saunet import __version__
-from saunet.atomic import write_bytes
 from saunet.checks import ConfigError, positive
 from saunet.report import figures, tables
 from saunet.report.document import Document, Figure, Gallery, Missing, Picture, Scene, Section, Table
 from saunet.report.inputs import Inputs
-from saunet.report.markdown import as_markdown, table_csv
 from saunet.report.models import Seen, look
-from saunet.report.page import as_html
 from saunet.report.published import published
 from saunet.report.runs import Run
 from saunet.report.scenes import View, read_views, scene
@@ -126,23 +122,6 @@ def build(
         why = "they are in the tables of their sweeps; saunet-evaluate puts their checkpoints here too"
         missing.append(Missing("Table 1, jobs of sweeps", why))
     return Document(options.title, _facts(everyone), tuple(sections), tuple(missing))
-
-
-def write(document: Document, folder: Path) -> dict[str, Path]:
-    """Write ``report.html``, ``report.md``, ``tables/*.csv`` and ``figures/``, each file whole or not at all.
-
-    Returns:
-        The files by their names in the folder.
-
-    Raises:
-        DataError: if the folder cannot be written to.
-    """
-    content = {"report.html": as_html(document).encode(), "report.md": as_markdown(document).encode()}
-    content |= {f"tables/{table.name}.csv": table_csv(table).encode() for table in document.tables}
-    content |= {f"figures/{picture.name}": picture.data for picture in document.pictures}
-    for name, data in content.items():
-        write_bytes(folder / name, data)
-    return {name: folder / name for name in content}
 
 
 _READING = (
