@@ -17,12 +17,12 @@ from torch import nn
 
 import saunet
 from saunet.checkpoint import ModelRecord, atomic_save, build_networks
-from saunet.config import PredictConfig
 from saunet.images import read_image
 from saunet.infer.clips import VideoWriter
 from saunet.infer.files import predict_files
 from saunet.infer.pointcloud import Camera, point_cloud, write_ply
 from saunet.registry import REGISTRIES
+from saunet.roots import PredictConfig
 
 
 def _node(kind: str, name: str) -> dict[str, Any]:

@@ -16,10 +16,10 @@ from omegaconf import OmegaConf
 from saunet.checkpoint import read_checkpoint, store_scale
 from saunet.checks import CheckpointError, ConfigError
 from saunet.cli._scale import scale_predictor
-from saunet.config import PredictConfig
 from saunet.data.synthetic import SyntheticDrive
 from saunet.infer.pipeline import ImagePredictor
 from saunet.record import Scale
+from saunet.roots import PredictConfig
 
 Tool = Callable[..., Any]
 UNKNOWN = 0.037

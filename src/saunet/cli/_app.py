@@ -25,9 +25,10 @@ from saunet import schema
 from saunet.checks import SaunetError, suggest
 from saunet.cli._globs import expand_globs
 from saunet.cli._sweep import summary, swept_folder
-from saunet.config import ROOTS, config_dir, register_configs
+from saunet.config import config_dir, register_configs
 from saunet.lit.run_record import FILE, Stopped
 from saunet.registry import REGISTRIES
+from saunet.roots import ROOTS
 
 
 def run(name: str, task: Callable[[DictConfig], Any]) -> None:

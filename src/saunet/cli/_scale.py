@@ -11,7 +11,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from saunet.checks import ConfigError, one_of, positive
-from saunet.config import SCALE_METHODS
+from saunet.roots import SCALE_METHODS
 
 
 def apply_scale(cfg: DictConfig, record: Any, network: Any, pose: Any, data: Any) -> tuple[Any, Any, dict[str, Any]]:

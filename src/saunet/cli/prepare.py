@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from saunet import config
 from saunet.checks import ConfigError, one_of, suggest
 from saunet.cli._app import pick_device, run
-from saunet.config import PrepareConfig
+from saunet.roots import PrepareConfig
 
 SHARED = ("job", "root", "folder", "cameras", "drives", "split", "on_error")
 KEYS = {

@@ -21,7 +21,7 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule, pretrained: bool = T
     """Build networks, objective, recipe and metrics from a resolved training config.
 
     Args:
-        cfg: Plain containers with the keys of `saunet.config.TrainConfig`.
+        cfg: Plain containers with the keys of `saunet.roots.TrainConfig`.
         data: What the model will be trained on; it names the validation protocol if the config does not.
         pretrained: Whether to start from the public weights that the config names; a resumed training has its own.
 

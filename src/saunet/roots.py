@@ -1,0 +1,239 @@
+"""The typed root of each command-line tool: every key at the top of its configuration, with its type and default."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from omegaconf import MISSING
+
+
+@dataclass
+class ModelConfig:
+    """Networks: depth (encoder + decoder) and pose."""
+
+    encoder: Any = MISSING
+    decoder: Any = MISSING
+    pose: Any = MISSING
+    min_depth: float = 0.1
+    max_depth: float = 100.0
+
+
+@dataclass
+class TrainConfig:
+    """Root of ``saunet-train``."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    objective: Any = MISSING
+    data: Any = MISSING
+    optim: Any = MISSING
+    speed: Any = MISSING
+    trainer: Any = MISSING
+    callbacks: dict[str, Any] = field(default_factory=dict)
+    logger: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    name: str = MISSING
+    output_dir: str = MISSING
+    resume: str | None = None
+    init_from: str | None = None
+    monitor: str = MISSING
+    protocol: str | None = None
+
+
+SCALE_METHODS = ("auto", "none", "stored", "camera_height", "speed", "stereo")
+"""``auto``: the factor stored in the checkpoint, where there is one; the last three measure it."""
+
+
+@dataclass
+class ScaleConfig:
+    """How depth becomes metres without ground truth; see docs/scale.md."""
+
+    method: str = "auto"
+    camera_height: float | None = None
+    speeds: str | None = None
+    fps: float | None = None
+    partner: str | None = None
+    baseline: float | None = None
+    frames: int = 100
+    store: bool = False
+
+
+@dataclass
+class EvaluateConfig:
+    """Root of ``saunet-evaluate``: a ``checkpoint``, or ``predictions`` of another system; docs/evaluation.md."""
+
+    checkpoint: str | None = None
+    predictions: str | None = None
+    predicted: str | None = None
+    match: str = "order"
+    data: Any = MISSING
+    protocols: list[str] | None = None
+    split: str = "test"
+    flip: bool = False
+    baselines: bool = True
+    scale: ScaleConfig = field(default_factory=ScaleConfig)
+    buckets: bool = False
+    distances: list[float] = field(default_factory=lambda: [0.0, 10.0, 20.0, 30.0, 50.0, 80.0])
+    intervals: float | None = 0.95
+    compare: str | None = None
+    truth_cache: str | None = None
+    export: str | None = None
+    device: str = "auto"
+    output_dir: str = MISSING
+
+
+@dataclass
+class PredictConfig:
+    """Root of ``saunet-predict``."""
+
+    checkpoint: str = MISSING
+    input: str = MISSING
+    output: str = MISSING
+    outputs: list[str] | None = None
+    palette: str = "magma"
+    camera: list[float] | None = None
+    rectify: str | None = None
+    max_depth: float | None = None
+    max_frames: int | None = None
+    flip: bool = False
+    keep_aspect: bool = False
+    scale: ScaleConfig = field(default_factory=ScaleConfig)
+    overwrite: bool = False
+    batch_size: int = 1
+    device: str = "auto"
+
+
+@dataclass
+class ExportConfig:
+    """Root of ``saunet-export``."""
+
+    checkpoint: str = MISSING
+    output: str = MISSING
+    formats: list[str] = field(default_factory=lambda: ["onnx", "program", "safetensors"])
+    images: str | None = None
+    batch: str = "auto"
+    evaluation: str | None = None
+    overwrite: bool = False
+
+
+@dataclass
+class BenchmarkConfig:
+    """Root of ``saunet-benchmark``: ``model`` alone, or each of ``models`` (names of choices of ``model``)."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    models: list[str] = field(default_factory=list)
+    sizes: list[str] = field(default_factory=lambda: ["192x640"])
+    devices: list[str] = field(default_factory=lambda: ["auto"])
+    precisions: list[str] = field(default_factory=lambda: ["fp32"])
+    modes: list[str] = field(default_factory=lambda: ["eager"])
+    batch_sizes: list[int] = field(default_factory=lambda: [1])
+    runs: int = 20
+    warmup: int = 3
+    threads: int | None = None
+    figure: bool = False
+    abs_rel: dict[str, float] = field(default_factory=dict)
+    output_dir: str = MISSING
+
+
+@dataclass
+class ReportConfig:
+    """Root of ``saunet-report``; ``scenes`` maps a condition to images, folders or patterns."""
+
+    runs: list[str] = MISSING
+    compare: bool = False
+    checkpoint: str = "best"
+    title: str = "saunet report"
+    labels: list[str] = field(default_factory=list)
+    scenes: Any = None
+    scenes_limit: int = 3
+    zooms: int = 2
+    figures: bool = True
+    device: str = "auto"
+    flip: bool = False
+    output_dir: str = MISSING
+
+
+@dataclass
+class DoctorConfig:
+    """Root of ``saunet-doctor``."""
+
+    data: Any = MISSING
+    splits: list[str] = field(default_factory=lambda: ["train", "val", "test"])
+    frames: int = 1000
+    output_dir: str = MISSING
+
+
+@dataclass
+class CalibrateConfig:
+    """Root of ``saunet-calibrate``; ``columns`` and ``rows`` count the board's squares."""
+
+    input: str | None = None
+    output: str = "camera.yaml"
+    board: str = "chessboard"
+    columns: int = 10
+    rows: int = 7
+    square: float = 0.025
+    marker: float = 0.75
+    dictionary: str = "DICT_4X4_100"
+    model: str = "pinhole"
+    views: int = 40
+    max_error: float = 1.0
+    camera_height: float | None = None
+    condition: str | None = None
+    print_board: str | None = None
+    overwrite: bool = False
+
+
+@dataclass
+class OdometryConfig:
+    """Root of ``saunet-odometry``; see docs/evaluation.md."""
+
+    checkpoint: str = MISSING
+    data: Any = MISSING
+    snippet: int = 5
+    lengths: list[float] | None = None
+    batch_size: int = 8
+    figure: bool = True
+    device: str = "auto"
+    output_dir: str = MISSING
+
+
+@dataclass
+class PrepareConfig:
+    """Root of ``saunet-prepare``; which keys belong to which job: ``saunet.cli.prepare.KEYS``."""
+
+    job: str = MISSING
+    root: str = MISSING
+    folder: str | None = None
+    cameras: list[str] = field(default_factory=lambda: ["left", "right"])
+    drives: list[str] = field(default_factory=list)
+    split: str = "all"
+    kinds: list[str] = field(default_factory=lambda: ["linear"])
+    depth: str = "camera_z"
+    checkpoint: str | None = None
+    input: str | None = None
+    values: str = "depth"
+    device: str = "auto"
+    height: int = 202
+    width: int = 672
+    format: str = "jpg"
+    quality: int = 95
+    workers: int | None = None
+    on_error: str = "raise"
+
+
+ROOTS = (
+    PrepareConfig,
+    TrainConfig,
+    EvaluateConfig,
+    PredictConfig,
+    ExportConfig,
+    BenchmarkConfig,
+    OdometryConfig,
+    ReportConfig,
+    DoctorConfig,
+    CalibrateConfig,
+    ModelConfig,
+    ScaleConfig,
+)
+"""The typed roots, and what lies directly below them."""
