@@ -69,7 +69,7 @@ class WindowAttention(nn.Module):
         if self.pads(height, width):
             x = F.pad(x, (0, 0, 0, -width % self.window, 0, -height % self.window))
         batch, rows, columns, _ = x.shape
-        if isinstance(batch, torch.SymInt):
+        if _symbolic(batch):
             return self._attend_each(x)[:, :height, :width]
         order, inverse = window_order(batch, rows, columns, self.window, self.shift, x.device)
         groups = window_groups(rows, columns, self.window, self.shift)
@@ -115,3 +115,8 @@ class WindowAttention(nn.Module):
         query, key, value = split.permute(2, 0, 3, 1, 4).unbind(0)
         out = F.scaled_dot_product_attention(query, key, value, attn_mask=bias)
         return out.transpose(1, 2).reshape(-1, self.dim)
+
+
+def _symbolic(size: object) -> bool:
+    """Tell whether an exported network leaves a size open; the annotations of torch call it an int all the same."""
+    return isinstance(size, torch.SymInt)
