@@ -123,10 +123,11 @@ def write_safetensors(state: dict[str, Tensor], path: str | Path) -> None:
         ConfigError: if the package is missing.
     """
     try:
-        from safetensors.torch import save_file
+        from safetensors.torch import save
     except ImportError as missing:
         raise ConfigError("safetensors needs the package safetensors; run: pip install 'saunet[export]'") from missing
-    save_file({name: value.detach().cpu().contiguous() for name, value in state.items()}, path, {"format": "pt"})
+    plain = {name: value.detach().cpu().contiguous() for name, value in state.items()}
+    Path(path).write_bytes(save(plain, {"format": "pt"}))  # save_file would let its owner alone read the file
 
 
 def run_eager(network: DepthNet) -> Run:
@@ -192,10 +193,12 @@ def _trace(module: nn.Module, image: Tensor, dynamic: bool) -> torch.export.Expo
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Silence the exporter's notes about packages that saunet does not use."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
     try:
         yield
     finally:
-        logger.setLevel(level)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
