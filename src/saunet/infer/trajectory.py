@@ -107,8 +107,9 @@ class Odometer:
         frames = [min(max(centre + offset, 0), last) - first for offset in self._offsets]
         with torch.inference_mode():
             sources = torch.stack([self._recent[index] for index in frames])
-            T_src_tgt = self._pose(self._recent[centre - first][None], sources[None])[0].double().cpu().numpy()
-        for offset, T in zip(self._offsets, T_src_tgt, strict=True):
+            T_src_tgt = self._pose(self._recent[centre - first][None], sources[None])[0].tolist()
+        # as Python numbers: an array of torch's would hold on to its memory for the whole clip
+        for offset, T in zip(self._offsets, np.array(T_src_tgt, dtype=np.float64), strict=True):
             if offset == 1:
                 self._motions[centre] = T
             elif offset == -1:
