@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import pkgutil
+import re
 import shlex
 import subprocess
 import sys
@@ -91,3 +93,18 @@ def test_every_page_is_on_the_site() -> None:
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     missing = [page.name for page in PAGES if page.parent.name == "docs" and page.name not in navigation]
     assert not missing
+
+
+def test_links_to_code_lead_to_names_that_exist() -> None:
+    """The strict build of the site checks this too, but is not part of every test run."""
+    links = [
+        (page.name, *link)
+        for page in PAGES
+        for link in re.findall(r"\(api/(\w+)\.md#([\w.]+)\)", page.read_text(encoding="utf-8"))
+    ]
+    assert {name for page, _, name in links if page == "paper.md"}
+    for page, api, name in links:
+        module = pkgutil.resolve_name(name).__module__
+        source = (ROOT / "docs" / "api" / f"{api}.md").read_text(encoding="utf-8")
+        assert name.startswith(f"{module}."), f"{page}: {name} lives in {module}"
+        assert f"::: {module}\n" in source, f"{page}: {module} is not on api/{api}.md"
