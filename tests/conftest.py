@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,24 @@ DATA_ROOT = Path(os.environ.get("SAUNET_TEST_DATA", Path(__file__).parents[1] / 
 @pytest.fixture(autouse=True)
 def _fixed_seed() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _logging_as_it_was() -> Iterator[None]:
+    """Undo what a tool that ran inside the test did to logging: Hydra leaves a handler that writes into its folder."""
+    handlers, level = logging.root.handlers[:], logging.root.level
+    disabled = {name: logger.disabled for name, logger in _loggers()}
+    yield
+    for handler in set(logging.root.handlers) - set(handlers):
+        handler.close()
+    logging.root.handlers[:] = handlers
+    logging.root.setLevel(level)
+    for name, logger in _loggers():
+        logger.disabled = disabled.get(name, False)
+
+
+def _loggers() -> list[tuple[str, logging.Logger]]:
+    return [(name, each) for name, each in logging.root.manager.loggerDict.items() if isinstance(each, logging.Logger)]
 
 
 @pytest.fixture(scope="session")

@@ -198,7 +198,7 @@ def test_prediction_sees_what_training_saw(tool: Tool, smoke_run: Path, tmp_path
     (tmp_path / "in").mkdir()
     cv2.imwrite(str(tmp_path / "in" / "a.png"), _sliding(1)[0])
     K = np.array([[250.0, 0, 160], [0, 250, 80], [0, 0, 1]])
-    camera = CameraFile(Path(), K, (160, 320), (-0.2, 0.05, 0, 0), crop=(0.25, 0.0, 0.0, 0.0))
+    camera = CameraFile(Path(), K, (160, 320), (-0.2, 0.05, 0.0, 0.0), crop=(0.25, 0.0, 0.0, 0.0))
     write_camera(tmp_path / "camera.yaml", camera)
     arguments = (f"checkpoint={smoke_run / 'checkpoints' / 'best.ckpt'}", "input=in", "output=out")
     outcome = tool("predict", *arguments, "outputs=[npy,ply]", "rectify=camera.yaml")

@@ -15,6 +15,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from saunet.cli._globs import expand_globs
 from saunet.config import config_dir, register_configs, register_training_configs
 
 from .pages import PAGES, ROOT, blocks, commands
@@ -28,7 +29,7 @@ def _overrides(command: str) -> list[str]:
     _, *words = shlex.split(command)
     kept = [word for word in words if "=" in word and not word.startswith(NOT_INSTALLED)]
     single = []
-    for override in OverridesParser.create().parse_overrides(kept):
+    for override in OverridesParser.create().parse_overrides(expand_globs(kept, config_dir())):
         if override.is_sweep_override():
             if override.is_choice_sweep():  # a glob or an interval has no first value to take
                 single.append(f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}")

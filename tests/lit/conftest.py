@@ -79,7 +79,7 @@ def config() -> dict[str, Any]:
             "max_depth": 100.0,
         },
         "objective": plain_node("objective", "saunet"),
-        "optim": {"lr": 1e-3},
+        "optim": {"lr": 3e-4},
         "data": {},
         "protocol": None,
     }

@@ -14,7 +14,7 @@ from saunet.registry import decoders, encoders
 from saunet.types import FeatureSpec
 
 
-# Lite-Mono's Table 2, encoder and decoder, in millions, as printed to one decimal
+# Lite-Mono's Table 2, encoder and decoder, in millions, as printed: to one decimal, so that 2.15 is 2.2
 @pytest.mark.parametrize(
     ("name", "millions"),
     [("lite_mono", 3.1), ("lite_mono_small", 2.5), ("lite_mono_tiny", 2.2), ("lite_mono_8m", 8.7)],
@@ -22,7 +22,7 @@ from saunet.types import FeatureSpec
 def test_published_size(name, millions):
     with torch.device("meta"):
         net = DepthNet(encoders.build(name), decoders.partial("lite_mono"))
-    assert sum(p.numel() for p in net.parameters()) / 1e6 == pytest.approx(millions, rel=0.02)
+    assert sum(p.numel() for p in net.parameters()) / 1e6 == pytest.approx(millions, rel=0.02, abs=0.06)
 
 
 def test_dilations():
