@@ -27,7 +27,9 @@ def test_every_component_is_listed_with_its_options(
 
 def test_sizes_are_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     run(monkeypatch, "attention", "--count")
-    counts = dict(line.split() for line in capsys.readouterr().out.splitlines()[1:] if line)
+    title, *lines = capsys.readouterr().out.splitlines()
+    assert title == "attention (5 registered, for 64 channels)"
+    counts = dict(line.split() for line in lines if line)
     assert counts == {"cbam": "610", "eca": "3", "gct": "192", "none": "0", "se": "512"}
     run(monkeypatch, "decoder", "aunet", "--count")
     assert "0.30 M" in capsys.readouterr().out

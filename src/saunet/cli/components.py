@@ -14,6 +14,8 @@ from saunet.registry import REGISTRIES, Entry, Registry, registry
 
 NETWORKS = ["encoder", "decoder", "attention", "pose"]
 """Kinds whose components are networks."""
+COUNTED = {"decoder": ", after stratified_tiny", "attention": ", for 64 channels"}
+"""What `count` assumes, for the kinds whose size depends on their neighbours."""
 
 
 def describe(owner: Registry, entry: Entry) -> str:
@@ -67,7 +69,8 @@ def main() -> None:
             entries = [owner.entry(arguments.name)] if arguments.name else list(owner)
             if arguments.count and owner.kind not in NETWORKS:
                 raise ConfigError(f"--count is for networks: {', '.join(NETWORKS)}; got '{owner.kind}'")
-            print(f"{owner.kind} ({len(list(owner))} registered)")
+            assumed = COUNTED.get(owner.kind, "") if arguments.count else ""
+            print(f"{owner.kind} ({len(list(owner))} registered{assumed})")
             if arguments.count:
                 print("\n".join(f"  {entry.name:20}{count(owner, entry):>12}" for entry in entries) + "\n")
             else:
