@@ -5,7 +5,7 @@ import torch
 from drives import NumberDrive
 
 from saunet.checks import ConfigError, DataError
-from saunet.data.module import DepthDataModule
+from saunet.data.module import DepthDataModule, available_cores
 from saunet.data.windows import Selection
 
 
@@ -132,3 +132,10 @@ def test_nothing_held_out_means_no_validation():
     assert data.val_dataloader() == []
     assert len(list(data.train_dataloader())) == 1
     assert set(data.fingerprints()) == {"train"}
+
+
+def test_no_more_loader_processes_than_cores(recwarn):
+    data = module(workers=available_cores() + 3)
+    data.setup("fit")
+    assert data.train_dataloader().num_workers == data.val_dataloader().num_workers == available_cores()
+    assert not [str(each.message) for each in recwarn if "worker" in str(each.message)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import Any
 
@@ -24,6 +23,7 @@ KEYS = {
 
 def prepare(cfg: DictConfig) -> None:
     """Do one job and say what was done."""
+    from saunet.data.module import available_cores
     from saunet.prepare.recordings import kitti_recordings
 
     one_of("job", cfg.job, KEYS)
@@ -33,7 +33,7 @@ def prepare(cfg: DictConfig) -> None:
         if key not in KEYS[cfg.job] and value != getattr(default, key):
             owners = " and ".join(job for job, keys in KEYS.items() if key in keys)
             raise ConfigError(f"{key} belongs to saunet-prepare {owners}, not to {cfg.job}; leave it out")
-    workers = os.cpu_count() or 1 if cfg.workers is None else cfg.workers
+    workers = available_cores() if cfg.workers is None else cfg.workers
     depth = one_of("depth", cfg.depth, ("camera_z", "improved"))
     recordings = kitti_recordings(cfg.root, plain["cameras"], plain["drives"], cfg.split, depth)  # type: ignore[arg-type]
     failures = _JOBS[cfg.job](plain, recordings, workers)

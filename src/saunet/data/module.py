@@ -5,6 +5,7 @@ A data set subclasses `DepthDataModule`, names its own parameters beside the sha
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal
 
@@ -40,7 +41,7 @@ class DepthDataModule(LightningDataModule):
         width: Image width in pixels.
         offsets: Time offsets of the source frames.
         batch_size: Samples a step over all devices together.
-        workers: Loader processes a device.
+        workers: Loader processes a device, at most one a core.
         translate: Frames are loaded this much larger (0.1 = 10 %) and a random window is cut in training; K follows.
         flip: Probability of mirroring in training.
         colour: Probability of colour jitter in training.
@@ -263,13 +264,14 @@ class DepthDataModule(LightningDataModule):
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
     def _loading(self) -> Mapping[str, Any]:
+        workers = min(self.workers, available_cores())
         return {
             "batch_size": None,  # the samplers yield whole batches
             "collate_fn": collate,
-            "num_workers": self.workers,
-            "prefetch_factor": AHEAD if self.workers else None,
+            "num_workers": workers,
+            "prefetch_factor": AHEAD if workers else None,
             "pin_memory": torch.cuda.is_available(),
-            "persistent_workers": self.workers > 0,
+            "persistent_workers": workers > 0,
             "worker_init_fn": single_threaded,
         }
 
@@ -278,3 +280,9 @@ def single_threaded(worker: int) -> None:
     """Keep a loader process to one thread: the processes are the parallelism."""
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use: fewer than the machine has, under a scheduler or in a container."""
+    allowed = getattr(os, "sched_getaffinity", None)  # Linux only
+    return len(allowed(0)) if allowed else os.cpu_count() or 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_info
 
 from saunet.checks import in_range, positive
+from saunet.data.module import available_cores
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,9 +87,9 @@ class LoaderMonitor(Callback):
 def sentence(loading: Loading, trainer: Trainer) -> str:
     """Say that the loader is the bottleneck, with its figures and what to do."""
     workers = getattr(trainer.train_dataloader, "num_workers", 0)
-    cores = os.cpu_count() or 1
+    cores = available_cores()
     each = " on this process" if trainer.world_size > 1 else ""
-    advice = f"raise data.workers (now {workers}, the machine has {cores} cores), or " if workers < cores else ""
+    advice = f"raise data.workers (now {workers}, there are {cores} cores), or " if workers < cores else ""
     return (
         f"the loader is the bottleneck: {loading.reached:.0f} images/s arrive{each} and the model could use "
         f"{loading.needed:.0f} ({loading.share:.0%} of the time is spent waiting); {advice}load smaller files made "

@@ -30,7 +30,7 @@ class SyntheticDataModule(DepthDataModule):
         width: Image width in pixels.
         offsets: Time offsets of the source frames.
         batch_size: Samples a step over all devices together.
-        workers: Loader processes a device.
+        workers: Loader processes a device, at most one a core.
         translate: Training frames are rendered this much larger (0.1 = 10 %) and a random window is cut; K follows.
         flip: Probability of mirroring in training.
         colour: Probability of colour jitter in training.
