@@ -58,6 +58,16 @@ def test_a_row_can_be_tried_at_smoke_size(row: str) -> None:
     assert (cfg["trainer"]["max_epochs"], cfg["trainer"]["limit_train_batches"]) == (1, 2)
 
 
+@pytest.mark.parametrize("row", ["paper", "table1/sau_net", *TABLE_3])
+def test_the_papers_own_system_compares_with_interpolated_lidar(row: str) -> None:
+    """Eq. (13)'s ground truth is interpolated, wherever SAU-Net is trained; other data still take its place."""
+    cfg = resolved(f"experiment={row}")
+    assert (cfg["data"]["dense"], cfg["data"]["target_depth"]) == ("linear", True)
+    assert cfg["objective"]["gradient"]["target"] == "lidar"
+    assert resolved(f"experiment={row}", *SMOKE)["data"]["target_depth"] is True
+    assert resolved(f"experiment={row}", "data=kitti")["data"]["dense"] == "none"
+
+
 def test_rows_of_table_3_differ_in_the_depth_network_only() -> None:
     rows = [resolved(f"experiment={row}") for row in TABLE_3]
     parts = [(row["model"].pop("encoder")["_target_"], row["model"].pop("decoder")["_target_"]) for row in rows]

@@ -26,6 +26,7 @@ _PROTOCOLS = {"camera_z": "eigen_camera_z", "lidar_x": "eigen_lidar_x", "improve
 
 
 @datamodules.register("kitti")
+@datamodules.register("kitti_dense", dense="linear")
 class KittiDataModule(DepthDataModule):
     """KITTI raw recordings: real street video with the true intrinsics of each camera and date, and LiDAR depth.
 
