@@ -30,6 +30,7 @@ KITTI = (
 def _says(outcome: Any, *words: str) -> None:
     assert outcome.code == 1
     assert "Traceback" not in outcome.err
+    assert "Error executing job" not in outcome.err  # Hydra's own words before ours
     sentence = outcome.err.strip().splitlines()[-1]
     assert sentence.startswith("saunet-")
     for word in words:
@@ -62,7 +63,14 @@ def _says(outcome: Any, *words: str) -> None:
 )
 def test_train(tool: Tool, override: str, words: tuple[str, ...], tmp_path: Path) -> None:
     _says(tool("train", *override.split()), *words)
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []  # nothing half-written is left
+    assert list(tmp_path.iterdir()) == []  # nothing half-written is left, nor an empty folder
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there(tool: Tool) -> None:
+    outcome = tool("train", "experiment=smoke", "trainer=gpu")
+    _says(outcome, "gpu")
+    assert "Error in call" not in outcome.err  # Hydra's wrapping
 
 
 def test_a_missing_value_is_asked_for(tool: Tool) -> None:

@@ -105,6 +105,9 @@ def test_frozen_parts_are_named_parts_and_something_is_left_to_train() -> None:
     assert Recipe(freeze=["depth.encoder"]).frozen(network) == [network.depth["encoder"]]
     with pytest.raises(ConfigError, match=r"optim.freeze is 'depth.encodr'; did you mean 'depth.encoder'\?"):
         Recipe(freeze=["depth.encodr"]).frozen(network)
+    network.pose = nn.Sequential(nn.Sequential(nn.Linear(1, 1)))
+    with pytest.raises(ConfigError, match=r"allowed: depth, depth.encoder, .*pose, pose.0, and parts of these by"):
+        Recipe(freeze=["posse"]).frozen(network)  # not every layer's name
     network.requires_grad_(False)
     with pytest.raises(ConfigError, match=r"leaves nothing to train"):
         Recipe(freeze=["depth", "pose"]).groups(network)

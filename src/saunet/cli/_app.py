@@ -45,6 +45,7 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
     _quieten()
 
     folders: list[Path] = []  # of a single run, once they exist
+    failed: list[Exception] = []
 
     @wraps(task)
     def required(cfg: DictConfig) -> Any:
@@ -54,15 +55,20 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
         folders.append(Path(hydra_cfg.runtime.output_dir))
         if "output_dir" in cfg:
             folders.append(Path(cfg.output_dir).resolve())
-        missing = sorted(OmegaConf.missing_keys(cfg))
-        if missing:
-            needed = " ".join(f"{key}=..." for key in missing)
-            raise SaunetError(f"{missing[0]} is not set; add {needed} to the command line")
-        return task(cfg)
+        try:
+            missing = sorted(OmegaConf.missing_keys(cfg))
+            if missing:
+                needed = " ".join(f"{key}=..." for key in missing)
+                raise SaunetError(f"{missing[0]} is not set; add {needed} to the command line")
+            return task(cfg)
+        except Exception as error:
+            failed.append(error)  # raised again outside of Hydra, which would print a line of its own before ours
 
     try:
         sys.argv[1:] = expand_globs(sys.argv[1:], config_dir())
         hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(required)()
+        if failed:
+            raise failed[0]
         _end_sweep(name)
     except KeyboardInterrupt:
         _end_sweep(name)
@@ -141,6 +147,10 @@ def _remove_if_bare(folder: Path) -> None:
     if (folder / ".hydra").is_dir():
         logging.shutdown()
         shutil.rmtree(folder, ignore_errors=True)
+        for parent in folder.parents:  # outputs/NAME and outputs, where nothing else is in them
+            if Path.cwd() not in parent.parents or any(parent.iterdir()):
+                break
+            parent.rmdir()
     elif not any(folder.iterdir()):
         folder.rmdir()
 
@@ -152,8 +162,9 @@ def sentence(error: Exception) -> str | None:
     raised_elsewhere = re.search(r"^saunet\.checks\.\w+: (.*)", str(error), re.MULTILINE)
     if raised_elsewhere:  # in a process that was spawned: only its traceback's text arrives here
         return raised_elsewhere[1]
-    if type(error).__name__ == "MisconfigurationException":  # Lightning's word for a user's error
-        return " ".join(str(error).split())
+    for each in (error, error.__cause__):  # Hydra wraps what a constructor raises
+        if type(each).__name__ == "MisconfigurationException":  # Lightning's word for a user's error
+            return " ".join(str(each).split())
     if type(error).__name__ == "ProcessExitedException":  # a process that was spawned is gone
         return f"{' '.join(str(error).split())}, so the run ends; go on with resume= and the run's last.ckpt"
     text = f"{error}\n{error.__cause__ or ''}"

@@ -12,7 +12,7 @@ from torch import nn
 from torch.nn import Parameter
 from torch.optim.lr_scheduler import LRScheduler
 
-from saunet.checks import ConfigError, in_range, one_of, positive
+from saunet.checks import ConfigError, in_range, one_of, positive, suggest
 
 SCHEDULES = ("step", "cosine", "one_cycle", "constant")
 OPTIMIZER_STATE = ("lr", "encoder_lr", "betas", "weight_decay", "fused")
@@ -108,7 +108,11 @@ class Recipe:
         """
         parts = dict(model.named_modules())
         for name in self.freeze:
-            one_of("optim.freeze", name, [part for part in parts if part.startswith(("depth", "pose"))])
+            allowed = [part for part in parts if part.startswith(("depth", "pose"))]
+            if name not in allowed:
+                upper = ", ".join(part for part in allowed if part.count(".") < 2)
+                hint = suggest(name, allowed) or ","
+                raise ConfigError(f"optim.freeze is '{name}'{hint} allowed: {upper}, and parts of these by their names")
         return [parts[name] for name in self.freeze]
 
     def groups(self, model: nn.Module) -> list[dict[str, Any]]:
