@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -132,3 +133,15 @@ def test_another_checkpoint_than_best_or_last_is_refused(tmp_path: Path) -> None
 def test_no_path_at_all_is_refused() -> None:
     with pytest.raises(DataError, match="no run given"):
         collect([])
+
+
+def test_an_evaluation_led_elsewhere_by_output_dir_belongs_to_the_run_of_its_checkpoint(tmp_path: Path) -> None:
+    add_checkpoint(make_run(tmp_path / "a"))
+    evaluation = make_evaluation(tmp_path / "scores" / "e", Path("unused.ckpt"))
+    shutil.rmtree(evaluation / ".hydra")  # it stays in the folder that Hydra chose
+    file = evaluation / "metrics.json"
+    settings = {"checkpoint": "a/checkpoints/best.ckpt", "data": "kitti", "split": "val"}
+    file.write_text(json.dumps({**json.loads(file.read_text()), "settings": settings}))
+    (run,) = collect([tmp_path / "a", evaluation]).runs
+    assert run.evaluations == (evaluation,)
+    assert {score.data for score in run.scores if not score.validation} == {"kitti, val split"}

@@ -65,7 +65,8 @@ class Subject:
         if self.cfg.export:
             rules = protocol((list(self.cfg.protocols or []) or [data.protocol])[0])
             predictor = ExportingPredictor(predictor, Path(self.cfg.export), rules)
-        return {name: predictor, **(trivial(data, self.cfg.truth_cache) if self.cfg.baselines else {})}
+        baselines = self.cfg.baselines and data.ground_truth != "none"  # else there is no depth to beat them in
+        return {name: predictor, **(trivial(data, self.cfg.truth_cache) if baselines else {})}
 
     def predictor(self, data: Any) -> tuple[str, Any]:
         """Return its name in tables, and itself."""

@@ -33,6 +33,8 @@ def evaluate_model(network: Any, data: Any, protocols: Sequence[str], *, split: 
 
 def evaluate(cfg: DictConfig) -> None:
     """Load what is scored and the data, print the tables, write them to the output folder."""
+    from hydra.core.hydra_config import HydraConfig
+
     from saunet.evaluation import EvaluationResult, evaluate_protocols, print_table, with_statistics, write_results
     from saunet.evaluation.breakdown import Buckets
 
@@ -47,7 +49,8 @@ def evaluate(cfg: DictConfig) -> None:
         buckets=Buckets(tuple(cfg.distances)) if cfg.buckets else None,
     )
     result = with_statistics(result, cfg.intervals, Path(cfg.compare) if cfg.compare else None)
-    result = replace(result, settings=subject.settings())
+    data = HydraConfig.get().runtime.choices["data"]
+    result = replace(result, settings={"data": data, **subject.settings()})
     print_table(result)
     for source in cfg.data.get("sources") or {}:  # of a mixture
         rows = tuple(row for row in result.rows if row.name.startswith(f"{source}/"))

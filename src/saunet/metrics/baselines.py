@@ -84,7 +84,7 @@ class MeanDepthMap(nn.Module):
         cells = seen.sum(1)
         known_rows = cells.nonzero()[:, 0]
         if len(known_rows) == 0:
-            raise DataError("the mean depth map has seen no ground truth; add batches with `update` first")
+            raise DataError("the mean depth map has seen no ground truth; give it data that have some")
         mean = self.depth_sum / self.count.clamp(min=1)
         row_mean = mean.sum(1) / cells.clamp(min=1)
         distance = (torch.arange(len(cells), device=cells.device)[:, None] - known_rows[None]).abs()

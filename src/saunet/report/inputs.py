@@ -180,10 +180,14 @@ def _read_evaluation(folder: Path) -> _Evaluation:
     config = read_mapping(folder / ".hydra" / "config.yaml")
     hydra = read_mapping(folder / ".hydra" / "hydra.yaml").get("hydra") or {}
     runtime = hydra.get("runtime") or {}
-    given = config.get("checkpoint")
-    checkpoint = Path(runtime.get("cwd") or ".", str(given)).resolve() if given else None
-    data = (runtime.get("choices") or {}).get("data") or "unknown data"
-    place = f"{data}, {config.get('split', 'test')} split"
+    settings = content.get("settings")  # all there is where `output_dir` led the results out of the run's folder
+    settings = settings if isinstance(settings, dict) else {}
+    given = config.get("checkpoint") or settings.get("checkpoint")
+    starts = [Path(runtime["cwd"])] if runtime.get("cwd") else [Path.cwd(), *folder.parents]
+    candidates = [Path(start, str(given)).resolve() for start in starts] if given else []
+    checkpoint = next((each for each in candidates if each.is_file()), next(iter(candidates), None))
+    data = (runtime.get("choices") or {}).get("data") or settings.get("data") or "unknown data"
+    place = f"{data}, {config.get('split') or settings.get('split') or 'test'} split"
     scores = tuple(
         Score(row["predictor"], row["protocol"], place, row.get("images") or 0, tuple(row[key] for key in ERROR_NAMES))
         for row in content.get("results", [])
