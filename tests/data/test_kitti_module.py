@@ -87,6 +87,20 @@ def test_batches_carry_truth_and_target_depth(tmp_path):
     assert len(names(data, "test")) == 40
 
 
+def test_speed_becomes_the_way_travelled(tmp_path):
+    make_drive(tmp_path, 1, frames=range(12))
+    with pytest.raises(DataError, match=r"with_speed is true but no training frame .* has an OXTS record"):
+        module(tmp_path, with_speed=True).setup("fit")
+    records = tmp_path / name(1) / "oxts" / "data"
+    records.mkdir(parents=True)
+    for frame in range(12):
+        (records / f"{frame:010d}.txt").write_text(" ".join(["0"] * 8 + ["8"] + ["0"] * 21))
+    data = module(tmp_path, with_speed=True)
+    data.setup("fit")
+    batch = data.on_after_batch_transfer(next(iter(data.train_dataloader())), 0)
+    torch.testing.assert_close(batch["distance"], torch.full((2, 2), 0.8))
+
+
 @pytest.mark.parametrize(
     ("depth", "protocol"),
     [("camera_z", "eigen_camera_z"), ("lidar_x", "eigen_lidar_x"), ("improved", "eigen_improved")],

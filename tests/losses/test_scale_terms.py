@@ -73,7 +73,7 @@ def test_objectives_say_whether_they_need_source_depth() -> None:
 @pytest.mark.parametrize(
     ("term", "key", "message"),
     [
-        (Velocity(), "distance", "the velocity term needs 'distance' in the batch, which the data does not give; use"),
+        (Velocity(), "distance", "the velocity term needs 'distance' in the batch, which the data does not give; set"),
         (Consistency(), "source_depth", "the consistency term needs 'source_depth' in the batch"),
     ],
 )

@@ -21,6 +21,7 @@ from saunet.checks import ConfigError, DataError, in_range, one_of, positive
 from saunet.data.depth_maps import DepthMaps
 from saunet.data.image_cache import CachedDrive, ImageCache
 from saunet.data.manifest import read_manifest
+from saunet.data.partners import Odometer
 from saunet.data.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, share
 from saunet.data.sequences import Drive
 from saunet.data.transforms import Augment, Prepare
@@ -98,6 +99,7 @@ class DepthDataModule(LightningDataModule):
         self.prepare = Prepare(self.height, self.width)
         self.maps: dict[str, DepthMaps] = {}
         self.copies: ImageCache | None = None
+        self.odometer: Odometer | None = None
         self.usage: dict[str, list[Usage]] = {}
         self.datasets: dict[str, WindowDataset] = {}
 
@@ -183,6 +185,7 @@ class DepthDataModule(LightningDataModule):
             with_target_depth=self.target_depth and split in self.neighbours and "target_depth" not in self.maps,
             with_pose=self.with_pose and split in self.neighbours,
             stereo=stereo,
+            odometer=self.odometer if split in self.neighbours else None,
             maps=self.maps if split in self.neighbours else {},
         )
 

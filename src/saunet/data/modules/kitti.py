@@ -11,8 +11,9 @@ from saunet.checks import ConfigError, DataError, in_range, one_of, suggest
 from saunet.data import splits
 from saunet.data.depth_maps import DENSE_KINDS, DepthMaps
 from saunet.data.image_cache import ImageCache
-from saunet.data.kitti import CAMERAS, DEPTH_KINDS, DepthKind, KittiRaw
+from saunet.data.kitti import CAMERAS, DEPTH_KINDS, DepthKind, KittiDrive, KittiRaw
 from saunet.data.module import DepthDataModule
+from saunet.data.partners import measured_distance
 from saunet.data.splits import Frame
 from saunet.data.static import static_by_flow
 from saunet.data.windows import Selection
@@ -62,6 +63,7 @@ class KittiDataModule(DepthDataModule):
         cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
         stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
             ``offsets: []`` it is the only one.
+        with_speed: Batches carry the way travelled, from OXTS, for the velocity term; unknown where a record lacks.
         manifest: Frames to leave out of training and validation, as ``saunet-doctor`` wrote them.
         on_error: A file that cannot be read: ``raise`` stops and names it, ``skip`` names, counts and passes it over.
 
@@ -98,6 +100,7 @@ class KittiDataModule(DepthDataModule):
         maps: str | None = None,
         cache: str | None = None,
         stereo: bool = False,
+        with_speed: bool = False,
         manifest: str | None = None,
         on_error: Literal["raise", "skip"] = "raise",
     ) -> None:
@@ -135,6 +138,7 @@ class KittiDataModule(DepthDataModule):
         if teacher:
             self.maps["target_teacher"] = DepthMaps("teacher", maps)
         self.copies = ImageCache(cache) if cache else None
+        self.odometer = measured_distance if with_speed else None
 
     def select(self, split: str) -> Sequence[Selection]:
         """Return the frames of a split, grouped by drive and camera.
@@ -161,6 +165,11 @@ class KittiDataModule(DepthDataModule):
             raise DataError(
                 f"target_depth is true but no training frame below {raw.root} has {kind} depth; "
                 "add the velodyne_points, or set data.target_depth=false"
+            )
+        if split == "train" and self.odometer and not any(map(_has_speed, selections)):
+            raise DataError(
+                f"with_speed is true but no training frame below {raw.root} has an OXTS record; "
+                "add the oxts folders, or set data.with_speed=false"
             )
         if split in ("train", "val"):
             self._check_maps(selections)
@@ -272,6 +281,11 @@ def _moving(selection: Selection, by_speed: bool) -> Selection:
     static |= static_by_flow(drive, [frame for frame, speed in speeds.items() if speed is None], MIN_FLOW)
     kept = [frame for frame in selection.frames if frame not in static]
     return Selection(drive, kept, {**selection.left_out, "static": len(static)})
+
+
+def _has_speed(selection: Selection) -> bool:
+    drive = selection.drive
+    return isinstance(drive, KittiDrive) and any(drive.speed(frame) is not None for frame in selection.frames)
 
 
 def _has_truth(selection: Selection) -> bool:

@@ -52,7 +52,10 @@ class Velocity(Term):
             distance = torch.linalg.vector_norm(batch["T_src_tgt"][..., :3, 3], dim=-1)
         else:
             distance = require(
-                batch, "distance", "the velocity term", "use data with speed or true motion, or drop the term"
+                batch,
+                "distance",
+                "the velocity term",
+                "set data.with_speed=true or data.with_pose=true where the data set has it, or drop the term",
             )
         # The norm's gradient at zero motion is 0, not NaN.
         predicted = torch.linalg.vector_norm(poses[:, :predictions, :3, 3], dim=-1)
