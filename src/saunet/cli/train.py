@@ -31,7 +31,7 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
     from saunet.lit.callbacks import BestCheckpoint, SplitsRecorded
     from saunet.lit.durable import way_on
     from saunet.lit.run_record import recording
-    from saunet.lit.start import check_resume, resume_path, warm_start
+    from saunet.lit.start import check_resume, keep_rows, resume_path, warm_start
     from saunet.lit.storage import AtomicCheckpointIO
     from saunet.registry import instantiate
 
@@ -41,8 +41,11 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
         resume = resume_path(cfg.resume, cfg.output_dir, cfg.init_from)
         data = instantiate(config.plain(cfg.data))
         model = assemble(config.plain(cfg), data, pretrained=resume is None and cfg.init_from is None)
+        loggers = [hydra_instantiate(logger) for logger in cfg.logger.values() if logger]
         if resume:
-            check_resume(model, resume)
+            steps = check_resume(model, resume)
+            for logger in loggers:
+                keep_rows(logger, steps)
             record.write(resumed=resume)
             print(f"going on from {resume}")
         elif cfg.init_from:
@@ -51,7 +54,7 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
         trainer = hydra_instantiate(
             cfg.trainer,
             callbacks=[SplitsRecorded(record), *callbacks],
-            logger=[hydra_instantiate(logger) for logger in cfg.logger.values() if logger] or False,
+            logger=loggers or False,
             plugins=[AtomicCheckpointIO()],
             default_root_dir=cfg.output_dir,
         )

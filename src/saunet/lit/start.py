@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import csv
+import warnings
 from pathlib import Path
 
+from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
 from saunet.checkpoint import load_weights, read_checkpoint
@@ -33,8 +37,11 @@ def resume_path(resume: str | None, output_dir: str | Path, init_from: str | Non
     return str(Path(resume).expanduser().resolve()) if resume else None
 
 
-def check_resume(model: SelfSupervisedDepth, path: str) -> None:
+def check_resume(model: SelfSupervisedDepth, path: str) -> int:
     """Check that a training can go on from a checkpoint, before the trainer finds out in its own words.
+
+    Returns:
+        The steps done by then.
 
     Raises:
         CheckpointError: if the file cannot be read or belongs to another model or other data.
@@ -44,6 +51,30 @@ def check_resume(model: SelfSupervisedDepth, path: str) -> None:
     load_weights(model.depth, checkpoint.weights("depth"), "depth network")
     if model.pose is not None:
         load_weights(model.pose, checkpoint.weights("pose"), "pose network")
+    return checkpoint.global_step or 0
+
+
+@rank_zero_only
+def keep_rows(logger: Logger, steps: int) -> None:
+    """Keep what a resumed run logged as CSV before; Lightning's logger would begin the file afresh.
+
+    Args:
+        logger: A logger of the resumed run; nothing is done for one that writes no CSV.
+        steps: The steps done by the checkpoint; later rows are dropped, as they will be logged again.
+    """
+    if not isinstance(logger, CSVLogger):
+        return
+    path = Path(logger.log_dir) / "metrics.csv"
+    if not path.is_file():
+        return
+    with path.open(newline="") as file:
+        rows = [{key: value for key, value in row.items() if value} for row in csv.DictReader(file)]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*will be deleted when the new ones are saved.*")
+        writer = logger.experiment
+    whole = (row for row in rows if row.get("step", "").isdecimal())  # a kill can cut the last one
+    writer.metrics.extend(row for row in whole if int(row["step"]) < steps)
+    writer.save()
 
 
 def warm_start(model: SelfSupervisedDepth, path: str | Path) -> str:
