@@ -198,7 +198,7 @@ TINY: dict[str, dict[str, Any]] = {
     "StratifiedTransformer": {"dim": 8, "depths": (2, 1, 1, 1), "heads": (1, 1, 2, 2), "window": (4, 4, 4, 4)},
     "SwinTransformer": {"dim": 8, "depths": (2, 1, 1, 1), "heads": (1, 1, 2, 2), "window": (4, 4, 4, 4)},
     "ResNet": {"blocks": (1, 1, 1, 1)},
-    "PackNetEncoder": {"channels": (8, 8, 8, 8, 8), "blocks": (1, 1, 1, 1)},
+    "PackNetEncoder": {"channels": (16, 16, 16, 16, 16), "blocks": (1, 1, 1, 1)},
     "LiteMonoEncoder": {"dims": (8, 16, 16), "depths": (2, 2, 2), "rates": (2,), "last_rates": (2,), "heads": 2},
 }
 """What makes an encoder of each kind small; its layers stay the same."""
