@@ -50,7 +50,7 @@ class KittiDataModule(DepthDataModule):
         width: Image width in pixels.
         offsets: Time offsets of the source frames.
         batch_size: Samples a step over all devices together.
-        workers: Loader processes a device.
+        workers: Loader processes a device, at most one a core.
         translate: Frames are loaded this much larger in training (0.1 = 10 %) and a random window is cut.
         flip: Probability of mirroring in training.
         colour: Probability of colour jitter in training.
