@@ -227,6 +227,7 @@ class TestBadInput:
             "from saunet.cli.predict import main\n"
             "from saunet.infer import files, sinks\n"
             "how, sys.argv = sys.argv[1], sys.argv[:1] + sys.argv[2:]\n"
+            "signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell job ignores it\n"
             "if how == 'full':\n"
             "    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
             "    resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
