@@ -62,7 +62,7 @@ def ddp(session: nox.Session) -> None:
 @nox.session
 def lint(session: nox.Session) -> None:
     """Check style and formatting."""
-    install(session, "ruff")
+    session.install("-c", str(ROOT / "constraints.txt"), "ruff")
     session.run("ruff", "check", ".")
     session.run("ruff", "format", "--check", ".")
 
