@@ -1,14 +1,15 @@
-"""Run the tiny training in one process or two: ``python ddp_curve.py FOLDER PROCESSES EPOCHS SLEEP``.
+"""Run the tiny training in one process or two: ``python ddp_curve.py FOLDER PROCESSES EPOCHS [RANK SIGNAL]``.
 
-Writes the losses of its steps and the validation metric to ``FOLDER/curve.json``.
+Writes the losses of its steps and the validation metric to ``FOLDER/curve.json``. With a rank and a signal, that
+process sends itself the signal in its fourth step.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ from saunet.lit.run_record import recording
 
 
 class Curve(Callback):
-    def __init__(self, sleep: float) -> None:
-        self.sleep = sleep
+    def __init__(self, rank: int | None, number: int) -> None:
+        self.rank, self.number = rank, number
         self.losses: list[float] = []
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any) -> None:
@@ -33,11 +34,11 @@ class Curve(Callback):
             torch.distributed.all_reduce(loss)
             loss = loss / trainer.world_size
         self.losses.append(float(loss))
-        print(f"process {trainer.global_rank} pid {os.getpid()} step {trainer.global_step}", flush=True)
-        time.sleep(self.sleep)
+        if trainer.global_rank == self.rank and trainer.global_step == 4:
+            os.kill(os.getpid(), self.number)
 
 
-def main(folder: Path, processes: int, epochs: int, sleep: float) -> None:
+def main(folder: Path, processes: int, epochs: int, rank: int | None = None, number: int = signal.SIGTERM) -> None:
     with recording(folder, "curve"):
         # The mean of the halves' losses is the whole's where all pixels count and no sample sees another: no auto-mask,
         # no validity mask, no dropout, no batch norm (which is synchronised on GPUs only).
@@ -45,7 +46,7 @@ def main(folder: Path, processes: int, epochs: int, sleep: float) -> None:
         photometric: Any = model.objective.terms["photometric"]
         photometric.automask, photometric.use_validity = False, False
         model.depth.encoder[1] = torch.nn.Identity()  # type: ignore[union-attr, index, operator]
-        curve = Curve(sleep)
+        curve = Curve(rank, number)
         watch = [
             GracefulStop(str(folder / "c")),
             ProcessWatch(str(folder), str(folder / "c")),
@@ -65,5 +66,4 @@ def main(folder: Path, processes: int, epochs: int, sleep: float) -> None:
 
 
 if __name__ == "__main__":
-    folder, processes, epochs, sleep = sys.argv[1:]
-    main(Path(folder), int(processes), int(epochs), float(sleep))
+    main(Path(sys.argv[1]), *(int(word) for word in sys.argv[2:]))

@@ -73,9 +73,13 @@ CURVE = Path(__file__).with_name("ddp_curve.py")
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
+def _train(folder: Path, *arguments: int) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(CURVE), str(folder), *(str(int(each)) for each in arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=400, env=ENVIRONMENT, check=False)
+
+
 def _curve(folder: Path, processes: int) -> dict[str, Any]:
-    command = [sys.executable, str(CURVE), str(folder), str(processes), "7", "0"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=400, env=ENVIRONMENT, check=False)
+    done = _train(folder, processes, 7)
     assert done.returncode == 0, done.stderr[-3000:]
     curve: dict[str, Any] = json.loads((folder / "curve.json").read_text())
     return curve
@@ -91,21 +95,11 @@ def test_two_processes_have_the_loss_curve_of_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("victim", [0, 1])
 def test_a_killed_process_ends_the_run_with_a_sentence_and_a_checkpoint(victim: int, tmp_path: Path) -> None:
-    command = [sys.executable, str(CURVE), str(tmp_path), "2", "500", "0.02"]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=ENVIRONMENT
-    ) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            words = line.split()
-            if words[:2] == ["process", str(victim)] and words[-1] == "4":
-                os.kill(int(words[3]), signal.SIGKILL)
-                break
-        rest = process.stdout.read()  # ends when all processes have
-    assert process.returncode != 0
+    done = _train(tmp_path, 2, 500, victim, signal.SIGKILL)
+    assert done.returncode != 0
     named = "process 1 of 2 was killed (signal 9)" if victim == 1 else "the first process of the run is gone"
-    assert f"saunet-train: {named}" in rest
-    assert "go on with resume=" in rest
+    assert f"saunet-train: {named}" in done.stderr
+    assert "go on with resume=" in done.stderr
     record = json.loads((tmp_path / "run.json").read_text())
     assert record["status"] == "failed"
     assert named in record["error"]
@@ -113,19 +107,10 @@ def test_a_killed_process_ends_the_run_with_a_sentence_and_a_checkpoint(victim: 
     assert stored["global_step"] >= 3
 
 
-def test_one_process_asked_to_stop_stops_both_with_everything_saved(tmp_path: Path) -> None:
-    command = [sys.executable, str(CURVE), str(tmp_path), "2", "500", "0.02"]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=ENVIRONMENT
-    ) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            words = line.split()
-            if words[:2] == ["process", "0"] and words[-1] == "4":
-                os.kill(int(words[3]), signal.SIGTERM)
-                break
-        process.stdout.read()
-    assert process.returncode == 128 + signal.SIGTERM
+@pytest.mark.parametrize("asked", [0, 1])
+def test_one_process_asked_to_stop_stops_both_with_everything_saved(asked: int, tmp_path: Path) -> None:
+    done = _train(tmp_path, 2, 500, asked, signal.SIGTERM)
+    assert done.returncode == 128 + signal.SIGTERM
     record = json.loads((tmp_path / "run.json").read_text())
     assert record["status"] == "interrupted"
     assert "stopped by SIGTERM after step" in record["error"]

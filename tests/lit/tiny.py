@@ -1,7 +1,7 @@
 """A training of a few thousand numbers, and a program that runs it, to be killed and resumed.
 
-``python tiny.py FOLDER MAX_STEPS [RESUME]`` trains, saves ``last.ckpt`` after every second step, prints every step, and
-writes the weights to ``FOLDER/end.pt``.
+``python tiny.py FOLDER EPOCHS`` trains, saves ``last.ckpt`` after every step, and writes the weights to
+``FOLDER/end.pt``. It prints every batch and waits for a line of input before it goes on.
 """
 
 from __future__ import annotations
@@ -123,17 +123,18 @@ def tiny_trainer(folder: Path, **kwargs: Any) -> Trainer:
     return Trainer(**{**quiet, **kwargs})
 
 
-class Say(Callback):
-    """Print every batch, so that whoever watches can choose when to strike."""
+class Ask(Callback):
+    """Print every batch and wait for an answer, so that whoever watches can choose when to strike."""
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        print(f"step {trainer.global_step} batch {trainer.fit_loop.total_batch_idx}", flush=True)
+        print(f"batch {trainer.fit_loop.total_batch_idx}", flush=True)
+        sys.stdin.readline()
 
 
 RECIPE = Recipe(lr=1e-2, schedule="one_cycle", warmup=0.3, encoder_lr=5e-3, ema=0.9)
 
 
-def main(folder: Path, epochs: int, resume: str | None = None, accumulate: int = 2) -> None:
+def main(folder: Path, epochs: int, resume: str | None = None, asking: Sequence[Callback] = ()) -> None:
     torch.manual_seed(99 if resume else 1)  # nothing may depend on what the generator happened to be
     model = tiny_model(RECIPE)
     if resume:
@@ -141,9 +142,9 @@ def main(folder: Path, epochs: int, resume: str | None = None, accumulate: int =
     trainer = tiny_trainer(
         folder,
         max_epochs=epochs,
-        accumulate_grad_batches=accumulate,
+        accumulate_grad_batches=2,
         gradient_clip_val=1.0,
-        callbacks=[Say(), LastCheckpoint(str(folder), every_n_steps=1), GracefulStop(str(folder))],
+        callbacks=[*asking, LastCheckpoint(str(folder), every_n_steps=1), GracefulStop(str(folder))],
     )
     trainer.fit(model, tiny_walls(batch_size=2), ckpt_path=resume, weights_only=True)
     assert model.average is not None
@@ -155,4 +156,4 @@ def main(folder: Path, epochs: int, resume: str | None = None, accumulate: int =
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3] if len(sys.argv) > 3 else None)
+    main(Path(sys.argv[1]), int(sys.argv[2]), asking=[Ask()])
