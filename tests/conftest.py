@@ -38,6 +38,19 @@ def _loggers() -> list[tuple[str, logging.Logger]]:
     return [(name, each) for name, each in logging.root.manager.loggerDict.items() if isinstance(each, logging.Logger)]
 
 
+@pytest.fixture
+def hydra() -> Iterator[None]:
+    """Let a test compose configurations, as the tools do."""
+    from hydra import initialize_config_dir
+
+    from saunet.config import config_dir, register_configs, register_training_configs
+
+    register_configs()
+    register_training_configs()
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        yield
+
+
 @pytest.fixture(scope="session")
 def test_data() -> Path:
     """Root of the reference data; skips the test where they are absent."""

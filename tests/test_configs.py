@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from hydra import compose
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from saunet.config import config_dir, plain, register_configs, register_training_configs
+from saunet.config import config_dir, plain
 from saunet.registry import REGISTRIES
+
+pytestmark = pytest.mark.usefixtures("hydra")
 
 ROOTS = {"train", "evaluate", "odometry", "predict", "benchmark", "report", "calibrate", "doctor", "prepare"}
 GROUPS = ("model", "trainer", "callbacks", "logger")
@@ -27,14 +28,6 @@ REGISTERED = [
 def _yaml(group: str) -> list[str]:
     folder = config_dir() / group
     return sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.rglob("*.yaml"))
-
-
-@pytest.fixture(autouse=True)
-def _hydra() -> Iterator[None]:
-    register_configs()
-    register_training_configs()
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        yield
 
 
 def _compose(*overrides: str, root: str = "train") -> object:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import pytest
-from hydra import compose, initialize_config_dir
+from hydra import compose
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from saunet.config import config_dir, plain, register_configs, register_training_configs
+from saunet.config import config_dir, plain
+
+pytestmark = pytest.mark.usefixtures("hydra")
 
 SWEEPS = ("alpha_beta", "loss_ablation")
 WITH = [
@@ -20,14 +21,6 @@ WITH = [
     ("experiment=smoke",),
     ("experiment=paper",),
 ]
-
-
-@pytest.fixture(autouse=True)
-def _hydra() -> Iterator[None]:
-    register_configs()
-    register_training_configs()
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        yield
 
 
 def jobs(sweep: str) -> list[list[str]]:

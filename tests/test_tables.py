@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra import compose, initialize_config_dir
+from hydra import compose
 
 from saunet.benchmarking.report import PUBLISHED
 from saunet.checks import ConfigError
 from saunet.cli._globs import expand_globs
-from saunet.config import check, config_dir, plain, register_configs, register_training_configs
+from saunet.config import check, config_dir, plain
+
+pytestmark = pytest.mark.usefixtures("hydra")
 
 ROWS = sorted(
     path.relative_to(config_dir() / "experiment").with_suffix("").as_posix()
@@ -20,14 +21,6 @@ ROWS = sorted(
 )
 TABLE_3 = ["table3/resnet50_unet", "table3/stf_t_aunet", "table3/stf_t_unet"]
 SMOKE = ("trainer=smoke", "data=synthetic_tiny")
-
-
-@pytest.fixture(autouse=True)
-def _hydra() -> Iterator[None]:
-    register_configs()
-    register_training_configs()
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        yield
 
 
 def resolved(*overrides: str) -> dict[str, Any]:

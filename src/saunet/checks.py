@@ -84,3 +84,19 @@ def divisible(height: int, width: int, divisor: int, *, what: str = "image", by:
         f"{what} {height}x{width} (height x width) is not divisible by {by} {divisor}; "
         f"the nearest valid size is {valid[0]}x{valid[1]}"
     )
+
+
+def require_matplotlib(what: str, without: str) -> None:
+    """Check that pictures can be drawn, before anything long is started.
+
+    Args:
+        what: What needs it, with its verb, for the message, such as ``figure=true needs``.
+        without: The setting that does without.
+
+    Raises:
+        ConfigError: if matplotlib is not installed.
+    """
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as reason:
+        raise ConfigError(f"{what} matplotlib; run `pip install 'saunet[plot]'` or set {without}") from reason

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from saunet.atomic import replacing
 from saunet.benchmarking.suite import Measurement
-from saunet.checks import ConfigError
+from saunet.checks import require_matplotlib
 
 
 class Published(NamedTuple):
@@ -109,12 +109,9 @@ def draw_figure(results: Sequence[Measurement], path: Path, abs_rel: Mapping[str
     Raises:
         ConfigError: if matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as reason:
-        raise ConfigError(
-            "figure=true needs matplotlib; run `pip install 'saunet[plot]'` or set figure=false"
-        ) from reason
+    require_matplotlib("figure=true needs", "figure=false")
+    from matplotlib.figure import Figure
+
     accuracy = {name: row.abs_rel for name, row in PUBLISHED.items()} | dict(abs_rel or {})
     models = list(dict.fromkeys(row.model for row in results))
     settings = list(dict.fromkeys(_setting(row) for row in results))

@@ -7,7 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from saunet import config
-from saunet.checks import ConfigError
+from saunet.checks import ConfigError, require_matplotlib
 from saunet.cli._app import pick_device, run
 
 
@@ -19,11 +19,11 @@ def odometry(cfg: DictConfig) -> None:
     from saunet.evaluation.foreign import file_stem
     from saunet.evaluation.motion import predict_trajectory
     from saunet.evaluation.odometry import path_errors, path_of, path_table, write_errors, write_path
-    from saunet.evaluation.plot import check_plotting, draw_path
+    from saunet.evaluation.plot import draw_path
     from saunet.registry import instantiate
 
     if cfg.figure:
-        check_plotting()
+        require_matplotlib("figure=true needs", "figure=false")
     checkpoint = read_checkpoint(cfg.checkpoint)
     record, device, output = checkpoint.record, pick_device(cfg.device), Path(cfg.output_dir)
     pose = checkpoint.networks()[1]

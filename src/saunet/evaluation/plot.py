@@ -7,22 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from saunet.atomic import replacing
-from saunet.checks import ConfigError
+from saunet.checks import require_matplotlib
 from saunet.evaluation.odometry import Path3d
-
-
-def check_plotting() -> None:
-    """Check that pictures can be drawn, before anything long is started.
-
-    Raises:
-        ConfigError: if matplotlib is not installed.
-    """
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as reason:
-        raise ConfigError(
-            "figure=true needs matplotlib; run `pip install 'saunet[plot]'` or set figure=false"
-        ) from reason
 
 
 def draw_path(path: Path3d, file: Path) -> None:
@@ -36,7 +22,7 @@ def draw_path(path: Path3d, file: Path) -> None:
         ConfigError: if matplotlib is not installed.
         DataError: if the file cannot be written.
     """
-    check_plotting()
+    require_matplotlib("figure=true needs", "figure=false")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4.5) if path.true is not None else (5, 4.5), layout="constrained")

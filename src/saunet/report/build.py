@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timezone
 
 from saunet import __version__
-from saunet.checks import ConfigError, positive
+from saunet.checks import ConfigError, positive, require_matplotlib
 from saunet.report import figures, tables
 from saunet.report.document import Document, Figure, Gallery, Missing, Picture, Scene, Section, Table
 from saunet.report.inputs import Inputs
@@ -75,7 +75,7 @@ def build(
     options = options or Options()
     positive("zooms", options.zooms, allow_zero=True)
     if options.figures:
-        figures.check_matplotlib()
+        require_matplotlib("the figures of a report need", "figures=false")
     views = read_views(options.scenes, options.scenes_limit)
     groups = _groups(inputs, options.labels)
     everyone: Named = {name: run for group in groups for name, run in group.runs.items()}

@@ -9,7 +9,6 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from saunet.checks import ConfigError
 from saunet.report.curves import curve
 from saunet.report.runs import Run
 from saunet.report.settings import RATIO, ratio
@@ -36,20 +35,6 @@ _STYLE = {
     "svg.fonttype": "path",
     "svg.hashsalt": "saunet",
 }
-
-
-def check_matplotlib() -> None:
-    """Make sure that matplotlib is there.
-
-    Raises:
-        ConfigError: if it is not.
-    """
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as reason:
-        raise ConfigError(
-            "the figures of a report need matplotlib; run `pip install 'saunet[plot]'` or set figures=false"
-        ) from reason
 
 
 def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, ordered: bool = False) -> bytes | None:
