@@ -12,7 +12,7 @@ from torch.utils.checkpoint import checkpoint
 
 from saunet import checks
 from saunet.layers.window_attention import WindowAttention
-from saunet.layers.window_stream import add_attention, add_mlp, streams
+from saunet.layers.window_stream import add_attention, add_mlp_, streams
 
 
 class DropPath(nn.Module):
@@ -91,8 +91,7 @@ class SwinBlock(nn.Module):
     def forward(self, x: Float[Tensor, "b h w c"]) -> Float[Tensor, "b h w c"]:
         """Apply attention and MLP, each behind a norm and around a residual."""
         if streams(x, self) and not self.attn.pads(x.shape[1], x.shape[2]):
-            x = add_attention(x, self.norm1, self.attn)
-            return add_mlp(x, self.norm2, self.mlp.fc1, self.mlp.fc2)
+            return add_mlp_(add_attention(x, self.norm1, self.attn), self.norm2, self.mlp.fc1, self.mlp.fc2)
         x = x + self.drop_path(self.attn(self.norm1(x)))
         return x + self.drop_path(self.mlp(self.norm2(x)))  # type: ignore[no-any-return]
 

@@ -54,29 +54,27 @@ def add_attention(
     batch, height, width, dim = x.shape
     window, shift = attention.window, attention.shift
     order, inverse = window_order(batch, height, width, window, shift, x.device)
-    rows = x.reshape(-1, dim)
-    out, start, size = torch.empty_like(rows), 0, rows_per_piece(3 * dim)
+    rows = F.embedding(order, x.reshape(-1, dim))
+    start, size = 0, rows_per_piece(3 * dim)
     buffer = rows.new_empty(min(max(size, window**2), len(rows)), 3 * dim)
     for group in window_groups(height, width, window, shift):
         stop, step = start + batch * group.windows * group.area, max(1, size // group.area) * group.area
         bias = attention.bias(group, x.dtype)
-        for first in range(start, stop, step):
-            last = min(first + step, stop)
-            tokens = F.embedding(order[first:last], rows)
-            qkv = _into(buffer[: last - first], attention.qkv, norm(tokens))
-            _add(out[first:last], tokens, attention.proj, attention.attend(qkv, group, bias))
+        for piece in torch.split(rows[start:stop], step):
+            qkv = _into(buffer[: len(piece)], attention.qkv, norm(piece))
+            _add(piece, attention.proj, attention.attend(qkv, group, bias))
         start = stop
-    return F.embedding(inverse, out).view(x.shape)
+    return F.embedding(inverse, rows).view(x.shape)
 
 
-def add_mlp(x: Float[Tensor, "*n c"], norm: nn.LayerNorm, fc1: nn.Linear, fc2: nn.Linear) -> Float[Tensor, "*n c"]:
-    """Return ``x + fc2(gelu(fc1(norm(x))))``."""
-    rows = x.reshape(-1, x.shape[-1])
-    out, size = torch.empty_like(rows), rows_per_piece(fc1.out_features)
+def add_mlp_(x: Float[Tensor, "*n c"], norm: nn.LayerNorm, fc1: nn.Linear, fc2: nn.Linear) -> Float[Tensor, "*n c"]:
+    """Add ``fc2(gelu(fc1(norm(x))))`` to ``x``, in place."""
+    rows = x.view(-1, x.shape[-1])
+    size = rows_per_piece(fc1.out_features)
     buffer = rows.new_empty(min(size, len(rows)), fc1.out_features)
-    for piece, target in zip(torch.split(rows, size), torch.split(out, size), strict=True):
-        _add(target, piece, fc2, _hidden(norm(piece), fc1, buffer))
-    return out.view(x.shape)
+    for piece in torch.split(rows, size):
+        _add(piece, fc2, _hidden(norm(piece), fc1, buffer))
+    return x
 
 
 def _hidden(rows: Tensor, layer: nn.Linear, buffer: Tensor) -> Tensor:
@@ -92,6 +90,6 @@ def _into(out: Tensor, layer: nn.Linear, rows: Tensor) -> Tensor:
     return torch.addmm(layer.bias, rows, layer.weight.t(), out=out)
 
 
-def _add(out: Tensor, residual: Tensor, layer: nn.Linear, rows: Tensor) -> Tensor:
-    """Write ``residual + layer(rows)`` to ``out``."""
-    return torch.add(residual, layer.bias, out=out).addmm_(rows, layer.weight.t())
+def _add(out: Tensor, layer: nn.Linear, rows: Tensor) -> None:
+    """Add ``layer(rows)`` to ``out``, in place."""
+    out.add_(layer.bias).addmm_(rows, layer.weight.t())

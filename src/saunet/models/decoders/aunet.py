@@ -84,7 +84,7 @@ class AUNetDecoder(nn.Module):
             # a 1×1 convolution and upsampling commute: narrowing first is cheaper
             x = upsample(self.narrow(x) if level == 0 else x)
             if level in projected:
-                x = x + projected[level]
+                x += projected[level]  # in place: fresh memory of this size costs more than the sum
             x = self.mappings[level](x)
             if level < len(self.heads):
                 maps.append(self.heads[level](x))
@@ -128,4 +128,5 @@ class Mapping(nn.Module):
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """Return the refined map."""
         refined: Tensor = self.mix(F.relu(self.spatial(x), inplace=True))
-        return x + refined
+        refined += x
+        return refined
