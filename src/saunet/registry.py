@@ -1,12 +1,13 @@
 """Components declared once, reachable from Python and from Hydra.
 
 ```python
-@encoders.register("stratified_tiny", dim=96)  # a preset: a name and only what differs
-class StratifiedTransformer(nn.Module): ...
+@encoders.register("stratified_tiny")  # the defaults
+@encoders.register("stratified_small", depths=(2, 2, 18, 2))  # a preset: a name and only what differs
+class StratifiedTransformer(WindowEncoder): ...
 
 
-saunet.build("encoder", "stratified_tiny", drop_path=0.1)  # Python
-# saunet-train model/encoder=stratified_tiny model.encoder.drop_path=0.1   (command line)
+saunet.build("encoder", "stratified_small", drop_path=0.1)  # Python
+# saunet-train model/encoder=stratified_small model.encoder.drop_path=0.1   (command line)
 ```
 """
 

@@ -6,7 +6,7 @@ import torch
 from drives import NumberDrive
 
 from saunet.checks import ConfigError
-from saunet.data.sampling import EvalBatches, ResumableLoader, TrainBatches
+from saunet.data.sampling import EvalBatches, ResumableLoader, TrainBatches, evenly
 from saunet.data.windows import WindowDataset, collate
 
 
@@ -89,3 +89,10 @@ def test_loader_goes_on_where_it_was_saved(workers):
     assert [batch["name"] for batch in again] == whole
     assert len(again) == 4
     assert np.shape(whole) == (4, 2)
+
+
+@pytest.mark.parametrize(
+    ("count", "most", "places"), [(5, 9, [0, 1, 2, 3, 4]), (9, 3, [0, 4, 8]), (7, 1, [0]), (0, 4, [])]
+)
+def test_places_are_spread_evenly_from_first_to_last(count, most, places):
+    assert evenly(count, most) == places

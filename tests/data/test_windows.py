@@ -15,6 +15,7 @@ from saunet.data.windows import (
     draw,
     find_windows,
     fingerprint,
+    reach,
     sample_name,
 )
 
@@ -126,3 +127,8 @@ def test_names_and_fingerprint():
     assert sample_name("2011_09_26/2011_09_26_drive_0001_sync l", 5).endswith("drive_0001_sync 0000000005 l")
     assert sample_name("my clip", 5) == "my clip 0000000005"
     assert fingerprint(["b", "a"]) == fingerprint(["a", "b"]) != fingerprint(["a"])
+
+
+@pytest.mark.parametrize(("offsets", "frames"), [((-1, 1), 2), ((1,), 1), ((-3, -1), 3), ((), 0)])
+def test_reach_of_a_window(offsets, frames):
+    assert reach(offsets) == frames

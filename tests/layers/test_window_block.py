@@ -1,4 +1,4 @@
-"""Swin blocks, merging, stochastic depth and recomputation."""
+"""Swin blocks, merging and recomputation."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from saunet.checks import ConfigError
 from saunet.layers import window_stream
-from saunet.layers.window_block import DropPath, PatchMerging, SwinBlock, SwinStage
+from saunet.layers.window_block import PatchMerging, SwinBlock, SwinStage
 from saunet.layers.window_stream import streams
 
 
@@ -34,21 +33,6 @@ def test_merging_order_is_swins() -> None:
     merge.norm = torch.nn.Identity()  # type: ignore[assignment]
     x = torch.arange(8.0).view(1, 2, 4, 1)  # rows 0 1 2 3 / 4 5 6 7
     assert merge(x)[0, 0].tolist() == [[4.0, 1.0], [6.0, 3.0]]  # (row 1, column 0), (row 0, column 1)
-
-
-def test_drop_path_keeps_the_mean_and_whole_samples() -> None:
-    drop = DropPath(0.25).train()
-    out = drop(torch.ones(4000, 2, 3))
-    per_sample = out.flatten(1)
-    assert ((per_sample == 0).all(1) | (per_sample == 1 / 0.75).all(1)).all()
-    assert abs(out.mean().item() - 1) < 0.05
-    assert torch.equal(drop.eval()(torch.ones(2, 3)), torch.ones(2, 3))
-
-
-@pytest.mark.parametrize("rate", [-0.1, 1.0])
-def test_drop_path_refuses_impossible_rates(rate: float) -> None:
-    with pytest.raises(ConfigError, match="drop_path is"):
-        DropPath(rate)
 
 
 def test_recomputation_gives_the_same_gradients() -> None:

@@ -17,6 +17,7 @@ from saunet.data.boards import Board, BoardView
 from saunet.data.camera_file import MODELS, CameraFile
 from saunet.data.clips import frame_paths
 from saunet.data.lens import Lens
+from saunet.data.sampling import evenly
 from saunet.images import read_image
 from saunet.videos import VideoReader
 
@@ -121,7 +122,7 @@ def _pictures(source: Path, most: int) -> Any:
         paths = frame_paths(source)
         if not paths:
             raise DataError(f"no images in {source}; give a folder of pictures of the board, or a video")
-        for place in np.unique(np.linspace(0, len(paths) - 1, min(most, len(paths))).round().astype(int)):
+        for place in evenly(len(paths), most):
             yield read_image(paths[place]), None, min(most, len(paths))
         return
     with VideoReader(source) as reader:

@@ -24,6 +24,8 @@ DepthKind = Literal["camera_z", "lidar_x", "improved"]
 DEPTH_KINDS = ("camera_z", "lidar_x", "improved")
 CAMERAS = {"left": (2, "l"), "right": (3, "r")}
 """Camera name -> its number on disk and its letter in names."""
+CAMERA_HEIGHT = 1.65
+"""Metres from the road to the cameras."""
 FRAME_SECONDS = 0.1
 """Time between frames: the scanner turns ten times a second and triggers the cameras."""
 

@@ -22,7 +22,7 @@ from saunet.data.depth_maps import DepthMaps
 from saunet.data.image_cache import CachedDrive, ImageCache
 from saunet.data.manifest import read_manifest
 from saunet.data.partners import Odometer
-from saunet.data.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, share
+from saunet.data.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, evenly, share
 from saunet.data.sequences import Drive
 from saunet.data.transforms import Augment, Prepare
 from saunet.data.unreadable import SkippingWindows, readable
@@ -234,9 +234,7 @@ class DepthDataModule(LightningDataModule):
             most: Of more frames, only so many are read, evenly spread.
         """
         dataset = self._set_up(split)
-        windows = dataset.windows
-        chosen = np.linspace(0, len(windows) - 1, min(most, len(windows))).round().astype(int)
-        for position, frame in (windows[place] for place in chosen):
+        for position, frame in (dataset.windows[place] for place in evenly(len(dataset), most)):
             depth = dataset.drives[position].depth(frame)
             if depth is not None:
                 yield torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32))[None]

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from saunet.atomic import write_bytes
 from saunet.checks import DataError
-from saunet.data.static import FLOW_WIDTH, median_flow
+from saunet.data.static import FLOW_WIDTH, MIN_FLOW, median_flow
 from saunet.images import read_image, resize
 
-MIN_FLOW = 0.5
-"""Pixels of median flow, at 320 pixels width, under which a frame counts as static."""
 SAME_PICTURE = 0.01
 """Mean difference over the picture's standard deviation under which two frames are the same picture twice."""
 
@@ -48,8 +46,12 @@ class Motion:
 
 def compare(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> tuple[float, float]:
     """Return the median flow between two RGB images in pixels at 320 width, and their relative difference."""
-    difference = np.abs(before.astype(np.float32) - after).mean()
-    return median_flow(before, after), float(difference / max(1.0, float(after.std())))
+    return median_flow(before, after), relative_change(before, after)
+
+
+def relative_change(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
+    """Return the mean difference of two images over the second's standard deviation."""
+    return float(np.abs(before.astype(np.float32) - after).mean() / max(1.0, float(after.std())))
 
 
 def shrink(image: NDArray[np.uint8], crop: Sequence[float | int] = (0, 0, 0, 0)) -> NDArray[np.uint8]:

@@ -95,6 +95,11 @@ class EvalBatches(DistributedSampler[Any]):
             yield [int(index) for index in part]
 
 
+def evenly(count: int, most: int) -> list[int]:
+    """Return the places of at most ``most`` of ``count`` things, spread evenly from the first to the last."""
+    return [int(place) for place in np.linspace(0, count - 1, min(most, count)).round()]
+
+
 def share(batch_size: int, world_size: int) -> int:
     """Return one device's part of the global batch.
 

@@ -1,4 +1,4 @@
-"""Driving video as sequences of frames, and the windows around each frame that training needs."""
+"""What a recording must offer, so that training, evaluation and preparation can work on any data set."""
 
 from __future__ import annotations
 

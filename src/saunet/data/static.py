@@ -14,6 +14,8 @@ from saunet.data.sequences import Drive
 
 FLOW_WIDTH = 320
 """Images are made this wide before flow is measured, so that thresholds mean the same for every camera."""
+MIN_FLOW = 0.5
+"""Pixels of median flow, at 320 pixels width, under which a frame counts as static."""
 
 
 def oxts_speed(path: Path) -> float:

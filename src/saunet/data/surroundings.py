@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
 import torch
 from lightning.pytorch.utilities import move_data_to_device
 
 from saunet.checks import ConfigError, DataError
 from saunet.data.module import DepthDataModule
 from saunet.data.partners import Odometer
+from saunet.data.sampling import evenly
 from saunet.data.windows import Selection, WindowDataset, collate, find_windows
 from saunet.types import EvalBatch
 
@@ -54,10 +54,9 @@ def surroundings(
             f"no frame of split '{split}' has neighbours at {list(offsets)}{' and a stereo partner' if stereo else ''} "
             f"({'; '.join(map(str, usage[:3]))}); measure the scale in another way"
         )
-    chosen = np.linspace(0, len(windows) - 1, min(most, len(windows))).round().astype(int)
     samples = WindowDataset(
         drives,
-        [windows[place] for place in chosen],
+        [windows[place] for place in evenly(len(windows), most)],
         offsets=offsets,
         height=data.height,
         width=data.width,

@@ -264,6 +264,11 @@ def check_offsets(offsets: Sequence[int]) -> None:
         raise ConfigError(f"offsets are {list(offsets)}; they must be distinct and not 0, such as [-1, 1]")
 
 
+def reach(offsets: Sequence[int]) -> int:
+    """Return how many frames the last frame of a window lies behind its first."""
+    return max((0, *offsets)) - min((0, *offsets))
+
+
 def draw(seed: int) -> torch.Tensor:
     """Return the `DRAWS` uniform random numbers in [0, 1) that belong to a seed."""
     return torch.from_numpy(np.random.default_rng(seed).random(DRAWS, dtype=np.float32))

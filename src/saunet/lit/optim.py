@@ -97,7 +97,7 @@ class Recipe:
             return float(self.gamma ** sum(progress >= milestone for milestone in self.milestones))
         if self.schedule == "cosine":
             done = (progress - self.warmup) / (1 - self.warmup)
-            return 0.5 * (1 + torch.cos(torch.tensor(torch.pi * min(done, 1.0))).item())
+            return 0.5 + 0.5 * math.cos(math.pi * min(done, 1.0))
         return 1.0
 
     def frozen(self, model: nn.Module) -> list[nn.Module]:

@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 
 from saunet.data.doctor.survey import BANDS, Survey
-from saunet.data.motion import MIN_FLOW, SAME_PICTURE
+from saunet.data.motion import SAME_PICTURE
+from saunet.data.static import MIN_FLOW
 
 Level = Literal["error", "warning", "note"]
 
@@ -146,9 +147,9 @@ def _leak(survey: Survey) -> Iterator[Finding]:
 
 
 def _parallax(survey: Survey) -> Iterator[Finding]:
-    flows = np.array([frame.flow for frame in survey.moving() if (frame.flow or 0) >= MIN_FLOW])
+    flows = np.array([frame.flow for frame in survey.compared() if (frame.flow or 0) >= MIN_FLOW])
     if not flows.size:
-        if survey.moving():
+        if survey.compared():
             yield Finding("error", "nothing moves in any frame that was read", "is this a recording of a drive?")
         return
     low, middle, high = np.quantile(flows, [0.05, 0.5, 0.95])
@@ -176,29 +177,29 @@ def _parallax(survey: Survey) -> Iterator[Finding]:
 
 
 def _doubled(survey: Survey) -> Iterator[Finding]:
-    doubled = sum(frame.change is not None and frame.change < SAME_PICTURE for frame in survey.moving())
-    if doubled > 0.02 * len(survey.moving()):
+    doubled = sum(frame.change is not None and frame.change < SAME_PICTURE for frame in survey.compared())
+    if doubled > 0.02 * len(survey.compared()):
         yield Finding(
             "warning",
-            f"{doubled} of {len(survey.moving())} frames are the same picture as their neighbour",
+            f"{doubled} of {len(survey.compared())} frames are the same picture as their neighbour",
             "the video's frame rate was raised: use the original, or data=campus, which drops doubled frames",
         )
 
 
 def _static(survey: Survey) -> Iterator[Finding]:
-    moving = survey.moving()
-    still = sum((frame.flow or 0) < MIN_FLOW for frame in moving)
-    if moving and still > 0.05 * len(moving):
+    compared = survey.compared()
+    still = sum((frame.flow or 0) < MIN_FLOW for frame in compared)
+    if still > 0.05 * len(compared):
         yield Finding(
             "warning",
-            f"{still} of {len(moving)} frames show no motion; they teach nothing",
+            f"{still} of {len(compared)} frames show no motion; they teach nothing",
             "train with data.manifest=<this manifest>, or data.static=flow (kitti) or drop (campus)",
         )
 
 
 def band_profile(survey: Survey) -> np.ndarray | None:
     """Return the motion of each band of the image over that of the whole, from top to bottom; None with few frames."""
-    rows = [f.bands / f.flow for f in survey.moving() if f.bands is not None and f.flow is not None and f.flow > 1]
+    rows = [f.bands / f.flow for f in survey.compared() if f.bands is not None and f.flow is not None and f.flow > 1]
     return np.median(rows, axis=0) if len(rows) >= 5 else None
 
 

@@ -9,7 +9,8 @@ from typing import Any
 from saunet.data.doctor.findings import BRIGHT, DARK, FLAT, Finding
 from saunet.data.doctor.survey import FrameFacts, Survey
 from saunet.data.manifest import UNREADABLE, Manifest
-from saunet.data.motion import MIN_FLOW, SAME_PICTURE
+from saunet.data.motion import SAME_PICTURE
+from saunet.data.static import MIN_FLOW
 
 
 def manifest_of(survey: Survey, findings: Sequence[Finding], path: str | Path) -> Manifest:

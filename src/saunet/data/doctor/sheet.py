@@ -55,7 +55,7 @@ def _frames(survey: Survey) -> list[_Picture]:
 
 
 def _charts(survey: Survey) -> _Picture:
-    flows = np.array([frame.flow for frame in survey.moving()], dtype=np.float64)
+    flows = np.array([frame.flow for frame in survey.compared()], dtype=np.float64)
     light = np.array([frame.brightness for frame in survey.readable()], dtype=np.float64)
     top = max(10.0, float(np.quantile(flows, 0.99)) if flows.size else 0.0)
     step = f"{survey.step} frame{'s' if survey.step > 1 else ''}"

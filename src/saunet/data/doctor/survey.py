@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saunet.checks import DataError, SaunetError
+from saunet.data.manifest import numbering
 from saunet.data.module import DepthDataModule
-from saunet.data.motion import shrink
+from saunet.data.motion import relative_change, shrink
+from saunet.data.sampling import evenly
 from saunet.data.sequences import Drive
 from saunet.data.static import optical_flow
 from saunet.data.windows import WindowDataset
@@ -105,8 +107,8 @@ class Survey:
         """Return the frames that could be read."""
         return [frame for frame in self.frames if frame.problem is None]
 
-    def moving(self) -> list[FrameFacts]:
-        """Return the frames whose motion is known."""
+    def compared(self) -> list[FrameFacts]:
+        """Return the frames whose motion against a neighbour was measured."""
         return [frame for frame in self.readable() if frame.flow is not None]
 
 
@@ -136,7 +138,7 @@ def survey(
             drives[drive.name] = drive
             wanted.setdefault(drive.name, set()).update(frame + offset for offset in (0, *dataset.offsets))
     for name in wanted:
-        found.numbering[name] = str(getattr(drives[name], "numbering", ""))
+        found.numbering[name] = numbering(drives[name])
     plan = _spread([(name, frame) for name, numbers in wanted.items() for frame in sorted(numbers)], frames)
     _read_frames(found, drives, plan, advance)
     for name in wanted:
@@ -177,13 +179,13 @@ def _read_by(dataset: WindowDataset) -> set[tuple[str, int]]:
 def _spread(plan: Sequence[tuple[str, int]], most: int) -> list[tuple[str, int]]:
     if not most or len(plan) <= most:
         return list(plan)
-    return [plan[place] for place in np.linspace(0, len(plan) - 1, most).round().astype(int)]
+    return [plan[place] for place in evenly(len(plan), most)]
 
 
 def _read_frames(
     found: Survey, drives: Mapping[str, Drive], plan: Sequence[tuple[str, int]], advance: Callable[[int, int], None]
 ) -> None:
-    shown = set(np.linspace(0, max(0, len(plan) - 1), _PICTURES).round().astype(int).tolist())
+    shown = set(evenly(len(plan), _PICTURES))
     existing = {name: set(drives[name].indices) for name in {name for name, _ in plan}}
     last: tuple[str, int, NDArray[np.uint8]] | None = None
     for place, (name, index) in enumerate(plan):
@@ -223,7 +225,7 @@ def _facts(
     if before is not None and before.shape == small.shape:
         lengths = np.linalg.norm(optical_flow(before, small), axis=-1)
         flow = float(np.median(lengths))
-        change = float(np.abs(before.astype(np.float32) - small).mean() / max(1.0, float(small.std())))
+        change = relative_change(before, small)
         bands = np.array([band.mean() for band in np.array_split(lengths, BANDS)], dtype=np.float64)
     return FrameFacts(
         drive.name,

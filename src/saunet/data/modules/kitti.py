@@ -11,18 +11,16 @@ from saunet.checks import ConfigError, DataError, in_range, one_of, suggest
 from saunet.data import splits
 from saunet.data.depth_maps import DENSE_KINDS, DepthMaps
 from saunet.data.image_cache import ImageCache
-from saunet.data.kitti import CAMERAS, DEPTH_KINDS, DepthKind, KittiDrive, KittiRaw
+from saunet.data.kitti import CAMERA_HEIGHT, CAMERAS, DEPTH_KINDS, DepthKind, KittiDrive, KittiRaw
 from saunet.data.module import DepthDataModule
 from saunet.data.partners import measured_distance
 from saunet.data.splits import Frame
-from saunet.data.static import static_by_flow
-from saunet.data.windows import Selection
+from saunet.data.static import MIN_FLOW, static_by_flow
+from saunet.data.windows import Selection, reach
 from saunet.registry import datamodules
 
 MIN_SPEED = 0.5
 """Metres a second under which a car counts as standing."""
-MIN_FLOW = 0.5
-"""Pixels of median flow, at 320 pixels width, under which a frame counts as static."""
 _PROTOCOLS = {"camera_z": "eigen_camera_z", "lidar_x": "eigen_lidar_x", "improved": "eigen_improved"}
 
 
@@ -71,8 +69,7 @@ class KittiDataModule(DepthDataModule):
         ConfigError: if a parameter is out of range or a word unknown.
     """
 
-    camera_height = 1.65
-    """Metres from the road to the cameras."""
+    camera_height = CAMERA_HEIGHT
 
     def __init__(
         self,
@@ -194,14 +191,13 @@ class KittiDataModule(DepthDataModule):
         return [str(frame) for frame in self._test(self._raw or KittiRaw(self.root))]
 
     def _training(self, raw: KittiRaw) -> splits.Parts:
-        gap = max(0, *self.offsets) - min(0, *self.offsets) if self.offsets else 0
         if self.split in splits.TRAINING:
             parts = splits.training_split(self.split, self.seed)
         elif self.split != "all" and Path(self.split).is_dir():
             folder = Path(self.split)
             parts = splits.read_split(folder / "train_files.txt"), splits.read_split(folder / "val_files.txt")
         else:
-            frames = self._pool(raw)
+            frames, gap = self._pool(raw), reach(self.offsets)
             parts = (frames, []) if self.val_drives else splits.hold_out(frames, self.val_share, gap, self.seed)
         return splits.hold_out_drives([*parts[0], *parts[1]], self.val_drives) if self.val_drives else parts
 

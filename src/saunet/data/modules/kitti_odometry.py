@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Literal
 
 from saunet.checks import in_range, one_of
+from saunet.data.kitti import CAMERA_HEIGHT
 from saunet.data.module import DepthDataModule
 from saunet.data.odometry import CAMERAS, OdometrySequence, find_root
 from saunet.data.splits import Frame, hold_out_tails
-from saunet.data.windows import Selection
+from saunet.data.windows import Selection, reach
 from saunet.registry import datamodules
 
 
@@ -44,8 +45,7 @@ class KittiOdometryDataModule(DepthDataModule):
     """
 
     neighbours = ("train", "val", "test")
-    camera_height = 1.65
-    """Metres from the road to the cameras."""
+    camera_height = CAMERA_HEIGHT
 
     def __init__(
         self,
@@ -103,8 +103,8 @@ class KittiOdometryDataModule(DepthDataModule):
             frames: Sequence[int] = drive.indices
             left_out = {}
             if split in ("train", "val"):
-                gap = max(0, *self.offsets) - min(0, *self.offsets) if self.offsets else 0
-                parts = hold_out_tails([Frame(name, index, "l") for index in frames], self.val_share, gap)
+                listed = [Frame(name, index, "l") for index in frames]
+                parts = hold_out_tails(listed, self.val_share, gap=reach(self.offsets))
                 if split == "train":
                     left_out = {"between training and validation": len(frames) - len(parts[0]) - len(parts[1])}
                 frames = [frame.number for frame in parts[split == "val"]]

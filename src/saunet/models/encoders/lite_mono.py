@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.checks import ConfigError, in_range
-from saunet.layers.window_block import DropPath
+from saunet.layers.drop_path import DropPath
 from saunet.layers.xca import CrossCovarianceAttention, FourierPosition
 from saunet.registry import encoders
 from saunet.types import FeatureSpec
