@@ -54,7 +54,8 @@ ALLOWED: dict[str, set[str]] = {
         "data.module",
         "losses.base",
     },
-    "benchmarking": {"checks", "atomic"},
+    "published": set(),
+    "benchmarking": {"checks", "atomic", "published"},
     "prepare": {"checks", "atomic", "images", "data", "infer"},
     "scale": {"types", "checks", "geometry", "record", "images"},
     "report": {
@@ -65,6 +66,7 @@ ALLOWED: dict[str, set[str]] = {
         "infer",
         "evaluation",
         "metrics.functional",
+        "published",
         "benchmarking.measure",
     },
     "roots": set(),

@@ -7,7 +7,6 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from rich.table import Table
@@ -15,27 +14,15 @@ from rich.table import Table
 from saunet.atomic import replacing
 from saunet.benchmarking.suite import Measurement
 from saunet.checks import require_matplotlib
+from saunet.published import published
 
-
-class Published(NamedTuple):
-    """What the SAU-Net paper prints about a system."""
-
-    system: str
-    megaparameters: float
-    """Table 2, there in "Mb"."""
-    abs_rel: float
-    """Table 1, KITTI Eigen, 0-80 m."""
-
-
-PUBLISHED: dict[str, Published] = {
-    "mono_r18": Published("Mono R18", 52.7, 0.115),
-    "mono_r50": Published("Mono R50", 68.7, 0.111),
-    "packnet": Published("PackNet", 118.5, 0.111),
-    "sau_net": Published("SAU-Net", 58.8, 0.108),
+PAPER_METHODS: dict[str, str] = {
+    "mono_r18": "Mono R18",
+    "mono_r50": "Mono R50",
+    "packnet": "PackNet",
+    "sau_net": "SAU-Net",
 }
-"""The paper's rows by the names of our models."""
-
-
+"""What the paper calls our models."""
 _MARKERS = "os^Dv<>Pp*hX"
 
 
@@ -46,14 +33,15 @@ def size_table(results: Sequence[Measurement]) -> Table:
         table.add_column(heading, no_wrap=True)
     for heading in ("depth M", "pose M", "total M", "paper M", "GFLOP"):
         table.add_column(heading, justify="right", no_wrap=True)
+    printed = {row.method: row.megaparameters for row in published().table2}
     for row in {(row.model, row.size): row for row in results}.values():
-        published = PUBLISHED.get(row.model)
+        method = PAPER_METHODS.get(row.model)
         counts = (row.depth_parameters, row.pose_parameters, row.total_parameters)
         table.add_row(
             row.model,
             row.size,
             *(f"{count / 1e6:.1f}" for count in counts),
-            f"{published.megaparameters} ({published.system})" if published else "-",
+            f"{printed[method]} ({method})" if method else "-",
             f"{row.flops / 1e9:.1f}",
         )
     return table
@@ -112,7 +100,9 @@ def draw_figure(results: Sequence[Measurement], path: Path, abs_rel: Mapping[str
     require_matplotlib("figure=true needs", "figure=false")
     from matplotlib.figure import Figure
 
-    accuracy = {name: row.abs_rel for name, row in PUBLISHED.items()} | dict(abs_rel or {})
+    printed = {row.method: row.errors[0] for row in published().table1}
+    accuracy = {model: value for model, method in PAPER_METHODS.items() if (value := printed[method]) is not None}
+    accuracy |= abs_rel or {}
     models = list(dict.fromkeys(row.model for row in results))
     settings = list(dict.fromkeys(_setting(row) for row in results))
     known, unknown = ([name for name in models if (name in accuracy) is wanted] for wanted in (True, False))

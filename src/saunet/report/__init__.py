@@ -5,7 +5,6 @@ from __future__ import annotations
 from saunet.report.build import Options, build
 from saunet.report.inputs import Inputs, Sweep, collect
 from saunet.report.output import write
-from saunet.report.published import published
 from saunet.report.runs import Run, Score, read_run
 
-__all__ = ["Inputs", "Options", "Run", "Score", "Sweep", "build", "collect", "published", "read_run", "write"]
+__all__ = ["Inputs", "Options", "Run", "Score", "Sweep", "build", "collect", "read_run", "write"]

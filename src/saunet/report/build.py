@@ -10,11 +10,11 @@ from datetime import datetime, timezone
 
 from saunet import __version__
 from saunet.checks import ConfigError, positive, require_matplotlib
+from saunet.published import published
 from saunet.report import figures, tables
 from saunet.report.document import Document, Figure, Gallery, Missing, Picture, Scene, Section, Table
 from saunet.report.inputs import Inputs
 from saunet.report.models import Seen, look
-from saunet.report.published import published
 from saunet.report.runs import Run
 from saunet.report.scenes import View, read_views, scene
 from saunet.report.settings import differing, labels, sweeps_ratio

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from saunet.checks import DataError
+from saunet.published import published
 from saunet.report.document import Column, Missing, Row, Table
 from saunet.report.files import read_json
-from saunet.report.published import published
 from saunet.report.runs import Run
 from saunet.report.tables import best_score
 

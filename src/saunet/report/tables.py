@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from saunet.published import published
 from saunet.report.document import Cell, Column, Missing, Row, Table
-from saunet.report.published import published
 from saunet.report.runs import Run, Score
 from saunet.report.settings import RATIO, differing, ratio, values
 

@@ -56,7 +56,7 @@ class Published:
 @functools.cache
 def published() -> Published:
     """Return the paper's numbers."""
-    content = json.loads(resources.files("saunet.report").joinpath("published.json").read_text(encoding="utf-8"))
+    content = json.loads(resources.files("saunet").joinpath("published.json").read_text(encoding="utf-8"))
     results = [
         tuple(Result(**{**row, "errors": tuple(row["errors"])}) for row in content[table])
         for table in ("table1", "table3")
