@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from saunet.data.kitti import KittiRaw
-from saunet.evaluation.trajectories import read_kitti
 from saunet.metrics.functional import ERROR_NAMES
+from saunet.trajectories import read_kitti
 
 Tool = Callable[..., Any]
 RAW = ("data=kitti", "data.split=all", "data.cameras=[left]", "data.workers=0", "baselines=false")

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from saunet.evaluation.odometry import Path3d, path_errors, path_of, path_table, write_errors, write_path
 from saunet.evaluation.plot import draw_path
-from saunet.evaluation.trajectories import read_kitti, read_tum
+from saunet.trajectories import read_kitti, read_tum
 
 
 def winding(frames=120, step=2.0):

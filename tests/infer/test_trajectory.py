@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from saunet.checks import CheckpointError, ConfigError, DataError
-from saunet.evaluation.trajectories import read_kitti
 from saunet.images import read_image
 from saunet.infer.trajectory import Odometer, draw_from_above, write_trajectory
 from saunet.record import Scale
+from saunet.trajectories import read_kitti
 
 
 def truth(count: int) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from saunet.data.calibration import read_matrices, zero_based
 from saunet.data.kitti import frame_files
 from saunet.data.partners import distance_between
 from saunet.images import read_image
+from saunet.trajectories import read_kitti
 
 CAMERAS = {"grey_left": (0, "l"), "grey_right": (1, "r"), "colour_left": (2, "l"), "colour_right": (3, "r")}
 """Camera name -> its number on disk and its letter in names."""
@@ -29,7 +30,7 @@ class OdometrySequence:
 
     Raises:
         ConfigError: for an unknown camera.
-        DataError: if the sequence or its calibration is missing or broken.
+        DataError: if the sequence or its calibration is missing or broken, or its file of poses is broken or empty.
     """
 
     def __init__(self, root: Path, sequence: str, camera: str = "colour_left") -> None:
@@ -55,7 +56,7 @@ class OdometrySequence:
         self._T_cam_cam0 = np.eye(4)
         self._T_cam_cam0[:3, 3] = np.linalg.solve(self._K, matrices[key][:, 3])
         poses = root / "poses" / f"{sequence}.txt"
-        self._poses = read_poses(poses) if poses.is_file() else None
+        self._poses = read_kitti(poses) if poses.is_file() else None
         self._times = _read_times(folder / "times.txt")
 
     @property
@@ -138,29 +139,3 @@ def _read_times(path: Path) -> NDArray[np.float64]:
         return np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
     except ValueError as reason:
         raise DataError(f"{path} holds what is no number ({reason}); expected seconds, one a frame") from reason
-
-
-def read_poses(path: Path) -> NDArray[np.float64]:
-    """Read poses of camera 0, n x 4 x 4, T_world_cam: twelve numbers a line.
-
-    Raises:
-        DataError: if a line is malformed: names file, line and what was expected.
-    """
-    rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        words = line.split()
-        if not words:
-            continue
-        try:
-            values = np.array([float(word) for word in words])
-        except ValueError:
-            values = np.empty(0)
-        if values.size != 12 or not np.isfinite(values).all():
-            raise DataError(
-                f"{path}, line {number}: expected 12 finite numbers (a 3 x 4 pose), got '{line.strip()[:60]}'"
-            )
-        rows.append(values)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    if rows:
-        poses[:, :3] = np.stack(rows).reshape(-1, 3, 4)
-    return poses

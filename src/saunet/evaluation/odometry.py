@@ -19,7 +19,6 @@ from rich.table import Table
 
 from saunet.atomic import write_bytes
 from saunet.evaluation.tables import plain_table
-from saunet.evaluation.trajectories import write_kitti, write_tum
 from saunet.metrics.odometry import (
     KITTI_LENGTHS,
     Similarity,
@@ -29,6 +28,7 @@ from saunet.metrics.odometry import (
     snippet_ate,
     trajectory_ate,
 )
+from saunet.trajectories import write_kitti, write_tum
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float64, UInt8
 from torch import Tensor, nn
 
-from saunet.atomic import write_bytes
 from saunet.checks import CheckpointError, ConfigError, DataError
 from saunet.images import network_input, write_image
 from saunet.infer.folder import read_model
 from saunet.metrics.odometry import chain_motions
 from saunet.record import Scale
+from saunet.trajectories import write_kitti
 
 _PAPER, _GRID, _INK, _TRACK, _START, _END = (
     (250, 250, 250), (222, 222, 222), (60, 60, 60), (31, 90, 180), (40, 140, 60), (200, 60, 40),
@@ -122,8 +122,7 @@ def write_trajectory(picture: Path, T_world_cam: Float64[np.ndarray, "n 4 4"], m
     Raises:
         DataError: if the system refuses to write.
     """
-    lines = (" ".join(f"{value:.17g}" for value in pose[:3].ravel()) for pose in T_world_cam)
-    write_bytes(picture.with_suffix(".txt"), ("\n".join(lines) + "\n").encode())
+    write_kitti(picture.with_suffix(".txt"), T_world_cam)
     write_image(picture, draw_from_above(T_world_cam, metric))
 
 

@@ -1,4 +1,4 @@
-"""Trajectories in the two formats that other tools read: KITTI's pose files and TUM's."""
+"""The one reader and writer of trajectories, in the two formats that other tools read: KITTI's pose files and TUM's."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ def read_kitti(path: Path) -> Float64[ndarray, "n 4 4"]:
     """Read camera-to-world poses from a KITTI pose file.
 
     Raises:
-        DataError: if the file is missing, empty, or a line is not twelve numbers.
+        DataError: if the file is missing, holds no pose, or a line is not twelve numbers; names the line.
     """
-    table = _read(path, 12, "a KITTI pose file has 12 numbers a line")
+    table = _read(path, 12, "a 3 x 4 pose, row by row")
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3] = table.reshape(-1, 3, 4)
     return poses
@@ -55,11 +55,11 @@ def read_tum(path: Path) -> tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, " 
     """Read camera-to-world poses and their times from a TUM trajectory.
 
     Raises:
-        DataError: if the file is missing, empty, or a line is not eight numbers with a proper quaternion.
+        DataError: if the file is missing, holds no pose, or a line is not eight numbers with a proper quaternion.
     """
-    table = _read(path, 8, "a TUM trajectory has 8 numbers a line: time x y z qx qy qz qw")
+    table = _read(path, 8, "time x y z qx qy qz qw")
     if not np.linalg.norm(table[:, 4:], axis=1).all():
-        raise DataError(f"'{path}' holds a quaternion of length 0; each must be a rotation")
+        raise DataError(f"{path} holds a quaternion of length 0; each must be a rotation")
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
     poses[:, :3, 3] = table[:, 1:4]
@@ -71,11 +71,12 @@ def _write(path: Path, table: Float64[ndarray, "n k"]) -> None:
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
-def _read(path: Path, columns: int, rule: str) -> Float64[ndarray, "n k"]:
+def _read(path: Path, columns: int, meaning: str) -> Float64[ndarray, "n k"]:
+    expected = f"{columns} finite numbers ({meaning})"
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot read '{path}' as text ({error}); {rule}") from error
+        raise DataError(f"cannot read {path} as text ({error}); expected lines of {expected}") from error
     rows = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
@@ -85,8 +86,8 @@ def _read(path: Path, columns: int, rule: str) -> Float64[ndarray, "n k"]:
         except ValueError:
             row = []
         if len(row) != columns or not np.isfinite(row).all():
-            raise DataError(f"'{path}' line {number} is not {columns} numbers: '{line[:60]}'; {rule}")
+            raise DataError(f"{path}, line {number}: expected {expected}, got '{line.strip()[:60]}'")
         rows.append(row)
     if not rows:
-        raise DataError(f"'{path}' holds no pose; {rule}")
+        raise DataError(f"{path} holds no pose; expected lines of {expected}; copy the file again")
     return np.array(rows, dtype=np.float64)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from saunet.checks import DataError
-from saunet.evaluation.trajectories import read_kitti, read_tum, write_kitti, write_tum
+from saunet.trajectories import read_kitti, read_tum, write_kitti, write_tum
 
 
 def poses(n=5):
@@ -55,10 +55,11 @@ def test_real_poses(kitti_mini):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "holds no pose"),
-        ("1 2 3\n", "line 1 is not 12 numbers: '1 2 3'"),
-        ("# comment\n" + " ".join(["x"] * 12), "line 2 is not 12 numbers"),
-        (" ".join(["nan"] * 12), "line 1 is not 12 numbers"),
+        ("", r"poses.txt holds no pose; expected lines of 12 finite numbers \(a 3 x 4 pose, row by row\)"),
+        ("# only a comment\n\n", "holds no pose"),
+        ("1 2 3\n", r"poses.txt, line 1: expected 12 finite numbers \(a 3 x 4 pose, row by row\), got '1 2 3'"),
+        ("# comment\n" + " ".join(["x"] * 12), "line 2: expected 12 finite numbers"),
+        (" ".join(["nan"] * 12), "line 1: expected 12 finite numbers"),
     ],
 )
 def test_broken_kitti_files(tmp_path, text, message):
@@ -71,6 +72,12 @@ def test_broken_kitti_files(tmp_path, text, message):
 def test_other_bad_input(tmp_path):
     with pytest.raises(DataError, match="cannot read"):
         read_kitti(tmp_path / "missing")
+    (tmp_path / "picture").write_bytes(b"\x89PNG\xff")
+    with pytest.raises(DataError, match=r"cannot read .*picture as text"):
+        read_kitti(tmp_path / "picture")
+    (tmp_path / "short").write_text("0 1 2 3 0 0 0 1\n1 2 3\n")
+    with pytest.raises(DataError, match=r"line 2: expected 8 finite numbers \(time x y z qx qy qz qw\), got '1 2 3'"):
+        read_tum(tmp_path / "short")
     with pytest.raises(DataError, match="5 poses come with 4 times"):
         write_tum(tmp_path / "t", poses(), np.arange(4.0))
     (tmp_path / "zero").write_text("0 1 2 3 0 0 0 0\n")
