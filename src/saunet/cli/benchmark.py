@@ -28,10 +28,10 @@ def benchmark(cfg: DictConfig) -> None:
     from hydra import compose
     from hydra.core.hydra_config import HydraConfig
     from rich.console import Console
-    from rich.progress import Progress
 
     from saunet.benchmarking import Plan, run_suite
     from saunet.benchmarking.report import draw_figure, size_table, speed_table, write_json
+    from saunet.progress import bar
 
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
@@ -48,10 +48,10 @@ def benchmark(cfg: DictConfig) -> None:
         models = {name: build(compose("benchmark", overrides=[f"model={name}"]).model) for name in cfg.models}
     else:
         models = {HydraConfig.get().runtime.choices["model"]: build(cfg.model)}
-    with Progress(transient=True) as bar:
-        task = bar.add_task("")
+    with bar() as shown:
+        task = shown.add_task("")
         results = run_suite(
-            models, plan, lambda text, done, total: bar.update(task, description=text, completed=done, total=total)
+            models, plan, lambda text, done, total: shown.update(task, description=text, completed=done, total=total)
         )
     console = Console()
     console = console if console.is_terminal else Console(width=160)

@@ -13,13 +13,11 @@ from saunet.cli._app import run
 
 def calibrate(cfg: DictConfig) -> None:
     """Print a board, or find one, solve for the camera, say how good that is, and write ``camera.yaml``."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
     from saunet.data.boards import Board
     from saunet.data.calibrate import calibrate, check_picture
     from saunet.data.camera_file import write_camera
     from saunet.images import write_image
+    from saunet.progress import bar
 
     board = Board(cfg.board, cfg.columns, cfg.rows, cfg.square, cfg.marker, cfg.dictionary)
     if cfg.print_board:
@@ -32,17 +30,15 @@ def calibrate(cfg: DictConfig) -> None:
     if output.exists() and not cfg.overwrite:
         raise ConfigError(f"{output} exists; choose another output, or set overwrite=true")
     height = None if cfg.camera_height is None else float(positive("camera_height", cfg.camera_height))
-    console = Console(stderr=True)
-    columns = (TextColumn("looking for the board"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("", total=None)
+    with bar() as shown:
+        task = shown.add_task("looking for the board", total=None)
         result = calibrate(
             cfg.input,
             board,
             model=cfg.model,
             views=cfg.views,
             max_error=cfg.max_error,
-            advance=lambda done, total: bar.update(task, completed=done, total=total),
+            advance=lambda done, total: shown.update(task, completed=done, total=total),
         )
     camera = replace(result.camera, camera_height=height, condition=cfg.condition)
     note = f"from {len(result.views)} views of a {board} in {Path(cfg.input).name}"

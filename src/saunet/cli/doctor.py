@@ -14,25 +14,22 @@ from saunet.cli._app import run
 def doctor(cfg: DictConfig) -> None:
     """Look, print what was found with what to do about it, and write ``doctor.png`` and ``manifest.json``."""
     from hydra.core.hydra_config import HydraConfig
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from saunet.data.doctor import diagnose, draw_sheet, manifest_of, survey
     from saunet.data.doctor.survey import SPLITS
     from saunet.data.manifest import write_manifest
     from saunet.images import write_image
+    from saunet.progress import bar
     from saunet.registry import instantiate
 
     for split in cfg.splits:
         one_of("splits", split, SPLITS)
     positive("frames", cfg.frames, allow_zero=True)
     data = instantiate(config.plain(cfg.data))
-    columns = (TextColumn("reading frames"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("", total=None)
+    with bar() as shown:
+        task = shown.add_task("reading frames", total=None)
         found = survey(
-            data, list(cfg.splits), cfg.frames, lambda done, total: bar.update(task, completed=done, total=total)
+            data, list(cfg.splits), cfg.frames, lambda done, total: shown.update(task, completed=done, total=total)
         )
     findings = diagnose(found)
     folder = Path(cfg.output_dir)

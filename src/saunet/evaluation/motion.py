@@ -13,9 +13,9 @@ from numpy import ndarray
 from torch import nn
 
 from saunet.checks import ConfigError, DataError, positive
-from saunet.evaluation.progress import bar
 from saunet.images import network_input
 from saunet.metrics.odometry import chain_motions
+from saunet.progress import bar
 
 
 class Step(NamedTuple):
@@ -110,7 +110,7 @@ def predict_trajectory(
 
     motions: dict[tuple[int, int], Float64[ndarray, "4 4"]] = {}
     pose.eval()
-    with bar(progress) as shown:
+    with bar(progress, "images", taken=True) as shown:
         task = shown.add_task(drive.name, total=len(targets))
         for start in range(0, len(targets), batch_size):
             chosen = targets[start : start + batch_size]

@@ -10,11 +10,11 @@ from torch import Tensor, nn
 
 from saunet.checks import ConfigError, DataError, one_of
 from saunet.evaluation.breakdown import Buckets, BucketSums
-from saunet.evaluation.progress import bar
 from saunet.evaluation.result import EvaluationResult, ImageRow
 from saunet.metrics.depth import native_depths
 from saunet.metrics.functional import flip_blend
 from saunet.metrics.protocols import GROUND_TRUTHS, Protocol, sample_errors, sample_image
+from saunet.progress import bar
 from saunet.types import DepthPyramid, EvalBatch
 
 Predictor = Callable[[EvalBatch], Tensor]
@@ -79,7 +79,7 @@ def evaluate(
     _check_request(predictors, protocols, ground_truth)
     rows: list[ImageRow] = []
     sums = {(p, q.name): BucketSums(buckets) for p in predictors for q in protocols} if buckets else {}
-    with bar(progress) as shown:
+    with bar(progress, "images", taken=True) as shown:
         task = shown.add_task("evaluate", total=total)
         for batch in batches:
             rows += _score_batch(predictors, batch, protocols, sums, buckets)

@@ -11,13 +11,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.checks import ConfigError, DataError
-from saunet.evaluation.progress import bar
 from saunet.evaluation.result import EvaluationResult, ViewRow
 from saunet.evaluation.runner import Predictor
 from saunet.geometry.depth import disparity_to_depth
 from saunet.geometry.warp import synthesize
 from saunet.losses.functional import automask, combine_sources, photometric_error
 from saunet.metrics.protocols import Protocol
+from saunet.progress import bar
 from saunet.types import EvalBatch
 
 Motion: TypeAlias = Callable[[EvalBatch], Tensor]
@@ -74,7 +74,7 @@ def evaluate_views(
             "score it with `evaluate`, or choose one that needs none, such as campus"
         )
     rows: list[ViewRow] = []
-    with bar(progress) as shown:
+    with bar(progress, "images", taken=True) as shown:
         task = shown.add_task(protocol.name, total=total)
         for batch in batches:
             if batch["sources"].shape[1] == 0:

@@ -21,9 +21,9 @@ from saunet.infer import exporters
 from saunet.infer.card import model_card
 from saunet.infer.folder import CONFIG, WEIGHTS, read_model, restored
 from saunet.infer.parity import Parity, Run, compare
-from saunet.infer.progress import bar
 from saunet.infer.sources import image_paths
 from saunet.models.depth import DepthNet
+from saunet.progress import bar
 from saunet.record import ModelRecord
 
 FORMATS: tuple[str, ...] = ("onnx", "program", "compiled", "safetensors")

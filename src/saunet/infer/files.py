@@ -17,8 +17,8 @@ from saunet.infer.colour import PALETTES, depth_to_png16
 from saunet.infer.pipeline import ImagePredictor
 from saunet.infer.pointcloud import Camera, point_cloud, write_ply
 from saunet.infer.prediction import Prediction
-from saunet.infer.progress import bar
 from saunet.infer.sources import Source, find_sources
+from saunet.progress import bar
 
 OUTPUTS: tuple[str, ...] = ("colour", "png16", "npy", "ply")
 """What can be written for each image: disparity in colours, depth as 16-bit PNG (x 256) or float32 array, points."""

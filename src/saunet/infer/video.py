@@ -15,8 +15,8 @@ from saunet.infer.colour import PALETTES, RunningRange
 from saunet.infer.files import OUTPUTS, Style
 from saunet.infer.pipeline import ImagePredictor
 from saunet.infer.pointcloud import Camera
-from saunet.infer.progress import bar
 from saunet.infer.sinks import LAYOUTS, FrameSink, Sink, TrajectorySink, VideoSink, ViewerSink, compose
+from saunet.progress import bar
 
 if TYPE_CHECKING:
     from saunet.infer.trajectory import Odometer

@@ -15,7 +15,7 @@ import cv2
 import torch
 
 from saunet.checks import DataError, one_of, positive
-from saunet.infer.progress import bar
+from saunet.progress import bar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

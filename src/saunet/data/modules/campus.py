@@ -7,8 +7,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Literal
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from saunet.checks import ConfigError, DataError, in_range, one_of, positive
 from saunet.data.camera_file import check_crop
@@ -17,7 +16,8 @@ from saunet.data.clips import Clip, default_cache, find_clips, read_clip
 from saunet.data.module import DepthDataModule
 from saunet.data.motion import measure
 from saunet.data.splits import Frame, hold_out
-from saunet.data.windows import Selection
+from saunet.data.windows import Selection, reach
+from saunet.progress import bar
 from saunet.registry import datamodules
 
 
@@ -136,8 +136,8 @@ class CampusDataModule(DepthDataModule):
                 for condition in self.conditions:
                     one_of("conditions", condition, found)
                 clips = [clip for clip in clips if clip.camera.condition in self.conditions]
-            with _bar(self._place()[0] == 0) as bar:
-                self._drives = [self._drive(clip, bar) for clip in clips]
+            with bar(self._place()[0] == 0) as shown:
+                self._drives = [self._drive(clip, shown) for clip in clips]
         return self._drives
 
     @property
@@ -163,8 +163,7 @@ class CampusDataModule(DepthDataModule):
         if named:
             train, val = frames, [Frame(name, index, "l") for name in named for index in drives[name].indices]
         else:
-            gap = max(0, *self.offsets) - min(0, *self.offsets) if self.offsets else 0
-            train, val = hold_out(frames, self.val_share, gap, self.seed)
+            train, val = hold_out(frames, self.val_share, reach(self.offsets), self.seed)
         if split in ("train", "val"):
             chosen = train if split == "train" else val
         else:
@@ -191,28 +190,28 @@ class CampusDataModule(DepthDataModule):
             selections.append(Selection(drive, wanted, left_out))
         return selections
 
-    def _drive(self, clip: Clip, bar: Progress) -> CampusDrive:
-        task = bar.add_task(f"decoding {clip.path.name}", total=None, visible=clip.is_video)
+    def _drive(self, clip: Clip, shown: Progress) -> CampusDrive:
+        task = shown.add_task(f"decoding {clip.path.name}", total=None, visible=clip.is_video)
         recording = read_clip(
             clip,
             self.fps,
             self.frames_cache,
             self.max_width,
-            lambda done, total: bar.update(task, completed=done, total=total),
+            lambda done, total: shown.update(task, completed=done, total=total),
         )
-        bar.update(task, visible=False)
+        shown.update(task, visible=False)
         crop = clip.camera.crop if self.crop is None else self.crop
         motion = None
         if self.static == "drop" or self.parallax > 0:
-            task = bar.add_task(f"measuring motion of {clip.path.name}", total=len(recording.paths))
+            task = shown.add_task(f"measuring motion of {clip.path.name}", total=len(recording.paths))
             motion = measure(
                 recording.paths,
                 crop,
                 skip_unreadable=self.on_error == "skip",
                 cache=self.frames_cache,
-                advance=lambda: bar.advance(task),
+                advance=lambda: shown.advance(task),
             )
-            bar.update(task, visible=False)
+            shown.update(task, visible=False)
         settings = f"fps={self.fps} parallax={self.parallax} static={self.static}"
         return CampusDrive(clip, recording, self.crop, motion, self.parallax, settings)
 
@@ -225,9 +224,3 @@ def _matching(patterns: Sequence[str], names: Sequence[str], what: str) -> list[
             raise ConfigError(f"{what} names '{pattern}', which fits no clip; clips: {', '.join(names[:20]) or 'none'}")
         found.update(dict.fromkeys(fitting))
     return list(found)
-
-
-def _bar(show: bool) -> Progress:
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console, disable=not (show and console.is_terminal), transient=True)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import Progress
-
 from saunet.checks import ConfigError, positive
 from saunet.data.module import DepthDataModule
 from saunet.data.synthetic import SyntheticDrive
 from saunet.data.windows import Selection
+from saunet.progress import bar
 from saunet.registry import datamodules
 
 _SEEDS_A_SPLIT = 10_000
@@ -133,8 +131,7 @@ class SyntheticDataModule(DepthDataModule):
 
 def _render(drives: Sequence[SyntheticDrive], split: str, show: bool) -> None:
     """Render before loading starts: loader processes then share the frames."""
-    console = Console(stderr=True)
-    with Progress(console=console, disable=not (show and console.is_terminal), transient=True) as progress:
-        task = progress.add_task(f"rendering {split} drives", total=sum(len(d.indices) for d in drives))
+    with bar(show) as shown:
+        task = shown.add_task(f"rendering {split} drives", total=sum(len(d.indices) for d in drives))
         for drive in drives:
-            drive.render(lambda: progress.advance(task))
+            drive.render(lambda: shown.advance(task))

@@ -1,0 +1,32 @@
+"""The one progress bar: on standard error, on a terminal only, gone when the work is done."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+
+def bar(show: bool = True, unit: str = "", taken: bool = False) -> Progress:
+    """Return a progress bar with counts and the time left; silent without a terminal.
+
+    Args:
+        show: False keeps it silent on a terminal too.
+        unit: What is counted, such as ``images``.
+        taken: Show the time taken so far too.
+    """
+    console = Console(stderr=True)
+    columns: list[ProgressColumn] = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
+    if unit:
+        columns.append(TextColumn(unit))
+    if taken:
+        columns.append(TimeElapsedColumn())
+    columns.append(TimeRemainingColumn())
+    return Progress(*columns, console=console, disable=not (show and console.is_terminal), transient=True)
