@@ -14,9 +14,9 @@ from rich.console import Console
 
 from saunet.checks import ConfigError, DataError
 from saunet.evaluation.result import EvaluationResult, ImageRow, summarise
-from saunet.evaluation.tables import HEADINGS, print_table
+from saunet.evaluation.tables import print_table
 from saunet.evaluation.writers import as_json, markdown, read_rows, write_results
-from saunet.metrics.functional import ERROR_NAMES
+from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
 from saunet.metrics.protocols import protocol
 
 NAN = (math.nan,) * 7
@@ -89,7 +89,7 @@ def test_terminal_table_is_whole_on_a_narrow_terminal(width):
     assert "0.200" in text
     assert "3 ± 0.82" in text
     assert "3 images; 1 more without a ground-truth pixel" in text
-    words = [heading.split()[-2:] for heading in HEADINGS]
+    words = [heading.split()[-2:] for heading in ERROR_HEADINGS]
     assert all(word in text for pair in words for word in pair)
 
 
@@ -105,7 +105,7 @@ def test_best_value_is_bold():
 
 def test_markdown():
     lines = markdown(result(protocols=("metric",))).splitlines()
-    assert lines[2] == f"| predictor | {' | '.join(HEADINGS)} |"
+    assert lines[2] == f"| predictor | {' | '.join(ERROR_HEADINGS)} |"
     assert lines[4] == "| model | 0.200 | 0.201 | 0.202 | 0.203 | 0.204 | 0.205 | 0.206 |"
 
 

@@ -12,11 +12,9 @@ from rich.table import Table
 from saunet.evaluation.breakdown import BucketRow
 from saunet.evaluation.result import Comparison, EvaluationResult, Spread, Summary, ViewRow
 from saunet.evaluation.views import summarise_views
-from saunet.metrics.functional import HIGHER_IS_BETTER
+from saunet.metrics.functional import ERROR_HEADINGS, HIGHER_IS_BETTER
 from saunet.metrics.protocols import Protocol
 
-HEADINGS: tuple[str, ...] = ("Abs Rel ↓", "Sq Rel ↓", "RMSE ↓", "RMSE log ↓", "δ1 ↑", "δ2 ↑", "δ3 ↑")
-"""Column headings in the order of `ERROR_NAMES`; the arrow points to better."""
 VIEW_HEADINGS: tuple[str, ...] = ("warped ↓", "unwarped", "explained ↑", "visible")
 """Column headings of what is measured without ground truth."""
 
@@ -103,7 +101,7 @@ def comparison_table(comparison: Comparison) -> Table:
     table.add_column("error", min_width=10)
     for heading in ("before", "now", "difference", f"{comparison.level:.0%} interval", "better on", "p"):
         table.add_column(heading, justify="right", no_wrap=True)
-    for heading, row, up in zip(HEADINGS, comparison.differences, HIGHER_IS_BETTER, strict=True):
+    for heading, row, up in zip(ERROR_HEADINGS, comparison.differences, HIGHER_IS_BETTER, strict=True):
         sure = row.low > 0 or row.high < 0
         difference = f"{row.difference:+.4f}"
         if sure:
@@ -134,7 +132,7 @@ def _error_table(title: str, first: str, last: str) -> Table:
     """An empty table that fits a terminal of 80 columns: headings on two lines, no vertical rules."""
     table = plain_table(title)
     table.add_column(first, min_width=9)
-    for heading in HEADINGS:
+    for heading in ERROR_HEADINGS:
         name, arrow = heading.rsplit(" ", 1)
         table.add_column(f"{name.replace(' ', chr(10))} {arrow}", justify="right", no_wrap=True, min_width=6)
     table.add_column(last, justify="right", no_wrap=True)

@@ -14,9 +14,9 @@ from typing import TextIO
 from saunet.atomic import replacing
 from saunet.checks import DataError
 from saunet.evaluation.result import Comparison, EvaluationResult, ImageRow, Spread, Summary
-from saunet.evaluation.tables import HEADINGS, VIEW_HEADINGS, images_note, spread_note
+from saunet.evaluation.tables import VIEW_HEADINGS, images_note, spread_note
 from saunet.evaluation.views import summarise_views
-from saunet.metrics.functional import ERROR_NAMES
+from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
 
 _ROW_FIELDS = ("predictor", "protocol", "name", "pixels", "scale", *ERROR_NAMES)
 _SUMMARY_FIELDS = (
@@ -42,7 +42,7 @@ def markdown(result: EvaluationResult) -> str:
         if mine:
             found = [spreads[s.predictor, s.protocol] for s in mine if (s.predictor, s.protocol) in spreads]
             note = "; ".join([images_note(mine[0]), *(spread_note(spread) for spread in found[:1])])
-            table = [f"**{protocol.name}**: {protocol.summary} ({note})", "", *_header("predictor", *HEADINGS)]
+            table = [f"**{protocol.name}**: {protocol.summary} ({note})", "", *_header("predictor", *ERROR_HEADINGS)]
             for summary in mine:
                 table.append(_line(summary.predictor, *(f"{value:.3f}" for value in summary.errors)))
                 spread = spreads.get((summary.predictor, summary.protocol))
@@ -59,7 +59,7 @@ def markdown(result: EvaluationResult) -> str:
         columns = ("error", "before", "now", "difference", "interval", "better on", "p")
         title = f"**{comparison.protocol}**: '{comparison.second}' against '{comparison.first}'"
         table = [f"{title} ({comparison.images} images, paired)", "", *_header(*columns)]
-        for heading, row in zip(HEADINGS, comparison.differences, strict=True):
+        for heading, row in zip(ERROR_HEADINGS, comparison.differences, strict=True):
             numbers = (f"{row.first:.4f}", f"{row.second:.4f}", f"{row.difference:+.4f}")
             interval = f"{row.low:+.4f} to {row.high:+.4f}"
             table.append(_line(heading, *numbers, interval, f"{row.better:.0%}", f"{row.p_value:.2g}"))

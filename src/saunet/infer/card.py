@@ -9,10 +9,8 @@ from typing import Any
 
 from saunet.infer.parity import Parity
 from saunet.infer.prediction import unit_of
+from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
 from saunet.record import ModelRecord
-
-_ERRORS = {"abs_rel": "Abs Rel ↓", "sq_rel": "Sq Rel ↓", "rmse": "RMSE ↓", "rmse_log": "RMSE log ↓"}
-_ERRORS |= {"a1": "δ1 ↑", "a2": "δ2 ↑", "a3": "δ3 ↑"}
 
 
 def model_card(
@@ -116,11 +114,11 @@ def _quality(metrics: Mapping[str, Any] | None) -> list[str]:
     if metrics is None:
         return ["No evaluation was given when this was exported (`evaluation=` the folder of a saunet-evaluate run)."]
     return [
-        f"| predictor | protocol | {' | '.join(_ERRORS.values())} | images |",
-        f"|---|---|{'---:|' * (len(_ERRORS) + 1)}",
+        f"| predictor | protocol | {' | '.join(ERROR_HEADINGS)} | images |",
+        f"|---|---|{'---:|' * (len(ERROR_HEADINGS) + 1)}",
         *(
             f"| {row['predictor']} | {row.get('protocol', '')} "
-            f"| {' | '.join(_number(row.get(key)) for key in _ERRORS)} | {row.get('images', '')} |"
+            f"| {' | '.join(_number(row.get(key)) for key in ERROR_NAMES)} | {row.get('images', '')} |"
             for row in metrics["results"]
         ),
     ]

@@ -10,6 +10,8 @@ ABS_REL, SQ_REL, RMSE, RMSE_LOG, A1, A2, A3 = range(7)
 """Positions in the vector that `depth_errors` returns."""
 ERROR_NAMES: tuple[str, ...] = ("abs_rel", "sq_rel", "rmse", "rmse_log", "a1", "a2", "a3")
 """The seven depth errors in the field's column order."""
+ERROR_HEADINGS: tuple[str, ...] = ("Abs Rel ↓", "Sq Rel ↓", "RMSE ↓", "RMSE log ↓", "δ1 ↑", "δ2 ↑", "δ3 ↑")
+"""Column headings of `ERROR_NAMES`; the arrow points to better."""
 HIGHER_IS_BETTER: tuple[bool, ...] = (False, False, False, False, True, True, True)
 """Which of `ERROR_NAMES` grow with quality."""
 
