@@ -158,12 +158,13 @@ def test_broken_files_of_a_folder(tmp_path):
     with pytest.raises(DataError, match="holds no prediction"):
         ForeignFolder(tmp_path)
     path = tmp_path / "0000.png"
-    for data in (b"", b"junk"):
+    whole = cv2.imencode(".png", np.full((6, 10), 2560, np.uint16))[1].tobytes()
+    for data, message in ((b"", "is empty"), (b"junk", "is not an image"), (whole[:-12], "is truncated")):
         path.write_bytes(data)
-        with pytest.raises(DataError, match="not a 16-bit grey PNG"):
+        with pytest.raises(DataError, match=rf"0000\.png {message}"):
             read_all(tmp_path)
     cv2.imwrite(str(path), np.full((6, 10), 200, np.uint8))
-    with pytest.raises(DataError, match="not a 16-bit grey PNG"):
+    with pytest.raises(DataError, match="a depth map is one channel of 16-bit numbers"):
         read_all(tmp_path)
     cv2.imwrite(str(path), np.zeros((6, 10), np.uint16))
     with pytest.raises(DataError, match="pixels without depth"):

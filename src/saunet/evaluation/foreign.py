@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -15,6 +14,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from saunet.checks import DataError, one_of
+from saunet.images import read_depth
 from saunet.types import EvalBatch
 
 SUFFIXES: tuple[str, ...] = (".npy", ".png")
@@ -109,11 +109,7 @@ class ForeignFolder:
 
     def _read(self, file: Path) -> Float[Tensor, "1 h w"]:
         if file.suffix.lower() == ".png":
-            data = np.fromfile(file, dtype=np.uint8)
-            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-            if image is None or image.dtype != np.uint16 or image.ndim != 2:
-                raise DataError(f"'{file}' is not a 16-bit grey PNG; it must hold depth x 256")
-            return _disparity(image.astype(np.float32) / 256, "depth", file)
+            return _disparity(read_depth(file), "depth", file)
         array = np.squeeze(np.array(_load_array(file), dtype=np.float32))
         if array.ndim != 2:
             raise DataError(f"'{file}' holds shape {array.shape}; a prediction is height x width")
