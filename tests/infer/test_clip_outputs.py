@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from saunet.checks import ConfigError, DataError
 from saunet.images import read_image, write_image
-from saunet.infer.clips import VideoReader, VideoWriter
+from saunet.infer.clips import VideoWriter
 from saunet.infer.colour import RunningRange, colourise
 from saunet.infer.predictor import Predictor
 from saunet.infer.trajectory import Odometer
 from saunet.infer.video import predict_clip
+from saunet.videos import VideoReader
 
 Picture = NDArray[np.uint8]
 ALL = ("mp4", "colour", "png16", "npy", "ply", "html", "trajectory")

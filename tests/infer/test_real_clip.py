@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from saunet.images import read_depth, read_image
-from saunet.infer.clips import VideoReader, VideoWriter
+from saunet.infer.clips import VideoWriter
 from saunet.infer.trajectory import Odometer
 from saunet.infer.video import predict_clip
 from saunet.models.depth import DepthNet
+from saunet.videos import VideoReader
 
 DRIVE = Path("raw") / "2011_09_26" / "2011_09_26_drive_9005_sync" / "image_02" / "data"
 CAMERA = (721.5377, 721.5377, 608.5593, 171.854)

@@ -16,9 +16,12 @@ from numpy.typing import NDArray
 
 from saunet.checks import ConfigError, DataError
 from saunet.images import write_image
-from saunet.infer.clips import VideoReader, VideoWriter, open_clip
+from saunet.infer.clips import VideoWriter, open_clip
+from saunet.infer.colour import RunningRange
 from saunet.infer.predictor import Predictor
-from saunet.infer.video import RunningRange, compose, render_video
+from saunet.infer.sinks import compose
+from saunet.infer.video import render_video
+from saunet.videos import VideoReader
 
 Picture = NDArray[np.uint8]
 
@@ -230,7 +233,7 @@ class TestUnfinished:
         code = (
             "import resource, signal, sys, numpy as np\n"
             "from saunet.checks import DataError\n"
-            "from saunet.infer.video import VideoWriter\n"
+            "from saunet.infer.clips import VideoWriter\n"
             "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
             "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
             "noise = np.random.default_rng(0)\n"

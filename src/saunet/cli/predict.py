@@ -18,7 +18,8 @@ def predict(cfg: DictConfig) -> None:
     from saunet.cli._scale import scale_predictor
     from saunet.infer.files import OUTPUTS
     from saunet.infer.load import load
-    from saunet.infer.video import CLIP_OUTPUTS, VIDEO_SUFFIXES
+    from saunet.infer.video import CLIP_OUTPUTS
+    from saunet.videos import VIDEO_SUFFIXES
 
     is_camera = cfg.input.isdecimal() and not Path(cfg.input).exists()
     source = int(cfg.input) if is_camera else cfg.input

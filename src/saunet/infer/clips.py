@@ -15,9 +15,7 @@ from saunet.atomic import replacing
 from saunet.checks import DataError, one_of, positive
 from saunet.images import IMAGE_SUFFIXES, read_image
 from saunet.infer.sources import find_sources, image_paths
-from saunet.videos import VIDEO_SUFFIXES, VideoReader
-
-__all__ = ["VIDEO_SUFFIXES", "ArrayClip", "Clip", "ImageClip", "Source", "VideoReader", "VideoWriter", "open_clip"]
+from saunet.videos import VideoReader
 
 
 class VideoWriter:

@@ -10,30 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saunet.checks import ConfigError, one_of, positive
-from saunet.infer.clips import VIDEO_SUFFIXES, Clip, Source, VideoReader, VideoWriter, open_clip
+from saunet.infer.clips import Clip, Source, open_clip
 from saunet.infer.colour import PALETTES, RunningRange
 from saunet.infer.files import OUTPUTS, Style
 from saunet.infer.pipeline import ImagePredictor
 from saunet.infer.pointcloud import Camera
-from saunet.infer.sinks import LAYOUTS, FrameSink, Sink, TrajectorySink, VideoSink, ViewerSink, compose
+from saunet.infer.sinks import LAYOUTS, FrameSink, Sink, TrajectorySink, VideoSink, ViewerSink
 from saunet.progress import bar
 
 if TYPE_CHECKING:
     from saunet.infer.trajectory import Odometer
-
-__all__ = [
-    "CLIP_OUTPUTS",
-    "LAYOUTS",
-    "VIDEO_SUFFIXES",
-    "ClipSummary",
-    "RunningRange",
-    "VideoReader",
-    "VideoSummary",
-    "VideoWriter",
-    "compose",
-    "predict_clip",
-    "render_video",
-]
 
 CLIP_OUTPUTS: tuple[str, ...] = ("mp4", "html", "trajectory")
 """What can be written for a clip as a whole, besides `saunet.infer.files.OUTPUTS` for each of its frames."""
