@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -54,3 +55,23 @@ def write_bytes(path: str | Path, data: bytes, error: type[SaunetError] = DataEr
     """
     with replacing(path, error) as temporary:
         temporary.write_bytes(data)
+
+
+def write_json(path: str | Path, content: object, error: type[SaunetError] = DataError, indent: int | None = 2) -> None:
+    """Write plain data to ``path`` as JSON in UTF-8, whole or not at all.
+
+    Args:
+        path: The file to write.
+        content: Dictionaries, lists, text, numbers, booleans and None.
+        error: What to raise when it cannot be written.
+        indent: Spaces a level; None puts everything on one line.
+
+    Raises:
+        SaunetError: of class ``error``, if the system refuses, or a number is NaN or infinite, which JSON cannot say.
+    """
+    try:
+        text = json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=False)
+    except ValueError as reason:
+        raise error(f"cannot write {path}: {reason}; JSON has finite numbers only") from reason
+    # Names of files may hold bytes that are not UTF-8, surrogates in Python: these become JSON's own \u escapes.
+    write_bytes(path, f"{text}\n".encode(errors="backslashreplace"), error)

@@ -14,7 +14,7 @@ from rich.console import Console
 from torch import nn
 
 from saunet.benchmarking import Measurement, Networks, Plan, run_suite
-from saunet.benchmarking.report import draw_figure, size_table, speed_table, write_json
+from saunet.benchmarking.report import draw_figure, size_table, speed_table, write_measurements
 from saunet.checks import ConfigError
 from saunet.models.depth import DepthNet
 from saunet.published import published
@@ -85,7 +85,7 @@ def test_tables_stand_beside_the_paper(results: list[Measurement]) -> None:
 
 
 def test_json_has_everything(results: list[Measurement], tmp_path: Path) -> None:
-    write_json(results, tmp_path / "out" / "benchmark.json")
+    write_measurements(results, tmp_path / "out" / "benchmark.json")
     content = json.loads((tmp_path / "out" / "benchmark.json").read_text())
     assert content["machine"]["torch"] == torch.__version__
     assert [Measurement(**row) for row in content["results"]] == results

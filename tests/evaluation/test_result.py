@@ -8,6 +8,7 @@ import io
 import json
 import math
 import os
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -134,10 +135,12 @@ def test_json_has_no_nan():
 def test_nothing_is_left_behind_when_writing_fails(tmp_path, monkeypatch):
     (tmp_path / "metrics.json").write_text("old")
 
-    def full(*args, **kwargs):
+    def full(path, data):
+        with path.open("wb") as file:
+            file.write(data[:10])
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(json, "dump", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(DataError, match=r"cannot write .*metrics.json: No space left"):
         write_results(result(), tmp_path)
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -11,7 +10,7 @@ from pathlib import Path
 import torch
 from rich.table import Table
 
-from saunet.atomic import replacing
+from saunet.atomic import replacing, write_json
 from saunet.benchmarking.suite import Measurement
 from saunet.checks import require_matplotlib
 from saunet.published import published
@@ -72,7 +71,7 @@ def speed_table(results: Sequence[Measurement]) -> Table:
     return table
 
 
-def write_json(results: Sequence[Measurement], path: Path) -> None:
+def write_measurements(results: Sequence[Measurement], path: Path) -> None:
     """Write the measurements with the machine they were made on."""
     machine = {
         "torch": torch.__version__,
@@ -81,9 +80,7 @@ def write_json(results: Sequence[Measurement], path: Path) -> None:
         "threads": torch.get_num_threads(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
-    content = {"machine": machine, "results": [asdict(row) for row in results]}
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(content, indent=2) + "\n")
+    write_json(path, {"machine": machine, "results": [asdict(row) for row in results]})
 
 
 def draw_figure(results: Sequence[Measurement], path: Path, abs_rel: Mapping[str, float] | None = None) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -163,12 +162,12 @@ def _needed(value: Any, key: str, method: str, what: str) -> Any:
 
 
 def _report(cfg: DictConfig, estimate: Any, folder: Path) -> Any:
-    from saunet.atomic import write_bytes
+    from saunet.atomic import write_json
     from saunet.checkpoint import store_scale
 
     print(estimate)
     folder.mkdir(parents=True, exist_ok=True)
-    write_bytes(folder / "scale.json", (json.dumps(estimate.as_json(), indent=2) + "\n").encode())
+    write_json(folder / "scale.json", estimate.as_json())
     scale = estimate.scale()
     if cfg.scale.store:
         store_scale(cfg.checkpoint, scale)

@@ -30,7 +30,7 @@ def benchmark(cfg: DictConfig) -> None:
     from rich.console import Console
 
     from saunet.benchmarking import Plan, run_suite
-    from saunet.benchmarking.report import draw_figure, size_table, speed_table, write_json
+    from saunet.benchmarking.report import draw_figure, size_table, speed_table, write_measurements
     from saunet.progress import bar
 
     if cfg.threads:
@@ -57,7 +57,7 @@ def benchmark(cfg: DictConfig) -> None:
     console = console if console.is_terminal else Console(width=160)
     console.print(size_table(results), speed_table(results))
     output = Path(cfg.output_dir)
-    write_json(results, output / "benchmark.json")
+    write_measurements(results, output / "benchmark.json")
     if cfg.figure:
         draw_figure(results, output / "benchmark.png", dict(cfg.abs_rel))
     print(f"results: {output}")

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from saunet.atomic import write_bytes
+from saunet.atomic import write_json
 from saunet.checks import DataError
 from saunet.data.camera_file import FILE_NAME, CameraFile, read_camera
 from saunet.images import IMAGE_SUFFIXES, encode_jpeg, resize
@@ -131,7 +131,7 @@ def read_clip(
     if not (folder / "clip.json").is_file():
         _decode(clip.path, fps, folder, max_width, advance)
     try:
-        facts = json.loads((folder / "clip.json").read_text())
+        facts = json.loads((folder / "clip.json").read_text(encoding="utf-8"))
         numbers, rate, missing = tuple(facts["numbers"]), float(facts["fps"]), int(facts["missing"])
     except (OSError, ValueError, KeyError, TypeError) as reason:
         raise DataError(f"{folder / 'clip.json'} is damaged ({reason}); delete the folder {folder}") from reason
@@ -174,7 +174,7 @@ def _decode(
             "numbers": numbers,
             "missing": missing if missing > _ESTIMATE else 0,
         }
-        write_bytes(partial / "clip.json", json.dumps(facts).encode())
+        write_json(partial / "clip.json", facts, indent=None)
         try:
             os.replace(partial, folder)
         except OSError:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.atomic import write_bytes
+from saunet.atomic import write_json
 from saunet.checks import DataError, one_of
 from saunet.data.sequences import Drive
 from saunet.images import read_depth
@@ -135,7 +135,7 @@ class DepthMaps:
                 )
             return float(info["factor"])
         info = {"version": VERSION, "kind": self.kind, "factor": factor, "made_from": made}
-        write_bytes(path, (json.dumps(info, indent=2) + "\n").encode())
+        write_json(path, info)
         return factor
 
     def check(self, wanted: Sequence[tuple[Drive, Sequence[int]]], command: str) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from saunet.atomic import write_bytes
+from saunet.atomic import write_json
 from saunet.checks import DataError
 from saunet.data.sequences import Drive
 from saunet.data.windows import Selection
@@ -82,7 +82,7 @@ def write_manifest(path: str | Path, manifest: Manifest) -> None:
             for drive, reasons in manifest.leave_out.items()
         },
     }
-    write_bytes(path, (json.dumps(plain, indent=1, ensure_ascii=False) + "\n").encode())
+    write_json(path, plain, indent=1)
 
 
 def read_manifest(path: str | Path) -> Manifest:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.atomic import write_bytes
+from saunet.atomic import write_json
 from saunet.checks import DataError
 from saunet.data.static import FLOW_WIDTH, MIN_FLOW, median_flow
 from saunet.images import read_image, resize
@@ -106,7 +106,7 @@ def measure(
     found = Motion(flow, change, tuple(unreadable))
     if file:
         plain = {"flow": _plain(flow), "change": _plain(change), "unreadable": unreadable}
-        write_bytes(file, json.dumps(plain).encode())
+        write_json(file, plain, indent=None)
     return found
 
 
@@ -139,7 +139,7 @@ def _key(paths: Sequence[Path], crop: Sequence[float | int]) -> str:
 def _read(file: Path, count: int) -> Motion | None:
     """Return a kept measurement; None where there is none that fits, and then it is made anew."""
     try:
-        plain = json.loads(file.read_text())
+        plain = json.loads(file.read_text(encoding="utf-8"))
         flow, change = (np.array(plain[key], dtype=np.float64) for key in ("flow", "change"))
         unreadable = tuple(int(place) for place in plain["unreadable"])
     except (OSError, ValueError, KeyError, TypeError):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -17,7 +16,7 @@ from numpy import ndarray
 from rich.markup import escape
 from rich.table import Table
 
-from saunet.atomic import write_bytes
+from saunet.atomic import write_bytes, write_json
 from saunet.evaluation.tables import plain_table
 from saunet.metrics.odometry import (
     KITTI_LENGTHS,
@@ -193,8 +192,7 @@ def write_errors(errors: Sequence[PathErrors], folder: Path, settings: dict[str,
         {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in asdict(row).items()}
         for row in errors
     ]
-    text = json.dumps({"settings": settings, "results": rows}, indent=2, ensure_ascii=False, allow_nan=False)
-    write_bytes(folder / "odometry.json", f"{text}\n".encode())
+    write_json(folder / "odometry.json", {"settings": settings, "results": rows})
     if rows:
         table = io.StringIO(newline="")
         writer = csv.DictWriter(table, list(rows[0]))

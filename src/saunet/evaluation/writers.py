@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from saunet.atomic import replacing
+from saunet.atomic import replacing, write_json
 from saunet.checks import DataError
 from saunet.evaluation.result import Comparison, EvaluationResult, ImageRow, Spread, Summary
 from saunet.evaluation.tables import VIEW_HEADINGS, images_note, spread_note
@@ -104,9 +103,7 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
             _write_csv(file, header, content)
     with _whole(paths["metrics.md"]) as file:
         file.write(markdown(result))
-    with _whole(paths["metrics.json"]) as file:
-        json.dump(as_json(result), file, indent=2, ensure_ascii=False, allow_nan=False)
-        file.write("\n")
+    write_json(paths["metrics.json"], as_json(result))
     return paths
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from saunet.atomic import replacing, write_bytes
+from saunet.atomic import replacing, write_bytes, write_json
 from saunet.checks import CheckpointError, ConfigError, DataError, one_of
 from saunet.images import network_input, read_image
 from saunet.infer import exporters
@@ -114,9 +114,9 @@ def export_model(
             shown.advance(task)
     about = {"threads": torch.get_num_threads(), "machine": platform.machine(), "versions": _versions()}
     content = {"tolerance": TOLERANCE, **about, "files": [asdict(report) for report in reports]}
-    write_bytes(folder / REPORT, _json(content))
+    write_json(folder / REPORT, content)
     write_bytes(folder / CARD, model_card(record, reports, metrics, splits).encode())
-    write_bytes(folder / CONFIG, _json(record.to_plain()))  # last: with it, the folder is a model
+    write_json(folder / CONFIG, record.to_plain())  # last: with it, the folder is a model
     return reports
 
 
@@ -191,10 +191,6 @@ def _versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
-
-
-def _json(value: object) -> bytes:
-    return (json.dumps(value, indent=2) + "\n").encode()
 
 
 _EXPORTERS: dict[str, Callable[[DepthNet, ModelRecord, Path, str], str]] = {

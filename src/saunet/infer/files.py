@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from saunet.atomic import write_bytes
+from saunet.atomic import write_bytes, write_json
 from saunet.checks import ConfigError, DataError, one_of, positive
 from saunet.images import image_size, read_image, write_image
 from saunet.infer.colour import PALETTES, depth_to_png16
@@ -132,7 +132,7 @@ def predict_files(
                 for output in outputs if overwrite else _missing(source, folder, outputs):
                     written.append(write_output(output, folder / source.stem, result, style))
                     if not claimed:
-                        write_bytes(folder / MANIFEST, (json.dumps(settings, indent=2) + "\n").encode())
+                        write_json(folder / MANIFEST, settings)
                         claimed = True
             shown.advance(task, len(readable))
     if failures and len(failures) == len(sources):
@@ -183,7 +183,7 @@ def _claimed(folder: Path, settings: Mapping[str, object], overwrite: bool) -> b
     if overwrite or not path.exists():
         return False
     try:
-        previous = json.loads(path.read_text())
+        previous = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as reason:
         raise DataError(f"{path} cannot be read ({reason}); delete it, or choose another output folder") from reason
     current = json.loads(json.dumps(settings))

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from saunet import __version__
-from saunet.atomic import write_bytes
+from saunet.atomic import write_json
 from saunet.checks import ConfigError, SaunetError
 
 FILE = "run.json"
@@ -186,7 +186,7 @@ def git_state(file: str | Path = __file__) -> Mapping[str, Any] | None:
 
 
 def _write(folder: Path, content: Mapping[str, Any]) -> None:
-    write_bytes(folder / FILE, json.dumps(content, indent=2, ensure_ascii=False).encode(), ConfigError)
+    write_json(folder / FILE, content, ConfigError)
 
 
 def _now() -> str:

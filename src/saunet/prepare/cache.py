@@ -7,7 +7,6 @@ hashes when all its copies are there. Run again, it checks what is there against
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from saunet.atomic import write_bytes
+from saunet.atomic import write_bytes, write_json
 from saunet.checks import DataError
 from saunet.data.image_cache import FRAMES, SETTINGS, CacheSettings, ImageCache
 from saunet.data.sequences import Drive
@@ -140,7 +139,7 @@ def _open(folder: Path, settings: CacheSettings) -> ImageCache:
     if not path.is_file():
         if folder.is_dir() and any(folder.iterdir()):
             raise DataError(f"{folder} is not empty and not a cache; set folder to a new one")
-        write_bytes(path, (json.dumps(settings.plain(), indent=2) + "\n").encode())
+        write_json(path, settings.plain())
     cache = ImageCache(folder)
     changed = [key for key, value in settings.plain().items() if cache.settings.plain()[key] != value]
     if changed:
@@ -162,4 +161,4 @@ def _finish(home: Path, drive: Drive, known: dict[str, Any], entries: dict[int, 
     frames |= {f"{frame:010d}": [count, digest] for frame, (count, digest, _) in entries.items()}
     content = {"native": list(sizes.pop()), "frames": dict(sorted(frames.items()))}
     if content != known:
-        write_bytes(home / FRAMES, (json.dumps(content, indent=0) + "\n").encode())
+        write_json(home / FRAMES, content, indent=0)
