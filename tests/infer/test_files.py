@@ -208,6 +208,12 @@ class TestRefused:
         with pytest.raises(ConfigError, match="palette is 'jet'"):
             predict_files(predictor, folder, tmp_path / "out", palette="jet")
 
+    @pytest.mark.parametrize("max_depth", [0.0, float("inf")])
+    def test_farthest_depth(self, predictor: Predictor, folder: Path, tmp_path: Path, max_depth: float) -> None:
+        with pytest.raises(ConfigError, match="max_depth is"):
+            predict_files(predictor, folder, tmp_path / "out", max_depth=max_depth)
+        assert not (tmp_path / "out").exists()
+
     def test_results_of_another_model(
         self, predictor: Predictor, network: DepthNet, folder: Path, tmp_path: Path
     ) -> None:

@@ -109,6 +109,9 @@ def test_all_compile_to_one_graph(encoder: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*(f"resnet18+{head}" for head in heads()), "stratified_nano+unet", "lite_mono+unet"])
+@pytest.mark.parametrize(
+    "name",
+    [*(f"resnet18+{head}" for head in heads()), *(f"{name}+aunet+eca" for name in saunet.available("encoder"))],
+)
 def test_compiled_code_gives_the_same_numbers(name: str) -> None:
     compile_networks("inductor", name)

@@ -42,12 +42,20 @@ class Summary:
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """How results are drawn and written."""
+    """How results are drawn and written.
+
+    Raises:
+        ConfigError: if ``max_depth`` is not a finite number above 0.
+    """
 
     palette: str = "magma"
     limits: tuple[float, float] | None = None
     camera: Camera | None = None
     max_depth: float | int | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_depth is not None:
+            positive("max_depth", self.max_depth)
 
     def plain(self) -> dict[str, object]:
         """Return the style as plain data."""
