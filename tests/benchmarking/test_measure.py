@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import time
+import itertools
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -34,15 +35,19 @@ def test_flops_count_attention() -> None:
     assert count_flops(layer, torch.zeros(1, 8, tokens // 8, 8)) == projections + attention
 
 
-def test_latency_of_known_calls() -> None:
-    waits = iter([0.05, 0.01, 0.02, 0.03, 0.04])
+def test_latency_of_known_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]  # a clock of our own: a busy machine must not decide this test
+    monkeypatch.setattr("saunet.benchmarking.measure.time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    waits = iter([0.05, 0.03, 0.01, 0.04, 0.02])
     ticks: list[int] = []
-    latency = measure_latency(lambda: time.sleep(next(waits)), CPU, runs=4, warmup=1, done=lambda: ticks.append(1))
+
+    def call() -> None:
+        clock[0] += next(waits)
+
+    latency = measure_latency(call, CPU, runs=4, warmup=1, done=lambda: ticks.append(1))
     assert len(ticks) == 5
-    assert latency.warmup >= 0.05
-    assert 0.01 <= latency.fastest < 0.02
-    assert 0.025 <= latency.median < 0.035
-    assert 0.037 <= latency.p90 < 0.06
+    assert (latency.warmup, latency.fastest) == pytest.approx((0.05, 0.01))
+    assert (latency.median, latency.p90) == pytest.approx((0.025, 0.037))
 
 
 @pytest.mark.parametrize(("runs", "warmup"), [(0, 1), (1, -1)])
@@ -56,8 +61,10 @@ def test_peak_memory_sees_what_was_freed_again() -> None:
     peak = peak_memory(lambda: torch.ones(size // 4).sum(), CPU)
     if peak is None:
         pytest.skip("this system does not tell")
-    assert 0.9 * size < peak < 1.5 * size
+    assert 0.5 * size < peak < 2 * size  # the system moves other pages of the process at the same time
 
 
-def test_ceiling_is_a_speed() -> None:
-    assert 1e8 < matmul_ceiling(CPU, torch.float32, side=64) < 1e14
+def test_ceiling_is_multiplications_and_additions_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    ticks = itertools.count()
+    monkeypatch.setattr("saunet.benchmarking.measure.time", SimpleNamespace(perf_counter=lambda: 0.5 * next(ticks)))
+    assert matmul_ceiling(CPU, torch.float32, side=8) == 2 * 8**3 / 0.5

@@ -1,9 +1,13 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import multiprocessing
+import os
+import signal
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -74,37 +78,49 @@ def test_a_cache_grows_by_recordings_and_frames(tree, tmp_path):
     assert content(folder) == content(tmp_path / "clean")
 
 
-def test_killed_at_random_moments_it_ends_like_a_clean_run(tree, tmp_path):
-    """SIGKILL while files are being written, then again, until a run gets through."""
+def test_killed_while_writing_it_ends_like_a_clean_run(tree, tmp_path):
+    """SIGKILL in each moment of writing a file, a moment later every time, until a run gets through."""
     recordings, folder = kitti_recordings(tree, ["left"]), tmp_path / "cache"
     build_cache(recordings, tmp_path / "clean", SMALL)
-    random, fork = np.random.default_rng(), multiprocessing.get_context("fork")
-    interrupted = 0
-    for files in (1, 3, 6, 9, 11):
-        run = fork.Process(target=_build, args=(recordings, folder))
+    clean, fork = content(tmp_path / "clean"), multiprocessing.get_context("fork")
+    for moment in itertools.count(1):
+        run = fork.Process(target=_build_until, args=(moment, recordings, folder))
         run.start()
-        while run.is_alive() and len(list(folder.rglob("*.jp*"))) < files:
-            time.sleep(0.0002)
-        time.sleep(float(random.uniform(0, 0.003)))
-        run.kill()
         run.join()
-        interrupted += run.exitcode != 0
         finished = {path: data for path, data in content(folder).items() if ".partial" not in path}
-        clean = content(tmp_path / "clean")
         assert finished.items() <= clean.items()  # never half a file, never one that does not belong
-    build_cache(recordings, folder, SMALL)
+        if run.exitcode == 0:
+            break
+        assert run.exitcode == -signal.SIGKILL
+    assert moment > 6  # each moment came more than once
     assert content(folder) == clean
-    assert interrupted >= 2
 
 
-def _build(recordings, folder):
+def _build_until(moment, recordings, folder):
+    """Die at the given moment: when half of a file is written, when all of it is, when it has its name."""
     cv2.setNumThreads(0)
+    write, replace, moments = Path.write_bytes, os.replace, itertools.count(1)
+
+    def pass_moment():
+        if next(moments) == moment:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def write_in_halves(path, data):
+        write(path, data[: len(data) // 2])
+        pass_moment()
+        return write(path, data)
+
+    def replace_slowly(source, target):
+        pass_moment()
+        replace(source, target)
+        pass_moment()
+
+    Path.write_bytes, os.replace = write_in_halves, replace_slowly
     build_cache(recordings, folder, SMALL)
 
 
 @pytest.mark.slow
 def test_killed_with_several_processes_through_the_command_line(tree, tmp_path):
-    import os
     import subprocess
     import sys
 
@@ -143,8 +159,6 @@ def _of_session(leader):
     found = []
     for process in psutil.process_iter():
         try:
-            import os
-
             if os.getsid(process.pid) == leader and process.status() != psutil.STATUS_ZOMBIE:
                 found.append(process.pid)
         except (psutil.Error, OSError):
