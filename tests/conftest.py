@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 DATA_ROOT = Path(os.environ.get("SAUNET_TEST_DATA", Path(__file__).parents[1] / ".." / "shared")).resolve()
+
+
+# Every run tries the same examples, however slow the machine: `pytest --hypothesis-profile=default` looks for new ones.
+settings.register_profile(
+    "reproducible", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow], print_blob=True
+)
+settings.load_profile("reproducible")
+
+# What the surroundings may say to Hydra and Lightning is not said to the tests, nor to the processes that they start.
+for _name in [name for name in os.environ if name.startswith(("HYDRA_", "SLURM_"))]:
+    del os.environ[_name]
+for _name in ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
+    os.environ.pop(_name, None)
 
 
 @pytest.fixture(autouse=True)
@@ -22,16 +37,35 @@ def _fixed_seed() -> None:
 
 @pytest.fixture(autouse=True)
 def _logging_as_it_was() -> Iterator[None]:
-    """Undo what a tool that ran inside the test did to logging: Hydra leaves a handler that writes into its folder."""
+    """Undo what a tool that ran inside the test did to logging."""
+    with logging_as_it_was():
+        yield
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Generator[None, Any, Any]:
+    """Make what several tests share the same whichever of them asks first: own seed, and logging left alone."""
+    if fixturedef.scope == "function":
+        return (yield)
+    torch.manual_seed(0)
+    with logging_as_it_was():
+        return (yield)
+
+
+@contextlib.contextmanager
+def logging_as_it_was() -> Iterator[None]:
+    """Restore logging afterwards: Hydra leaves a handler that writes into its folder."""
     handlers, level = logging.root.handlers[:], logging.root.level
     disabled = {name: logger.disabled for name, logger in _loggers()}
-    yield
-    for handler in set(logging.root.handlers) - set(handlers):
-        handler.close()
-    logging.root.handlers[:] = handlers
-    logging.root.setLevel(level)
-    for name, logger in _loggers():
-        logger.disabled = disabled.get(name, False)
+    try:
+        yield
+    finally:
+        for handler in set(logging.root.handlers) - set(handlers):
+            handler.close()
+        logging.root.handlers[:] = handlers
+        logging.root.setLevel(level)
+        for name, logger in _loggers():
+            logger.disabled = disabled.get(name, False)
 
 
 def _loggers() -> list[tuple[str, logging.Logger]]:
