@@ -17,7 +17,7 @@ from saunet.checks import ConfigError, DataError
 from saunet.evaluation.result import EvaluationResult, ImageRow, summarise
 from saunet.evaluation.tables import print_table
 from saunet.evaluation.writers import as_json, markdown, read_rows, write_results
-from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
+from saunet.metrics.functional import ERROR_HEADINGS
 from saunet.metrics.protocols import protocol
 
 NAN = (math.nan,) * 7
@@ -170,4 +170,3 @@ def test_reading_rows_that_are_none(tmp_path):
     path.write_text(path.read_text().replace(",50,", ",many,"))
     with pytest.raises(DataError, match="not a row of numbers"):
         read_rows(path)
-    assert "abs_rel" in ERROR_NAMES

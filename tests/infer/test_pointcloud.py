@@ -106,5 +106,5 @@ def test_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"must end in \.ply"):
         write_ply(tmp_path / "x.obj", PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "x"))
     for settings in ({"stride": 0}, {"max_depth": -1.0}, {"edge": -0.5}):
-        with pytest.raises(ConfigError):
+        with pytest.raises(ConfigError, match=next(iter(settings))):
             point_cloud(prediction, camera, **settings)  # type: ignore[arg-type]

@@ -231,4 +231,5 @@ def test_full_precision_inside_autocast() -> None:
     a, b = torch.rand(2, 3, 6, 7), torch.rand(2, 3, 6, 7)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert photometric_error(a.bfloat16(), b).dtype == torch.float32
-        torch.testing.assert_close(photometric_error(a, b), photometric_error(a, b), rtol=0, atol=0)
+        inside = photometric_error(a, b)
+    torch.testing.assert_close(inside, photometric_error(a, b), rtol=0, atol=0)
