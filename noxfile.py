@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from pathlib import Path
 
@@ -32,12 +33,11 @@ def demo(session: nox.Session) -> None:
 def tests(session: nox.Session) -> None:
     """Run the test suite (without the slow and gpu tests), a process a core; torch shares no core between tests."""
     install(session, "-e", ".[dev]")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     session.run(
         "pytest",
         "-n",
-        "logical",
-        "--maxprocesses",
-        "8",
+        str(min(cores, 8)),
         "--dist",
         "worksteal",
         *session.posargs,
