@@ -10,7 +10,7 @@ from pathlib import Path
 
 def run(tmp_path: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "saunet.cli.benchmark", f"hydra.run.dir={tmp_path}/out", *overrides]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    return subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path)
 
 
 def test_models_are_measured_side_by_side(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ SMOKE = (
 def _run(tool: str, folder: Path, *overrides: str) -> None:
     command = [sys.executable, "-m", f"saunet.cli.{tool}", *overrides, f"hydra.run.dir={folder}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900, env=environment, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
 
 
@@ -63,7 +63,7 @@ def test_spawned_processes_train_too(tmp_path: Path) -> None:
 
 def test_a_sweep_over_processes_is_refused_with_the_ways_out(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "saunet.cli.train", "--multirun", *SMOKE, *TWO, "seed=1,2"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path, check=False)
     assert done.returncode == 1
     assert "trainer=ddp_spawn, or one process per job through a Hydra launcher" in done.stderr
     assert "Traceback" not in done.stderr
@@ -75,7 +75,7 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 def _train(folder: Path, *arguments: int) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(CURVE), str(folder), *(str(int(each)) for each in arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=400, env=ENVIRONMENT, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=900, env=ENVIRONMENT, check=False)
 
 
 def _curve(folder: Path, processes: int) -> dict[str, Any]:

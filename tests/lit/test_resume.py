@@ -44,7 +44,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_killed_at_a_random_step_and_resumed_it_equals_the_uninterrupted_run(whole: Path, tmp_path: Path) -> None:
     strike = random.randrange(3, BATCHES - 1)  # a different one every time: any must do
     command = [sys.executable, str(Path(tiny.__file__)), str(tmp_path), str(EPOCHS)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}  # sums in the order of this process
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=1, text=True, env=environment
     ) as process:

@@ -57,15 +57,15 @@ def test_ranks_agree_with_one_process(tmp_path: Path, shards: list[list[int]], b
     answers = context.SimpleQueue()
     meeting = f"file://{tmp_path / 'meeting'}"
     ranks = [
-        context.Process(target=one_rank, args=(rank, shards, batch_size, meeting, answers))
+        context.Process(target=one_rank, args=(rank, shards, batch_size, meeting, answers), daemon=True)
         for rank in range(len(shards))
     ]
     for process in ranks:
         process.start()
-    found = dict(answers.get() for _ in ranks)
     for process in ranks:
-        process.join(60)
+        process.join(600)
         assert process.exitcode == 0
+    found = dict(answers.get() for _ in ranks)
     expected = score(list(range(len(SIZES))), 8)
     assert expected["images"] == 7
     assert expected["images_without_truth"] == 1
