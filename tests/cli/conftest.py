@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -53,8 +54,8 @@ def run_tool(name: str, *overrides: str, folder: Path) -> Outcome:
     os.chdir(folder)
     sys.argv = [f"saunet-{name}", *overrides]
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            run(name, TASKS[name])
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), mock.patch.dict(os.environ):
+            run(name, TASKS[name])  # a training leaves its seed in the environment
     except SystemExit as exit_:
         code = int(exit_.code or 0)
     finally:
