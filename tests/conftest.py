@@ -36,6 +36,14 @@ def _fixed_seed() -> None:
 
 
 @pytest.fixture(autouse=True)
+def _plain_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Print tables as wide and as plain as into a file, whatever the terminal of the test run."""
+    monkeypatch.setenv("COLUMNS", "80")
+    for name in ("LINES", "FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture(autouse=True)
 def _logging_as_it_was() -> Iterator[None]:
     """Undo what a tool that ran inside the test did to logging."""
     with logging_as_it_was():
