@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 import os
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -91,6 +92,19 @@ def hydra() -> Iterator[None]:
     register_training_configs()
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
         yield
+
+
+@pytest.fixture(scope="session")
+def node() -> Callable[[str, str], dict[str, Any]]:
+    """Return a component's settings as a checkpoint records them: ``node("encoder", "resnet18")``."""
+
+    def plain(kind: str, name: str) -> dict[str, Any]:
+        from saunet.registry import REGISTRIES
+
+        settings = dataclasses.asdict(REGISTRIES[kind].node(name)())
+        return {key: value for key, value in settings.items() if value != "???"}
+
+    return plain
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@ import os
 import pickle
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +18,12 @@ from torch import Tensor, nn
 
 from saunet.checkpoint import ModelRecord, Scale, atomic_save, build_networks, load_weights, read_checkpoint
 from saunet.checks import CheckpointError, ConfigError
-from saunet.registry import REGISTRIES
 
-
-def node(kind: str, name: str, **changes: Any) -> dict[str, Any]:
-    plain = dataclasses.asdict(REGISTRIES[kind].node(name)())
-    return {key: value for key, value in {**plain, **changes}.items() if value != "???"}
+Node = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
-def record() -> ModelRecord:
+def record(node: Node) -> ModelRecord:
     return ModelRecord(
         encoder=node("encoder", "resnet18"),
         decoder=node("decoder", "unet"),
@@ -240,7 +237,9 @@ class TestRecord:
 
 
 class TestWeights:
-    def test_another_architecture(self, content: dict[str, Any], record: ModelRecord, tmp_path: Path) -> None:
+    def test_another_architecture(
+        self, node: Node, content: dict[str, Any], record: ModelRecord, tmp_path: Path
+    ) -> None:
         other = dataclasses.replace(record, encoder=node("encoder", "resnet34"))
         atomic_save({**content, "saunet": other.to_plain()}, tmp_path / "x.ckpt")
         with pytest.raises(

@@ -42,6 +42,16 @@ class Outcome:
     out: str
     err: str
 
+    def says(self, *words: str) -> None:
+        """Check that it failed with one sentence of ours, which holds these words."""
+        assert self.code == 1
+        assert "Traceback" not in self.err
+        assert "Error executing job" not in self.err  # Hydra's own words before ours
+        sentence = self.err.strip().splitlines()[-1]
+        assert sentence.startswith("saunet-")
+        for word in words:
+            assert word in sentence
+
 
 Tool = Callable[..., Outcome]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import subprocess
 import sys
@@ -21,19 +20,13 @@ from saunet.images import read_image
 from saunet.infer.clips import VideoWriter
 from saunet.infer.files import predict_files
 from saunet.infer.pointcloud import Camera, point_cloud, write_ply
-from saunet.registry import REGISTRIES
 from saunet.roots import PredictConfig
 
 
-def _node(kind: str, name: str) -> dict[str, Any]:
-    plain = dataclasses.asdict(REGISTRIES[kind].node(name)())
-    return {key: value for key, value in plain.items() if value != "???"}
-
-
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def checkpoint(node: Callable[..., dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained model on disk."""
-    parts = {"encoder": _node("encoder", "resnet18"), "decoder": _node("decoder", "unet"), "pose": None}
+    parts = {"encoder": node("encoder", "resnet18"), "decoder": node("decoder", "unet"), "pose": None}
     record = ModelRecord(**parts, min_depth=0.1, max_depth=100.0, height=32, width=64)
     depth, _ = build_networks(record)
     path = tmp_path_factory.mktemp("model") / "x.ckpt"

@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,21 +29,17 @@ from saunet.infer.onnx import OnnxPredictor
 from saunet.infer.parity import Parity
 from saunet.infer.predictor import Predictor
 from saunet.models.depth import DepthNet
-from saunet.registry import REGISTRIES, decoders, encoders
+from saunet.registry import decoders, encoders
 
 Picture = NDArray[np.uint8]
+Node = Callable[..., dict[str, Any]]
 onnx = pytest.importorskip("onnx", reason="ONNX export needs saunet[export]")
 pytest.importorskip("onnxscript", reason="ONNX export needs saunet[export]")
 pytest.importorskip("onnxruntime", reason="ONNX export needs saunet[export]")
 
 
-def node(kind: str, name: str) -> dict[str, Any]:
-    plain = dataclasses.asdict(REGISTRIES[kind].node(name)())
-    return {key: value for key, value in plain.items() if value != "???"}
-
-
 @pytest.fixture(scope="module")
-def record() -> ModelRecord:
+def record(node: Node) -> ModelRecord:
     return ModelRecord(
         {**node("encoder", "resnet18"), "blocks": [1, 1, 1, 1]}, {**node("decoder", "unet"), "channels": [8] * 5},
         None, 0.1, 100.0, 32, 64,
@@ -205,7 +202,7 @@ TINY: dict[str, dict[str, Any]] = {
 HANDFUL = [("stratified_tiny", "aunet"), ("lite_mono", "lite_mono"), ("resnet50", "unet")]
 
 
-def check_pair(encoder: str, decoder: str, record: ModelRecord, folder: Path) -> None:
+def check_pair(node: Node, encoder: str, decoder: str, record: ModelRecord, folder: Path) -> None:
     """Export to ONNX with any number of images and compare, in disparity, with 1, 2 and 3."""
     tiny = TINY[encoders.entry(encoder).target.__name__]
     network = DepthNet(encoders.build(encoder, **tiny), decoders.partial(decoder)).eval()
@@ -224,15 +221,17 @@ def check_pair(encoder: str, decoder: str, record: ModelRecord, folder: Path) ->
 
 
 @pytest.mark.parametrize(("encoder", "decoder"), HANDFUL)
-def test_networks_export_to_onnx(encoder: str, decoder: str, record: ModelRecord, tmp_path: Path) -> None:
-    check_pair(encoder, decoder, record, tmp_path)
+def test_networks_export_to_onnx(node: Node, encoder: str, decoder: str, record: ModelRecord, tmp_path: Path) -> None:
+    check_pair(node, encoder, decoder, record, tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("decoder", decoders.names())
 @pytest.mark.parametrize("encoder", encoders.names())
-def test_every_pair_exports_to_onnx(encoder: str, decoder: str, record: ModelRecord, tmp_path: Path) -> None:
-    check_pair(encoder, decoder, record, tmp_path)
+def test_every_pair_exports_to_onnx(
+    node: Node, encoder: str, decoder: str, record: ModelRecord, tmp_path: Path
+) -> None:
+    check_pair(node, encoder, decoder, record, tmp_path)
 
 
 @pytest.mark.slow

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import pickle
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +21,13 @@ from saunet.infer.exporters import write_safetensors
 from saunet.infer.folder import read_model
 from saunet.infer.load import locate
 from saunet.infer.pointcloud import Camera
-from saunet.registry import REGISTRIES
 
+Node = Callable[..., dict[str, Any]]
 pytest.importorskip("safetensors", reason="safetensors is not installed")
 
 
-def node(kind: str, name: str) -> dict[str, Any]:
-    plain = dataclasses.asdict(REGISTRIES[kind].node(name)())
-    return {key: value for key, value in plain.items() if value != "???"}
-
-
 @pytest.fixture(scope="module")
-def record() -> ModelRecord:
+def record(node: Node) -> ModelRecord:
     encoder = {**node("encoder", "resnet18"), "blocks": [1, 1, 1, 1]}
     decoder = {**node("decoder", "unet"), "channels": [8] * 5}
     return ModelRecord(encoder, decoder, node("pose", "posecnn"), 0.1, 100.0, 32, 64)

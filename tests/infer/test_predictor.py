@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from saunet.images import write_image
 from saunet.infer.predictor import Predictor
 from saunet.models.depth import DepthNet
 from saunet.record import Scale
-from saunet.registry import REGISTRIES
 
 Picture = NDArray[np.uint8]
 
@@ -131,13 +131,7 @@ def test_fingerprint_follows_weights_and_settings(network: DepthNet) -> None:
     assert Predictor(network, 32, 64).fingerprint != one
 
 
-def test_load_in_one_line(tmp_path: Path, picture: Picture) -> None:
-    import dataclasses
-
-    def node(kind: str, name: str) -> dict[str, Any]:
-        plain = dataclasses.asdict(REGISTRIES[kind].node(name)())
-        return {key: value for key, value in plain.items() if value != "???"}
-
+def test_load_in_one_line(node: Callable[..., dict[str, Any]], tmp_path: Path, picture: Picture) -> None:
     record = ModelRecord(
         node("encoder", "resnet18"), node("decoder", "unet"), None, 0.1, 100.0, 32, 64, scale=Scale(5.0, "LiDAR")
     )
