@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 
@@ -26,7 +27,8 @@ def test_on_a_terminal_it_counts_on_standard_error(
         shown.advance(shown.add_task("work", total=2))
     written = capsys.readouterr()
     assert written.out == ""
-    assert all(part in written.err for part in ("work", "1/2", "images", "0:00:00", "-:--:--"))
+    assert all(part in written.err for part in ("work", "1/2", "images", "-:--:--"))
+    assert re.search(r"\d:\d\d:\d\d", written.err)  # the time taken, however long a busy machine takes
     assert "\x1b[2K" in written.err.rpartition("1/2")[2]  # and is wiped away
 
     with bar() as shown:
@@ -34,7 +36,7 @@ def test_on_a_terminal_it_counts_on_standard_error(
     written = capsys.readouterr()
     assert "1/2" in written.err
     assert "images" not in written.err
-    assert "0:00:00" not in written.err
+    assert not re.search(r"\d:\d\d:\d\d", written.err)
 
     with bar(show=False) as shown:
         shown.advance(shown.add_task("work", total=2))
