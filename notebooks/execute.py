@@ -22,7 +22,7 @@ def main() -> None:
         kept = [cell for cell in notebook.cells if cell.cell_type == "code" and (cell.outputs or cell.execution_count)]
         if kept:
             sys.exit(f"{path.name} holds outputs; strip them with nbstripout {path}")
-        NotebookClient(notebook, timeout=1800, kernel_name="python3", resources={"metadata": {"path": FOLDER}}).execute()
+        NotebookClient(notebook, timeout=900, kernel_name="python3", resources={"metadata": {"path": FOLDER}}).execute()
         if len(sys.argv) > 1:  # a folder to keep the executed notebooks in
             nbformat.write(notebook, Path(sys.argv[1]) / path.name)
         print(f"{path.name}: executed in {time.monotonic() - start:.0f} s")
