@@ -76,3 +76,21 @@ def test_aunet_sums_features():
                 )
             expected = expected + project(feature)
     torch.testing.assert_close(seen[0], expected)
+
+
+def test_aunet_sums_in_place_only_where_no_gradient_is_wanted():
+    decoder, seen = decoders.build("aunet", features=_resnet18()).eval(), []
+    maps = _maps(_resnet18())
+    before = [each.clone() for each in maps]
+    with torch.no_grad():
+        quick = decoder(maps)
+    for mapping in decoder.mappings:  # what looks at a layer's output in training finds it as the layer made it
+        mapping.mix.register_forward_hook(lambda module, given, made: seen.append((made, made.clone())))
+        mapping.mix.register_full_backward_hook(lambda module, given, made: None)
+    slow = decoder(maps)
+    sum(each.sum() for each in slow).backward()
+    assert all(torch.equal(made, then) for made, then in seen)
+    assert len(seen) == len(decoder.mappings)
+    for one, other in zip(quick, slow, strict=True):
+        torch.testing.assert_close(one, other)
+    assert all(map(torch.equal, maps, before))

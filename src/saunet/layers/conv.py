@@ -75,6 +75,17 @@ def upsample(x: Float[Tensor, "b c h w"], factor: int = 2) -> Float[Tensor, "b c
     return F.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
 
 
+def sum_of(fresh: Float[Tensor, "b c h w"], x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+    """Return ``fresh + x``; written over ``fresh``, which nobody else holds, where no gradient is wanted.
+
+    Fresh memory of a large map's size costs more than the sum. With gradients the map stays as its layer made it, for
+    hooks that look at it.
+    """
+    if torch.is_grad_enabled() or fresh.dtype != x.dtype:
+        return fresh + x
+    return fresh.add_(x)
+
+
 def channels_last_weights(network: nn.Module) -> None:
     """Store the weights of 2-D convolutions in channels-last order, so that no forward pass has to reorder them."""
     for parameter in network.parameters():

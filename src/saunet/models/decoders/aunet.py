@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.checks import positive
-from saunet.layers.conv import DisparityHead, upsample
+from saunet.layers.conv import DisparityHead, sum_of, upsample
 from saunet.models.decoders.base import by_level, check_scales
 from saunet.registry import attentions, decoders
 from saunet.types import FeatureSpec
@@ -84,7 +84,7 @@ class AUNetDecoder(nn.Module):
             # a 1×1 convolution and upsampling commute: narrowing first is cheaper
             x = upsample(self.narrow(x) if level == 0 else x)
             if level in projected:
-                x += projected[level]  # in place: fresh memory of this size costs more than the sum
+                x = sum_of(x, projected[level])
             x = self.mappings[level](x)
             if level < len(self.heads):
                 maps.append(self.heads[level](x))
@@ -128,5 +128,4 @@ class Mapping(nn.Module):
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """Return the refined map."""
         refined: Tensor = self.mix(F.relu(self.spatial(x), inplace=True))
-        refined += x
-        return refined
+        return sum_of(refined, x)
