@@ -56,9 +56,9 @@ def test_real_poses(kitti_mini):
     ("text", "message"),
     [
         ("", r"poses.txt holds no pose; expected lines of 12 finite numbers \(a 3 x 4 pose, row by row\)"),
-        ("# only a comment\n\n", "holds no pose"),
+        ("\n\n", "holds no pose"),
         ("1 2 3\n", r"poses.txt, line 1: expected 12 finite numbers \(a 3 x 4 pose, row by row\), got '1 2 3'"),
-        ("# comment\n" + " ".join(["x"] * 12), "line 2: expected 12 finite numbers"),
+        ("\n" + " ".join(["x"] * 12), "line 2: expected 12 finite numbers"),
         (" ".join(["nan"] * 12), "line 1: expected 12 finite numbers"),
     ],
 )
@@ -83,3 +83,11 @@ def test_other_bad_input(tmp_path):
     (tmp_path / "zero").write_text("0 1 2 3 0 0 0 0\n")
     with pytest.raises(DataError, match="quaternion of length 0"):
         read_tum(tmp_path / "zero")
+
+
+def test_a_comment_is_no_frame_of_a_kitti_file(tmp_path):
+    """Frames are counted by lines: a line passed over would give every later frame its neighbour's pose."""
+    path, row = tmp_path / "00.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"
+    path.write_text(f"{row}# {row}{row}")
+    with pytest.raises(DataError, match="line 2: expected 12 finite numbers"):
+        read_kitti(path)

@@ -57,7 +57,7 @@ def read_tum(path: Path) -> tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, " 
     Raises:
         DataError: if the file is missing, holds no pose, or a line is not eight numbers with a proper quaternion.
     """
-    table = _read(path, 8, "time x y z qx qy qz qw")
+    table = _read(path, 8, "time x y z qx qy qz qw", comments=True)
     if not np.linalg.norm(table[:, 4:], axis=1).all():
         raise DataError(f"{path} holds a quaternion of length 0; each must be a rotation")
     poses = np.tile(np.eye(4), (len(table), 1, 1))
@@ -71,7 +71,7 @@ def _write(path: Path, table: Float64[ndarray, "n k"]) -> None:
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
-def _read(path: Path, columns: int, meaning: str) -> Float64[ndarray, "n k"]:
+def _read(path: Path, columns: int, meaning: str, comments: bool = False) -> Float64[ndarray, "n k"]:
     expected = f"{columns} finite numbers ({meaning})"
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -79,7 +79,7 @@ def _read(path: Path, columns: int, meaning: str) -> Float64[ndarray, "n k"]:
         raise DataError(f"cannot read {path} as text ({error}); expected lines of {expected}") from error
     rows = []
     for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.startswith("#"):
+        if not line.strip() or (comments and line.startswith("#")):
             continue
         try:
             row = [float(word) for word in line.split()]
