@@ -1,4 +1,4 @@
-"""The one progress bar: on standard error, on a terminal only, gone when the work is done."""
+"""The one progress bar: on standard error, on a terminal or in a notebook only, gone when the work is done."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from rich.progress import (
 
 
 def bar(show: bool = True, unit: str = "", taken: bool = False) -> Progress:
-    """Return a progress bar with counts and the time left; silent without a terminal.
+    """Return a progress bar with counts and the time left; silent where nobody looks (a file, a pipe).
 
     Args:
-        show: False keeps it silent on a terminal too.
+        show: False keeps it silent everywhere.
         unit: What is counted, such as ``images``.
         taken: Show the time taken so far too.
     """
@@ -29,4 +29,5 @@ def bar(show: bool = True, unit: str = "", taken: bool = False) -> Progress:
     if taken:
         columns.append(TimeElapsedColumn())
     columns.append(TimeRemainingColumn())
-    return Progress(*columns, console=console, disable=not (show and console.is_terminal), transient=True)
+    watched = console.is_terminal or console.is_jupyter
+    return Progress(*columns, console=console, disable=not (show and watched), transient=True)

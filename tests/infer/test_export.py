@@ -170,6 +170,24 @@ def test_a_folder_with_another_export_is_not_mixed(
     assert saunet.load(tmp_path / "out").fingerprint == saunet.load(checkpoint).fingerprint
 
 
+def test_a_file_that_gives_nan_is_not_written(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(export._RUNNERS, "program", lambda path, record: lambda image: image[:, :1] * np.float32("nan"))
+    with pytest.raises(CheckpointError, match=r"model\.pt2 gives NaN where .*so it is not written"):
+        export_model(checkpoint, tmp_path / "out", ["program"])
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_settings_that_the_folder_cannot_hold(checkpoint: Path, tmp_path: Path) -> None:
+    content = torch.load(checkpoint, weights_only=True)
+    content["saunet"]["data"]["far"] = float("inf")
+    atomic_save(content, tmp_path / "far.ckpt")
+    with pytest.raises(ConfigError, match=r"config\.json cannot hold the model's settings .*give finite numbers"):
+        export_model(tmp_path / "far.ckpt", tmp_path / "out", ["safetensors"])
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_file_that_differs_is_not_written(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(export._RUNNERS, "program", lambda path, record: lambda image: image[:, :1] * 0 + 1)
     with pytest.raises(CheckpointError, match=r"model\.pt2 differs from the network by .* so it is not written"):

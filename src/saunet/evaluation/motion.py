@@ -84,7 +84,7 @@ def predict_trajectory(
         width: Width of its input in pixels.
         device: Where to run.
         batch_size: Targets that go through the network together.
-        progress: Show a progress bar on standard error.
+        progress: Show a progress bar on a terminal or in a notebook.
 
     Returns:
         ``T_world_cam`` of each frame; the world is the first camera, and the scale is the network's own.

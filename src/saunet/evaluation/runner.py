@@ -67,7 +67,7 @@ def evaluate(
         ground_truth: What the batches' depth is, one of `GROUND_TRUTHS`.
         buckets: Also sum the errors by these buckets of pixels.
         total: Number of images, for the progress bar.
-        progress: Show a progress bar on standard error.
+        progress: Show a progress bar on a terminal or in a notebook.
 
     Returns:
         One row for each predictor, protocol and image, also for images without ground truth.

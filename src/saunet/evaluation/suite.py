@@ -62,7 +62,7 @@ def evaluate_protocols(
         split: ``test`` or ``val``.
         device: Where the predictors want their batches.
         buckets: Also sum the errors by these buckets of pixels.
-        progress: Show a progress bar on standard error.
+        progress: Show a progress bar on a terminal or in a notebook.
 
     Raises:
         ConfigError: if a protocol does not fit the data, or needs motion and there is none.

@@ -62,7 +62,7 @@ def evaluate_views(
         protocol: One that needs no ground truth.
         group_of: The condition or the recording of an image, by its name.
         total: Number of images, for the progress bar.
-        progress: Show a progress bar on standard error.
+        progress: Show a progress bar on a terminal or in a notebook.
 
     Raises:
         ConfigError: if the protocol needs ground truth.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -86,6 +87,7 @@ def export_model(
     splits = _splits(read.path)
     network, pose = read.networks()
     record = replace(read.record, data={key: value for key, value in read.record.data.items() if key not in _PLACES})
+    _check_finite(record)
     network.eval()
     random, real = _random(record), _real(record, images)
     _clear(folder, overwrite)
@@ -105,6 +107,11 @@ def export_model(
                 size = temporary.stat().st_size / 2**20
                 run = _RUNNERS[name](temporary, record)
                 report = compare(path.name, eager, run, random, real, span, takes, size)
+                if math.isnan(report.difference):
+                    raise CheckpointError(
+                        f"the exported {path.name} gives NaN where the network gives disparity, so it is not written; "
+                        "report encoder and decoder"
+                    )
                 if not report.difference <= TOLERANCE:
                     raise CheckpointError(
                         f"the exported {path.name} differs from the network by {report.difference:.2g} of the "
@@ -161,6 +168,18 @@ def _clear(folder: Path, overwrite: bool) -> None:
             (folder / name).unlink()
         except OSError as reason:
             raise DataError(f"cannot replace {folder / name}: {reason.strerror or reason}") from reason
+
+
+def _check_finite(record: ModelRecord) -> None:
+    """Check that ``config.json`` can hold the record, before anything is written.
+
+    Raises:
+        ConfigError: if a number in it is NaN or infinite.
+    """
+    try:
+        json.dumps(record.to_plain(), allow_nan=False)
+    except ValueError as reason:
+        raise ConfigError(f"{CONFIG} cannot hold the model's settings ({reason}); give finite numbers") from reason
 
 
 def _random(record: ModelRecord) -> list[NDArray[np.float32]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,7 +46,7 @@ class Style:
     """How results are drawn and written.
 
     Raises:
-        ConfigError: if ``max_depth`` is not a finite number above 0.
+        ConfigError: if ``max_depth`` is not a finite number above 0, or ``limits`` are not finite.
     """
 
     palette: str = "magma"
@@ -56,6 +57,8 @@ class Style:
     def __post_init__(self) -> None:
         if self.max_depth is not None:
             positive("max_depth", self.max_depth)
+        if self.limits is not None and not all(map(math.isfinite, self.limits)):
+            raise ConfigError(f"colour limits are {self.limits[0]} to {self.limits[1]}; they must be finite numbers")
 
     def plain(self) -> dict[str, object]:
         """Return the style as plain data."""
@@ -98,8 +101,8 @@ def predict_files(
         What was written and skipped, and which images could not be read.
 
     Raises:
-        ConfigError: for an unknown output, points without a camera, or an output folder that holds the originals or
-            results of another model.
+        ConfigError: for an unknown output, numbers out of range, points without a camera, or an output folder that
+            holds the originals or results of another model.
         DataError: if there is no image, none of them can be read, or the system refuses to write.
     """
     for output in outputs:
