@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from saunet import progress
 from saunet.progress import bar
 
 
@@ -41,6 +42,13 @@ def test_on_a_terminal_it_counts_on_standard_error(
     with bar(show=False) as shown:
         shown.advance(shown.add_task("work", total=2))
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("widgets", [True, False])
+def test_in_a_notebook_it_needs_widgets(widgets: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setattr(progress, "find_spec", lambda name: object() if widgets else None)
+    assert bar().disable is not widgets
 
 
 def test_it_costs_rich_alone() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -29,5 +31,6 @@ def bar(show: bool = True, unit: str = "", taken: bool = False) -> Progress:
     if taken:
         columns.append(TimeElapsedColumn())
     columns.append(TimeRemainingColumn())
-    watched = console.is_terminal or console.is_jupyter
+    # In a notebook, rich draws with ipywidgets, and warns at every bar where they are missing.
+    watched = console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
     return Progress(*columns, console=console, disable=not (show and watched), transient=True)
