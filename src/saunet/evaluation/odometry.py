@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from rich.table import Table
 
 from saunet.atomic import write_bytes, write_json
 from saunet.evaluation.tables import plain_table
+from saunet.evaluation.writers import without_nan
 from saunet.metrics.odometry import (
     KITTI_LENGTHS,
     Similarity,
@@ -188,10 +188,7 @@ def write_errors(errors: Sequence[PathErrors], folder: Path, settings: dict[str,
     Raises:
         DataError: if a file cannot be written.
     """
-    rows = [
-        {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in asdict(row).items()}
-        for row in errors
-    ]
+    rows: list[dict[str, object]] = [without_nan(asdict(row)) for row in errors]
     write_json(folder / "odometry.json", {"settings": settings, "results": rows})
     if rows:
         table = io.StringIO(newline="")

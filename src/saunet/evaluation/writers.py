@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from saunet.atomic import replacing, write_json
 from saunet.checks import DataError
@@ -130,8 +130,7 @@ def as_json(result: EvaluationResult) -> dict[str, object]:
         ]
     if result.comparisons:
         content["comparisons"] = [dataclasses.asdict(comparison) for comparison in result.comparisons]
-    plain = _without_nan(content)
-    assert isinstance(plain, dict)
+    plain: dict[str, object] = without_nan(content)
     return plain
 
 
@@ -193,12 +192,12 @@ def _without_errors(row: object) -> dict[str, object]:
     return {key: value for key, value in plain.items() if key != "errors"}
 
 
-def _without_nan(value: object) -> object:
+def without_nan(value: Any) -> Any:
     """Return plain data with None in place of NaN, which JSON cannot hold."""
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
+        return [without_nan(item) for item in value]
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
