@@ -17,8 +17,8 @@ from saunet.checks import ConfigError, DataError
 from saunet.images import read_image, write_image
 from saunet.infer.clips import VideoWriter
 from saunet.infer.colour import RunningRange, colourise
+from saunet.infer.odometer import Odometer
 from saunet.infer.predictor import Predictor
-from saunet.infer.trajectory import Odometer
 from saunet.infer.video import predict_clip
 from saunet.videos import VideoReader
 

@@ -13,7 +13,7 @@ import pytest
 
 from saunet.images import read_depth, read_image
 from saunet.infer.clips import VideoWriter
-from saunet.infer.trajectory import Odometer
+from saunet.infer.odometer import Odometer
 from saunet.infer.video import predict_clip
 from saunet.models.depth import DepthNet
 from saunet.videos import VideoReader

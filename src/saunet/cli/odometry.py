@@ -7,7 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from saunet import config
-from saunet.checks import ConfigError, require_matplotlib
+from saunet.checks import require_matplotlib
 from saunet.cli._app import pick_device, run
 
 
@@ -15,36 +15,25 @@ def odometry(cfg: DictConfig) -> None:
     """Predict the path through each test sequence and compare it with the true one where that is known."""
     from rich.console import Console
 
-    from saunet.checkpoint import read_checkpoint
     from saunet.evaluation.foreign import file_stem
-    from saunet.evaluation.motion import predict_trajectory
     from saunet.evaluation.odometry import path_errors, path_of, path_table, write_errors, write_path
     from saunet.evaluation.plot import draw_path
+    from saunet.infer.folder import read_model
+    from saunet.infer.load import locate
+    from saunet.infer.odometer import Odometer, follow
     from saunet.registry import instantiate
 
     if cfg.figure:
         require_matplotlib("figure=true needs", "figure=false")
-    checkpoint = read_checkpoint(cfg.checkpoint)
-    record, device, output = checkpoint.record, pick_device(cfg.device), Path(cfg.output_dir)
-    pose = checkpoint.networks()[1]
-    if pose is None:
-        raise ConfigError(f"{cfg.checkpoint} has no pose network (it was trained on stereo pairs); a path needs one")
+    source, output = locate(cfg.checkpoint), Path(cfg.output_dir)
+    record = read_model(source).record
+    odometer = Odometer.from_model(source, device=pick_device(cfg.device), batch_size=cfg.batch_size)
     fixed = {"height": record.height, "width": record.width, "offsets": list(record.offsets)}
     data = instantiate({**config.plain(cfg.data), **fixed})
     data.setup("test")
     errors = []
     for drive in data.datasets["test"].drives:
-        predicted = predict_trajectory(
-            pose.to(device),
-            drive,
-            offsets=record.offsets,
-            height=record.height,
-            width=record.width,
-            device=device,
-            batch_size=cfg.batch_size,
-        )
-        if record.scale is not None:
-            predicted[:, :3, 3] *= record.scale.factor
+        predicted = follow(odometer, drive)
         path = path_of(drive, predicted)
         folder = output / file_stem(drive.name)
         write_path(path, folder)

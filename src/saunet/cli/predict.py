@@ -62,9 +62,9 @@ def _predict_clip(cfg: DictConfig, predictor: Any, source: Any, outputs: list[st
 
     odometer = None
     if "trajectory" in outputs:
-        from saunet.infer.trajectory import Odometer
+        from saunet.infer.odometer import Odometer
 
-        odometer = Odometer.from_model(locate(cfg.checkpoint), predictor.scale, pick_device(cfg.device))
+        odometer = Odometer.from_model(locate(cfg.checkpoint), predictor.scale, pick_device(cfg.device), cfg.batch_size)
     clip = predict_clip(predictor, source, cfg.output, outputs, odometer=odometer, max_frames=cfg.max_frames, **shared)
     print(f"{clip.frames} frames: {', '.join(map(str, clip.paths))}")
     if clip.missing:

@@ -22,7 +22,7 @@ from saunet.infer.prediction import Prediction
 from saunet.infer.viewer import ViewerWriter
 
 if TYPE_CHECKING:
-    from saunet.infer.trajectory import Odometer
+    from saunet.infer.odometer import Odometer
 
 LAYOUTS: tuple[str, ...] = ("auto", "stacked", "beside")
 """Depth below the image, beside it, or whichever comes nearer to a screen's shape."""

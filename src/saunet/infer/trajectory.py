@@ -1,119 +1,20 @@
-"""Where the camera went: a pose network's motions chained over a clip, as KITTI poses and drawn from above."""
+"""Where the camera went, written as KITTI poses and drawn from above."""
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float64, UInt8
-from torch import Tensor, nn
 
-from saunet.checks import CheckpointError, ConfigError, DataError
-from saunet.images import network_input, write_image
-from saunet.infer.folder import read_model
-from saunet.metrics.odometry import chain_motions
-from saunet.record import Scale
+from saunet.images import write_image
 from saunet.trajectories import write_kitti
 
 _PAPER, _GRID, _INK, _TRACK, _START, _END = (
     (250, 250, 250), (222, 222, 222), (60, 60, 60), (31, 90, 180), (40, 140, 60), (200, 60, 40),
 )  # fmt: skip
-
-
-class Odometer:
-    """Follows the camera through a clip, frame by frame; memory does not grow but by one pose a frame.
-
-    Args:
-        pose: A pose network.
-        height: Height of its input in pixels.
-        width: Width of its input in pixels.
-        scale: Factor to metres; None leaves the trajectory in the unknown unit of the depth.
-        device: Where to run.
-
-    Raises:
-        ConfigError: if the network was not trained on neighbouring frames.
-    """
-
-    def __init__(
-        self, pose: nn.Module, height: int, width: int, scale: Scale | None = None, device: str | torch.device = "cpu"
-    ) -> None:
-        self._offsets: tuple[int, ...] = tuple(pose.offsets)  # type: ignore[arg-type]
-        if not {-1, 1} & set(self._offsets):
-            raise ConfigError(
-                f"the pose network was trained on frames at offsets {list(self._offsets)}; a trajectory needs 1 or -1"
-            )
-        self._pose, self._size, self.scale = pose.to(device).eval(), (height, width), scale
-        self._device = torch.device(device)
-        self._motions: dict[int, Float64[np.ndarray, "4 4"]] = {}  # frame i -> T_next_cam
-        reach = max(abs(offset) for offset in self._offsets)
-        self._recent: deque[Tensor] = deque(maxlen=2 * reach + 1)
-        self._reach, self._count, self._done = reach, 0, 0
-
-    @classmethod
-    def from_model(cls, path: str | Path, scale: Scale | None = None, device: str = "cpu") -> Odometer:
-        """Load the pose network of a checkpoint or exported folder; nothing in it is run.
-
-        Raises:
-            ConfigError: if it has none, or the network was not trained on neighbouring frames.
-            CheckpointError: if it cannot be read.
-        """
-        if Path(path).suffix.lower() == ".onnx":
-            raise ConfigError(f"{path} has no pose network, which a trajectory needs; give the checkpoint")
-        model = read_model(path)
-        pose = model.networks()[1]
-        if pose is None:
-            raise ConfigError(f"{path} has no pose network, which a trajectory needs; leave 'trajectory' out")
-        return cls(pose, model.record.height, model.record.width, scale or model.record.scale, device)
-
-    def add(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Take the next frame."""
-        self._recent.append(torch.from_numpy(network_input(image, *self._size)).to(self._device))
-        self._count += 1
-        if self._count - 1 - self._reach >= self._done:
-            self._estimate(self._done)
-            self._done += 1
-
-    def trajectory(self) -> Float64[np.ndarray, "n 4 4"]:
-        """Return the camera-to-world pose of every frame so far; the world is the first camera.
-
-        Raises:
-            DataError: if there are too few frames.
-            CheckpointError: if the network's output is not finite.
-        """
-        for centre in range(self._done, self._count):
-            self._estimate(centre)
-        self._done = max(self._done, self._count)
-        missing = [index for index in range(self._count - 1) if index not in self._motions]
-        if missing or self._count < 2:
-            needed = 3 if {-1, 1} <= set(self._offsets) else 2
-            raise DataError(f"a trajectory needs at least {needed} frames, got {self._count}")
-        motions = np.stack([self._motions[index] for index in range(self._count - 1)])
-        if not np.isfinite(motions).all():
-            raise CheckpointError("the pose network's output is not finite; the weights are damaged")
-        motions[:, :3, 3] *= self.scale.factor if self.scale else 1.0
-        return chain_motions(motions)
-
-    def _estimate(self, centre: int) -> None:
-        """Ask for the motions around a frame, where both its neighbours exist; farther sources stop at the borders."""
-        last = self._count - 1
-        near = [centre + offset for offset in self._offsets if abs(offset) == 1]
-        if not all(0 <= index <= last for index in near):
-            return
-        first = self._count - len(self._recent)
-        frames = [min(max(centre + offset, 0), last) - first for offset in self._offsets]
-        with torch.inference_mode():
-            sources = torch.stack([self._recent[index] for index in frames])
-            T_src_tgt = self._pose(self._recent[centre - first][None], sources[None])[0].tolist()
-        # as Python numbers: an array of torch's would hold on to its memory for the whole clip
-        for offset, T in zip(self._offsets, np.array(T_src_tgt, dtype=np.float64), strict=True):
-            if offset == 1:
-                self._motions[centre] = T
-            elif offset == -1:
-                self._motions.setdefault(centre - 1, np.linalg.inv(T))
 
 
 def write_trajectory(picture: Path, T_world_cam: Float64[np.ndarray, "n 4 4"], metric: bool) -> None:

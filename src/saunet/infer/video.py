@@ -19,7 +19,7 @@ from saunet.infer.sinks import LAYOUTS, FrameSink, Sink, TrajectorySink, VideoSi
 from saunet.progress import bar
 
 if TYPE_CHECKING:
-    from saunet.infer.trajectory import Odometer
+    from saunet.infer.odometer import Odometer
 
 CLIP_OUTPUTS: tuple[str, ...] = ("mp4", "html", "trajectory")
 """What can be written for a clip as a whole, besides `saunet.infer.files.OUTPUTS` for each of its frames."""
