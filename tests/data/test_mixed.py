@@ -3,10 +3,11 @@ from __future__ import annotations
 import pickle
 
 import pytest
+import torch
 from campus_tree import frames, make_clip
 from kitti_tree import make_drive, name
 
-from saunet.checks import ConfigError
+from saunet.checks import ConfigError, DataError
 from saunet.registry import datamodules
 
 SIZE = {"height": 20, "width": 40, "batch_size": 4, "workers": 0}
@@ -46,6 +47,28 @@ def test_two_data_sets_are_one(tmp_path):
     assert test["depth"].shape[0] == len(test["name"])
     drive = data.datasets["train"].drives[0]
     assert pickle.loads(pickle.dumps(drive)).name == drive.name == f"town/{name(1)} l"
+
+
+def test_one_source_knows_the_way_travelled(tmp_path):
+    made = sources(tmp_path, with_speed=True)
+    records = tmp_path / "raw" / name(1) / "oxts" / "data"
+    records.mkdir(parents=True)
+    for frame in range(12):
+        (records / f"{frame:010d}.txt").write_text(" ".join(["0"] * 8 + ["8"] + ["0"] * 21))
+    data = datamodules.build("mixed", sources=made, **SIZE)
+    assert pickle.loads(pickle.dumps(data.odometer)) is not None  # loader processes that are spawned need it
+    data.setup("fit")
+    found = {
+        each: way
+        for batch in data.train_dataloader()
+        for each, way in zip(batch["name"], batch["distance"], strict=True)
+    }
+    assert {each.partition("/")[0] for each in found} == {"town", "campus"}
+    for each, way in found.items():
+        expected = torch.full((2,), 0.8 if each.startswith("town/") else torch.nan)
+        torch.testing.assert_close(way, expected, equal_nan=True)
+    with pytest.raises(DataError, match=r"with_speed is true but no training frame .* has an OXTS record"):
+        datamodules.build("mixed", sources=sources(tmp_path / "b", with_speed=True), **SIZE).setup("fit")
 
 
 def test_sources_can_serve_training_or_test_alone(tmp_path):

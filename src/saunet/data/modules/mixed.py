@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import copy
 import inspect
+import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 from saunet.checks import ConfigError
 from saunet.data.module import DepthDataModule
+from saunet.data.partners import measured_distance
+from saunet.data.sequences import Drive
 from saunet.data.windows import Selection
 from saunet.registry import datamodules
 
@@ -33,6 +37,7 @@ class MixedDataModule(DepthDataModule):
 
     On the command line: ``data=mixed +data@data.sources.town=kitti +data@data.sources.campus=campus`` and then
     ``data.sources.town.root=...``. What every data set has (size, offsets, batch, augmentation) is set for the mixture.
+    With a source's ``with_speed`` its batches carry the way travelled, and those of other sources say it is unknown.
 
     Args:
         sources: Name -> data module; names start the names of samples.
@@ -103,6 +108,8 @@ class MixedDataModule(DepthDataModule):
                 )
             self.sources[name] = self._fitted(name, source)
         self._names = {"train": _known("train", train, self.sources), "test": _known("test", test, self.sources)}
+        with_speed = frozenset(name for name, source in self.sources.items() if source.odometer)
+        self.odometer = partial(_distance, with_speed) if with_speed else None
         self.ground_truth, self.protocol = _truth([self.sources[name] for name in self._names["test"]])
 
     def prepare_data(self) -> None:
@@ -145,6 +152,11 @@ class MixedDataModule(DepthDataModule):
             setattr(source, key, getattr(self, key))
         source.on_error = self.on_error
         return source
+
+
+def _distance(with_speed: frozenset[str], drive: Drive, first: int, second: int) -> float:
+    """Return the metres travelled where the drive's source was asked for them, else NaN."""
+    return measured_distance(drive, first, second) if drive.name.partition("/")[0] in with_speed else math.nan
 
 
 def _known(key: str, names: Sequence[str], sources: Mapping[str, Any]) -> tuple[str, ...]:
