@@ -47,8 +47,8 @@ def tests(session: nox.Session) -> None:
 
 @nox.session
 def slow(session: nox.Session) -> None:
-    """Run the tests marked slow."""
-    install(session, "-e", ".[dev]")
+    """Run the tests marked slow, those of the extra sweep's launchers among them."""
+    install(session, "-e", ".[dev,sweep]")
     session.run("pytest", "-m", "slow and not gpu", *session.posargs)
 
 
@@ -91,7 +91,8 @@ def wheel(session: nox.Session) -> None:
 def notebooks(session: nox.Session) -> None:
     """Execute the notebooks on synthetic data."""
     install(session, "-e", ".[dev]")
-    session.run("python", "notebooks/execute.py", *session.posargs)
+    # One thread: two that wait for each other by spinning come to a near halt where another job wants the cores too.
+    session.run("python", "notebooks/execute.py", *session.posargs, env={"OMP_NUM_THREADS": "1"})
 
 
 @nox.session

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from saunet.cli._sweep import summary
 from saunet.lit.run_record import RunRecord
@@ -30,6 +32,45 @@ def test_a_finished_run_says_so(smoke_run: Path) -> None:
     assert (content["status"], content["error"], content["name"]) == ("finished", None, "smoke")
     assert {"train", "val"} == set(content["splits"])
     assert all(len(each) == 64 for each in content["splits"].values())
+
+
+def test_what_a_run_says_is_in_its_log_once(smoke_run: Path) -> None:
+    said = (smoke_run / "train.log").read_text()
+    for line in ("train (", "val (", "networks: depth"):
+        assert said.count(f" INFO {line}") == 1
+    assert record(smoke_run)["splits"]["train"][:16] in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("package", "options"),
+    [
+        ("hydra_plugins.hydra_joblib_launcher", ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=1,2")),
+        ("hydra_plugins.hydra_submitit_launcher", ("hydra/launcher=submitit_local", "seed=1,2")),
+        (
+            "hydra_plugins.hydra_optuna_sweeper",
+            ("hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=1",
+             "hydra.sweeper.sampler.seed=1", "optim.lr=tag(log,interval(1e-5,1e-3))"),
+        ),
+    ],
+    ids=["joblib", "submitit", "optuna"],
+)  # fmt: skip
+def test_launchers_and_searches_of_the_extra_sweep(package: str, options: tuple[str, ...], tmp_path: Path) -> None:
+    pytest.importorskip(package, reason="the extra 'sweep' is not installed")
+    command = [sys.executable, "-m", "saunet.cli.train", "-m", *QUICK, *options, "hydra.sweep.dir=sweep"]
+    run = subprocess.run(
+        command, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+    assert "sweep: 2 of 2 jobs finished" in run.stdout
+    for job in ("0", "1"):
+        assert record(tmp_path / "sweep" / job)["status"] == "finished"
+        assert (tmp_path / "sweep" / job / "train.log").read_text().count("networks: depth") == 1
+    if "optuna" in package:
+        found = yaml.safe_load((tmp_path / "sweep" / "optimization_results.yaml").read_text())
+        tried = {float(value) for value in re.findall(r"optim\.lr=(\S+)", run.stdout)}
+        assert found["best_params"]["optim.lr"] in tried
+        assert found["best_value"] > 0
 
 
 def test_a_failing_job_costs_no_other_and_is_recorded(tool: Tool, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ import torch
 
 pytestmark = pytest.mark.ddp
 
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 TWO = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2")
 SMOKE = (
     "experiment=smoke",
@@ -69,8 +71,32 @@ def test_a_sweep_over_processes_is_refused_with_the_ways_out(tmp_path: Path) -> 
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("nodes", [1, 2])
+def test_torchrun_starts_the_processes_of_one_node_or_of_several(nodes: int, tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        meeting = f"127.0.0.1:{probe.getsockname()[1]}"
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--nnodes",
+        str(nodes),
+        "--nproc-per-node",
+        str(2 // nodes),
+    ]
+    command += ["--rdzv-backend", "c10d", "--rdzv-endpoint", meeting, "-m", "saunet.cli.train", *SMOKE, *TWO]
+    command += [f"trainer.devices={2 // nodes}", f"trainer.num_nodes={nodes}", f"hydra.run.dir={tmp_path}"]
+    started = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT) for _ in range(nodes)]
+    said = [each.communicate(timeout=900)[1] for each in started]
+    assert [each.returncode for each in started] == [0] * nodes, said
+    assert sum(each.count("networks: depth") for each in said) == 1  # one process speaks
+    assert json.loads((tmp_path / "run.json").read_text())["status"] == "finished"
+    assert _logged(tmp_path)["val/images"] == 5
+
+
 CURVE = Path(__file__).with_name("ddp_curve.py")
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
 def _train(folder: Path, *arguments: int) -> subprocess.CompletedProcess[str]:

@@ -42,13 +42,13 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
     debug = before == "1" and "LOCAL_RANK" not in os.environ
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then lets exceptions through instead of printing them its own way
     register_configs()
-    _quieten()
 
     folders: list[Path] = []  # of a single run, once they exist
     failed: list[Exception] = []
 
     @wraps(task)
     def required(cfg: DictConfig) -> Any:
+        _one_voice()
         hydra_cfg = HydraConfig.get()
         if hydra_cfg.mode == RunMode.MULTIRUN:
             return _job(name, task, cfg)
@@ -117,15 +117,26 @@ def pick_device(name: str) -> str:
     return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
 
 
-def _quieten() -> None:
-    """Keep the terminal to what concerns the user: no advertisements, no deprecations inside other libraries."""
+class _NoAdvertisement(logging.Filter):
+    def filter(self, record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        return not text.startswith(("💡", "TPU available", "Loading `train_dataloader` to estimate"))
 
-    class NoAdvertisement(logging.Filter):
-        def filter(self, record: logging.LogRecord) -> bool:
-            text = record.getMessage()
-            return not text.startswith(("💡", "TPU available", "Loading `train_dataloader` to estimate"))
 
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(NoAdvertisement())
+_NO_ADVERTISEMENT = _NoAdvertisement()
+
+
+def _one_voice() -> None:
+    """Let Lightning speak through Hydra's loggers, to the terminal and the run's log, of what concerns the user alone.
+
+    In each job, as a sweep may run it in a process of its own.
+    """
+    import lightning.pytorch.utilities.rank_zero as rank_zero  # now: its first import adds handlers of its own
+
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).handlers.clear()
+        logging.getLogger(name).propagate = True
+    logging.getLogger(rank_zero.__name__).addFilter(_NO_ADVERTISEMENT)
     warnings.filterwarnings("ignore", message=r".*LeafSpec.*")
     warnings.filterwarnings("ignore", message=r".*does not have many workers.*")
 

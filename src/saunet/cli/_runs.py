@@ -35,12 +35,7 @@ def arguments(given: Sequence[str]) -> list[str]:
     extra = []
     if words[:1] == ["compare"]:  # it prints, and leaves no folder behind
         words = words[1:]
-        extra = [
-            "compare=true",
-            "hydra.run.dir=.",
-            "hydra.output_subdir=null",
-            "hydra/job_logging=stdout",
-        ]
+        extra = ["compare=true", "hydra.run.dir=.", "hydra.output_subdir=null"]
     plain = [
         word
         for before, word in zip(["", *words], words, strict=False)

@@ -84,7 +84,10 @@ class Odometer:
         model = read_model(path)
         pose = model.networks()[1]
         if pose is None:
-            raise ConfigError(f"{path} has no pose network (it was trained on stereo pairs), which a path needs")
+            raise ConfigError(
+                f"{path} has no pose network (it was trained on stereo pairs), which a path needs; give a model "
+                "trained on video, or ask for no trajectory"
+            )
         return cls(pose, model.record.height, model.record.width, scale or model.record.scale, device, batch_size)
 
     def restart(self) -> Odometer:
