@@ -66,6 +66,30 @@ def test_intrinsics_that_cannot_be_right_are_refused(tmp_path):
         calibration.intrinsics(1)
 
 
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ("0 0 0 0 0 0 0 0 0 0 0 0", r"P_rect_02 has K .*; expected \[\[fx, skew, cx\]"),
+        ("-50 0 30 3 0 50 10 0 0 0 1 0", "the lengths must be positive"),
+        ("1e-3 0 30 3 0 50 10 0 0 0 1 0", "a focal length is some 0.3 to 3 image widths"),
+        ("100 0 60 3 0 100 20 0 0 0 1 0", "the centre must lie inside"),  # of images twice as large
+        ("25 0 15 3 0 25 5 0 0 0 1 0", "near a corner it is that of images of another size"),  # half as large
+    ],
+)
+def test_a_k_that_cannot_belong_to_the_images_is_refused_before_it_is_solved(tmp_path, numbers, message):
+    calibration = read_calibration(write(tmp_path, CALIBRATION.replace("50 0 30 3 0 50 10 0 0 0 1 0", numbers)))
+    for use in (lambda: calibration.intrinsics(2), lambda: calibration.T_cam_cam(3, 2)):
+        with pytest.raises(DataError, match=message) as caught:
+            use()
+        assert str(tmp_path / "calib_cam_to_cam.txt") in str(caught.value)
+
+
+def test_an_image_without_size_is_named(tmp_path):
+    text = CALIBRATION.replace("S_rect_02: 6.000000e+01 2.0", "S_rect_02: 0 0.0")
+    with pytest.raises(DataError, match=r"S_rect_02 is 0 0; expected width and height"):
+        read_calibration(write(tmp_path, text))
+
+
 def test_a_missing_calibration_is_named(tmp_path):
     with pytest.raises(DataError, match=r"no calibration at .*calib_cam_to_cam.txt"):
         read_calibration(tmp_path)

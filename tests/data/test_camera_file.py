@@ -61,6 +61,11 @@ def test_intrinsics_follow_the_size_of_the_frames(tmp_path):
         ("image_size: [640, 0]\nK: [500, 500, 320, 240]\n", r"image_size is \[640, 0\]; expected whole numbers"),
         ("image_size: [640, 480]\nK: [500, 500, 700, 240]\n", "the centre must lie inside"),
         ("image_size: [640, 480]\nK: [0.8, 1.0, 0.5, 0.5]\n", "or normalised \\(then set normalised: true\\)"),
+        ("image_size: [621, 187]\nK: [721, 721, 609, 173]\n", "the centre must lie inside, not near the left or"),
+        ("image_size: [1242, 374]\nK: [180, 180, 152, 43]\n", "a focal length is some 0.3 to 3 image widths"),
+        ("image_size: [1242, 374]\nK: [360, 360, 304, 86]\n", "near a corner it is that of images of another size"),
+        ("image_size: [640, 480]\nK: [500, 1" + "0" * 400 + ", 320, 240]\n", "finite numbers, got '1000"),
+        ("image_size: [640, 480]\nK: [500, 1" + "0" * 5000 + ", 320, 240]\n", "camera.yaml cannot be read as YAML"),
         ("normalised: true\nK: [500, 500, 320, 240]\n", "normalised K has fx 500 and centre 320, 240"),
         ("normalised: maybe\nK: [1, 1, 0.5, 0.5]\n", "normalised is 'maybe'"),
         (GOOD + "distortion: [0.1, 0.2]\n", "distortion needs a list of 0 or 4 or 5 or 8"),
@@ -82,6 +87,22 @@ def test_intrinsics_follow_the_size_of_the_frames(tmp_path):
 def test_mistakes_are_one_sentence(tmp_path, text, message):
     with pytest.raises(DataError, match=message):
         read_camera(write(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "image_size: [1242, 375]\nK: [721.5, 721.5, 608.6, 171.9]\n",  # KITTI
+        "image_size: [1216, 352]\nK: [721.5, 721.5, 595.6, 148.9]\n",  # KITTI, cropped at the top and the sides
+        "image_size: [640, 192]\nK: [372, 368, 313, 88]\n",  # KITTI, squeezed
+        "image_size: [640, 240]\nK: [500, 510, 321, 2]\n",  # all above the horizon cut off
+        "image_size: [450, 480]\nK: [500, 510, 131, 242]\n",  # a third cut off at the left
+        "image_size: [1280, 720]\nK: [229, 229, 640, 360]\nmodel: fisheye\n",  # 180 degrees in a circle
+        "image_size: [1080, 1920]\nK: [1500, 1500, 540, 960]\n",  # a telephone held upright
+    ],
+)
+def test_cameras_and_crops_that_can_be_are_accepted(tmp_path, text):
+    assert read_camera(write(tmp_path, text)).K[0, 0] > 0
 
 
 def test_a_missing_file_is_named(tmp_path):
@@ -129,5 +150,5 @@ def test_a_point_is_found_where_k_says_after_undistortion_crop_and_size(model, k
 
 def test_frames_of_another_size_are_named():
     lens = Lens(camera([]), 200, 320)
-    with pytest.raises(DataError, match=r"a.png is 100x50 .* first frame of its clip is 320x200"):
+    with pytest.raises(DataError, match=r"a.png is 100x50 .* where other frames of its clip are 320x200"):
         lens(np.zeros((50, 100, 3), np.uint8), "a.png")

@@ -176,13 +176,29 @@ def test_another_size_within_a_clip_and_a_camera_that_does_not_fit(tmp_path):
     make_clip(tmp_path / "r", "a", [*pictures[:5], pictures[5][:100], *pictures[6:]])
     data = module(tmp_path / "r", static="keep", val_share=0.0)
     data.setup("fit")
-    with pytest.raises(DataError, match=r"frame_5.png is 320x100 .* first frame of its clip is 320x200"):
+    with pytest.raises(DataError, match=r"frame_5.png is 320x100 .* where other frames of its clip are 320x200"):
         list(data.train_dataloader())
-    (tmp_path / "r" / "camera.yaml").write_text(CAMERA.replace("320, 200", "1920, 1080").replace("158.0", "960"))
+    (tmp_path / "r" / "camera.yaml").write_text("image_size: [1920, 1080]\nK: [1500, 1512, 960, 540]\n")
     wrong = module(tmp_path / "r", static="keep", val_share=0.0)
     wrong.setup("fit")
     with pytest.raises(DataError, match=r"frames of 'a' \(frame_0.png\) are 320x200 .* is for 1920x1080"):
         list(wrong.train_dataloader())
+
+
+@pytest.mark.parametrize("first", ["empty", "small"])
+@pytest.mark.parametrize("static", ["keep", "drop"])
+def test_a_bad_first_frame_is_skipped_and_no_other(tmp_path, first, static):
+    pictures = frames(16)
+    folder = make_clip(tmp_path / "r", "a", [pictures[0][:100], *pictures[1:]])
+    if first == "empty":
+        (folder / "frame_0.png").write_bytes(b"")
+    data = module(tmp_path / "r", on_error="skip", static=static, val_share=0.25)
+    data.setup()
+    list(data.train_dataloader())
+    measured = first == "empty" and static == "drop"  # then there is no frame 0, and without it no window
+    assert data.skipped() == ([] if measured else ["a 0000000001"])
+    assert len(names(data, "val")) >= 2
+    assert all(usage.left_out["unreadable"] == 0 for usage in data.usage["val"])
 
 
 def test_what_is_missing_is_one_sentence(tmp_path):

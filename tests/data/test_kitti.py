@@ -84,6 +84,32 @@ def test_images_of_another_shape_are_refused(tmp_path):
         KittiRaw(tmp_path).drive(name(1)).intrinsics(0)
 
 
+def test_images_made_smaller_need_the_size_of_the_originals(tmp_path):
+    make_drive(tmp_path, 1, size=(10, 30))
+    calibration = tmp_path / DATE / "calib_cam_to_cam.txt"
+    lines = calibration.read_text().splitlines()
+    calibration.write_text("\n".join(line for line in lines if not line.startswith("S_rect")))
+    with pytest.raises(DataError, match=r"P_rect_02 \(without S_rect\) has .* centre 30, 10 for an image of 10x30"):
+        KittiRaw(tmp_path).drive(name(1)).intrinsics(0)
+
+
+@pytest.mark.parametrize("with_size", [True, False])
+@pytest.mark.parametrize("first", [b"", (8, 12)])
+def test_a_bad_first_frame_decides_nothing(tmp_path, first, with_size):
+    make_drive(tmp_path, 1)
+    path = tmp_path / name(1) / "image_02" / "data" / "0000000000.png"
+    if first:
+        cv2.imwrite(str(path), np.zeros((*first, 3), np.uint8))
+    else:
+        path.write_bytes(first)
+    if not with_size:
+        calibration = tmp_path / DATE / "calib_cam_to_cam.txt"
+        calibration.write_text(calibration.read_text().replace("S_rect", "s_rect"))
+    drive = KittiRaw(tmp_path).drive(name(1))
+    assert drive.intrinsics(1)[0].tolist() == [50, 0, 29]
+    assert drive.native_size == drive.frame_size == (20, 60)
+
+
 def test_an_absent_drive_has_no_frames(tmp_path):
     make_drive(tmp_path, 1)
     raw = KittiRaw(tmp_path)

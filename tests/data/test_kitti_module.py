@@ -160,6 +160,19 @@ def test_a_broken_frame_is_named_when_it_is_read(tmp_path):
         list(data.train_dataloader())
 
 
+def test_a_bad_first_frame_is_skipped_and_no_other(tmp_path):
+    for number in (1, 2):
+        drive = make_drive(tmp_path, number)
+        (drive / "image_02" / "data" / "0000000000.png").write_bytes(b"")
+    data = module(tmp_path, val_drives=[name(2)], cameras=["left"], on_error="skip")
+    with pytest.warns(UserWarning, match=r"frame left out: .*0000000000\.png is empty"):
+        data.setup("fit")
+    with pytest.warns(UserWarning, match=r"sample skipped: .*0000000000\.png is empty"):
+        list(data.train_dataloader())
+    assert data.skipped() == [f"{name(1)} 0000000001 l"]
+    assert names(data, "val") == [f"{name(2)} {number:010d} l" for number in (2, 3, 4)]
+
+
 def test_real_frames(kitti_mini):
     data = module(kitti_mini, height=96, width=320, test_split="all", target_depth=True)
     data.setup()

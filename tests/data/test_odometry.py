@@ -47,6 +47,39 @@ def test_sequence(root):
     assert OdometrySequence(root, "09").pose(3) is None
 
 
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ("0 0 0 0 0 0 0 0 0 0 0 0", r"P2 has K .*; expected \[\[fx, skew, cx\]"),
+        ("0 0 30 -25 0 0 10 0 0 0 1 0", "the lengths must be positive"),
+        ("-50 0 300 -25 0 50 300 0 0 0 1 0", "the lengths must be positive"),
+        ("100 0 60 -50 0 100 20 0 0 0 1 0", "the centre must lie inside"),  # of images twice as large
+    ],
+)
+def test_a_k_that_does_not_belong_to_the_images_is_named(root, numbers, message):
+    calibration = root / "sequences" / "00" / "calib.txt"
+    calibration.write_text(calibration.read_text().replace("50 0 30 -25 0 50 10 0 0 0 1 0", numbers))
+    with pytest.raises(DataError, match=rf"sequences.00.calib\.txt: {message}" if "P2" in message else message):
+        module(root).setup("fit")
+
+
+def test_a_bad_first_frame_decides_nothing_and_odd_frames_are_named_or_skipped(root):
+    images = root / "sequences" / "00" / "image_2"
+    (images / "000000.png").write_bytes(b"")
+    for number in (5, 6, 7):  # neighbours of one size, which is not that of the calibration
+        cv2.imwrite(str(images / f"{number:06d}.png"), np.zeros((12, 30), np.uint8))
+    data = module(root, val_share=0.0)
+    data.setup("fit")
+    with pytest.raises(DataError, match=r"image_2.00000\d\.png is (empty|30x12 .* the frames of 'odometry/00 l' are)"):
+        list(data.train_dataloader())
+    skipping = module(root, val_share=0.0, on_error="skip")
+    skipping.setup("fit")
+    with pytest.warns(UserWarning, match="sample skipped"):
+        list(skipping.train_dataloader())
+    assert len(skipping.skipped()) == 6  # 1; 4 to 8
+    assert len(skipping.datasets["train"]) == 8
+
+
 def test_root_is_found_around_the_sequences(root):
     for given in (root, root / "sequences", root.parent / root.name):
         assert find_root(given) == root

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saunet.checks import DataError
+from saunet.data.intrinsics import check_intrinsics
 
 Array = NDArray[np.float64]
 _CAMERA_KEYS = {
@@ -116,13 +117,8 @@ class KittiCalibration:
             known = ", ".join(f"{each:02d}" for each in self.projections) or "none"
             raise DataError(f"{self.path} has no P_rect_{camera:02d}; cameras in it: {known}")
         K = self.projections[camera][:, :3]
-        height, width = self.sizes.get(camera, (math.inf, math.inf))
-        if not (K[0, 0] > 0 and K[1, 1] > 0 and 0 < K[0, 2] < width and 0 < K[1, 2] < height):
-            raise DataError(
-                f"{self.path}: P_rect_{camera:02d} has focal lengths {K[0, 0]:g}, {K[1, 1]:g} and centre "
-                f"{K[0, 2]:g}, {K[1, 2]:g} for an image of {height}x{width} (height x width); "
-                "the lengths must be positive and the centre inside"
-            )
+        height, width = self.sizes.get(camera, (None, None))
+        check_intrinsics(K, height, width, f"{self.path}: P_rect_{camera:02d}")
         return zero_based(K)
 
 
@@ -152,6 +148,10 @@ def read_calibration(folder: Path) -> KittiCalibration:
     for camera in range(4):
         if f"S_rect_{camera:02d}" in cameras:
             width, height = cameras[f"S_rect_{camera:02d}"]
+            if min(width, height) < 2:
+                raise DataError(
+                    f"{path}: S_rect_{camera:02d} is {width:g} {height:g}; expected width and height in pixels"
+                )
             sizes[camera] = (int(height), int(width))
     return KittiCalibration(path, projections, sizes, cameras["R_rect_00"], _read_scanner(folder))
 

@@ -17,7 +17,6 @@ needed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +29,7 @@ from numpy.typing import NDArray
 
 from saunet.atomic import write_bytes
 from saunet.checks import DataError, SaunetError, suggest
+from saunet.data.intrinsics import check_intrinsics
 from saunet.geometry.camera import crop_intrinsics, scale_intrinsics
 
 FILE_NAME = "camera.yaml"
@@ -47,8 +47,14 @@ _KEYS = (
     "crop",
     "reprojection_error",
 )
+FIX = "is K in pixels of images of this size, or normalised (then set normalised: true)?"
+"""What to look at where K cannot belong to the images."""
 _SAME_SHAPE = 0.02
 """Relative difference of the two aspect ratios up to which a frame is the calibrated image at another size."""
+
+
+_LARGEST = 1e300
+"""Beyond it a whole number is no float; NaN and infinity are not within it either."""
 
 
 @dataclass(frozen=True)
@@ -90,25 +96,8 @@ class CameraFile:
                 )
             scaled = scale_intrinsics(given, width / columns, height / rows)
         K: NDArray[np.float64] = scaled.numpy()
-        check_intrinsics(K, height, width, str(self.path))
+        check_intrinsics(K, height, width, f"{self.path}: K", FIX)
         return K
-
-
-def check_intrinsics(K: NDArray[np.float64], height: int, width: int, where: str) -> None:
-    """Check that K can belong to an image: positive focal lengths, a possible field of view, the centre inside.
-
-    Raises:
-        DataError: naming what cannot be.
-    """
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    told = f"{where}: K has focal lengths {fx:g}, {fy:g} and centre {cx:g}, {cy:g} for an image {width}x{height}"
-    if not (0.1 * width < fx < 20 * width and 0.1 * height < fy < 20 * max(height, width)):
-        raise DataError(
-            f"{told} (width x height); a focal length is some 0.3 to 3 image widths: is K in pixels of this size, "
-            "or normalised (then set normalised: true)?"
-        )
-    if not (0 < cx < width - 1 and 0 < cy < height - 1):
-        raise DataError(f"{told} (width x height); the centre must lie inside: K does not belong to this image size")
 
 
 def read_camera(path: str | Path) -> CameraFile:
@@ -124,7 +113,7 @@ def read_camera(path: str | Path) -> CameraFile:
         raise DataError(
             f"no camera file at {path}; make one with saunet-calibrate, or write one (see docs/your_camera.md)"
         ) from reason
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as reason:
+    except (OSError, ValueError, yaml.YAMLError) as reason:  # ValueError: no text, no date, a number without end
         raise DataError(f"{path} cannot be read as YAML: {' '.join(str(reason).split())}") from reason
     if not isinstance(plain, dict):
         raise DataError(f"{path} holds {type(plain).__name__}; expected keys such as 'K: [fx, fy, cx, cy]'")
@@ -169,7 +158,7 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
         reprojection_error=_positive(path, "reprojection_error", plain.get("reprojection_error")),
     )
     if size is not None:
-        check_intrinsics(camera.K, *size, str(path))
+        check_intrinsics(camera.K, *size, f"{path}: K", FIX)
     elif not (0.1 < camera.K[0, 0] < 20 and 0 < camera.K[0, 2] < 1 and 0 < camera.K[1, 2] < 1):
         raise DataError(
             f"{path}: normalised K has fx {camera.K[0, 0]:g} and centre {camera.K[0, 2]:g}, {camera.K[1, 2]:g}; "
@@ -214,7 +203,7 @@ def _numbers(path: Path, key: str, value: Any, counts: Sequence[int]) -> list[fl
         got = f"{len(value)}" if isinstance(value, list) else repr(value)[:40]
         raise DataError(f"{path}: {key} needs a list of {allowed} numbers, got {got}")
     for number in value:
-        if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
+        if isinstance(number, bool) or not isinstance(number, int | float) or not abs(number) <= _LARGEST:
             raise DataError(f"{path}: {key} needs {allowed} finite numbers, got {str(number)[:40]!r} among them")
     return [float(number) for number in value]
 

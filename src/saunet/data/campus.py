@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saunet.data.clips import Clip, Recording
+from saunet.data.frame_size import common_size
 from saunet.data.lens import Lens
 from saunet.data.motion import Motion, even_steps
-from saunet.images import image_size, read_image
+from saunet.images import read_image
 
 LONGEST_STEP = 5.0
 """Seconds between two frames beyond which they are no neighbours: too much has moved meanwhile."""
@@ -91,7 +92,7 @@ class CampusDrive:
         """Return the frame, undistorted and cropped, h x w x 3, RGB.
 
         Raises:
-            DataError: naming the file, if it is broken or has another size than the first of the clip.
+            DataError: naming the file, if it is broken or has another size than most frames of the clip.
         """
         path = self.path(index)
         return self._lens(read_image(path), str(path))
@@ -114,8 +115,8 @@ class CampusDrive:
 
     @functools.cached_property
     def _lens(self) -> Lens:
-        first = self.path(self._indices[0])
-        return Lens(self.clip.camera, *image_size(first), self._crop, f"the frames of '{self.name}' ({first.name})")
+        example, size = common_size([self.path(index) for index in self._indices])
+        return Lens(self.clip.camera, *size, self._crop, f"the frames of '{self.name}' ({example.name})")
 
 
 def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tuple[dict[int, int], dict[str, int]]:

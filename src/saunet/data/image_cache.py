@@ -154,6 +154,11 @@ class CachedDrive:
         return getattr(self._drive, name)
 
     @property
+    def frame_size(self) -> tuple[int, int]:
+        """(height, width) of the copies."""
+        return self._cache.settings.height, self._cache.settings.width
+
+    @property
     def indices(self) -> Sequence[int]:
         """Numbers of the frames that exist, ascending."""
         return self._drive.indices

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from saunet.checks import DataError, one_of
 from saunet.data.calibration import KittiCalibration, read_calibration
+from saunet.data.frame_size import common_size
+from saunet.data.intrinsics import check_intrinsics
 from saunet.data.lidar import lidar_depth, read_scan
 from saunet.data.static import oxts_speed
 from saunet.geometry.camera import scale_intrinsics
-from saunet.images import image_size, read_depth, read_image
+from saunet.images import read_depth, read_image
 
 DepthKind = Literal["camera_z", "lidar_x", "improved"]
 DEPTH_KINDS = ("camera_z", "lidar_x", "improved")
@@ -79,31 +81,42 @@ class KittiDrive:
         """Return K of this camera on this date, in pixels of `image`; images made smaller beforehand scale it.
 
         Raises:
-            DataError: if the images have another shape than the calibration says.
+            DataError: if the images have another shape than the calibration says, or K cannot be that of such images.
         """
         return self._intrinsics.copy()
 
     @functools.cached_property
     def _intrinsics(self) -> NDArray[np.float64]:
         K = self.calibration.intrinsics(self.number)
-        first = self.path(self._indices[0])
-        height, width = image_size(first)
+        example, (height, width) = self._common_size
         rows, columns = self.native_size
+        if self.number not in self.calibration.sizes:  # or else it was checked against that size
+            where = f"{self.calibration.path}: P_rect_{self.number:02d} (without S_rect)"
+            check_intrinsics(self.calibration.projections[self.number][:, :3], height, width, where)
         if (height, width) == (rows, columns):
             return K
         if abs(height / rows * columns / width - 1) > 0.02:
             raise DataError(
-                f"{first} has {height}x{width} (height x width) but {self.calibration.path} is for {rows}x{columns}; "
+                f"{example} has {height}x{width} (height x width) but {self.calibration.path} is for {rows}x{columns}; "
                 "use the original images or ones scaled as a whole"
             )
         return scale_intrinsics(torch.from_numpy(K), width / columns, height / rows).numpy()
+
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        """(height, width) of the images, which `intrinsics` belongs to."""
+        return self._common_size[1]
 
     @property
     def native_size(self) -> tuple[int, int]:
         """(height, width) of the original images, which ground truth has too."""
         if self.number in self.calibration.sizes:
             return self.calibration.sizes[self.number]
-        return image_size(self.path(self._indices[0]))
+        return self.frame_size
+
+    @functools.cached_property
+    def _common_size(self) -> tuple[Path, tuple[int, int]]:
+        return common_size([self.path(index) for index in self._indices])
 
     def has_depth(self, index: int) -> bool:
         """Tell whether there is ground truth for a frame, without reading it."""

@@ -11,7 +11,8 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from saunet.checks import DataError
-from saunet.data.camera_file import CameraFile, check_crop, check_intrinsics
+from saunet.data.camera_file import FIX, CameraFile, check_crop
+from saunet.data.intrinsics import check_intrinsics
 from saunet.geometry.camera import crop_intrinsics
 
 
@@ -49,7 +50,7 @@ class Lens:
         self._maps: tuple[NDArray[np.int16], NDArray[np.uint16]] | None = None
         if any(camera.distortion):
             K, self._maps = _undistortion(camera, recorded, height, width)
-            check_intrinsics(K, height, width, f"{camera.path}, after undistortion")
+            check_intrinsics(K, height, width, f"{camera.path}: K after undistortion", FIX)
         shares = camera.crop if crop is None else tuple(crop)
         check_crop(shares, "crop")
         self._rows = slice(round(shares[0] * height), height - round(shares[1] * height))
@@ -66,7 +67,7 @@ class Lens:
         if image.shape[:2] != self.recorded:
             height, width = self.recorded
             raise DataError(
-                f"{name} is {image.shape[1]}x{image.shape[0]} (width x height) where the first frame of its clip is "
+                f"{name} is {image.shape[1]}x{image.shape[0]} (width x height) where other frames of its clip are "
                 f"{width}x{height}; frames of a clip share one size"
             )
         if self._maps is not None:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from saunet.checks import DataError, one_of
 from saunet.data.calibration import read_matrices, zero_based
+from saunet.data.frame_size import common_size
+from saunet.data.intrinsics import check_intrinsics
 from saunet.data.kitti import frame_files
 from saunet.data.partners import distance_between
 from saunet.images import read_image
@@ -30,7 +32,8 @@ class OdometrySequence:
 
     Raises:
         ConfigError: for an unknown camera.
-        DataError: if the sequence or its calibration is missing or broken, or its file of poses is broken or empty.
+        DataError: if the sequence or its calibration is missing or broken or does not belong to the images, or its
+            file of poses is broken or empty.
     """
 
     def __init__(self, root: Path, sequence: str, camera: str = "colour_left") -> None:
@@ -52,6 +55,8 @@ class OdometrySequence:
         if key not in matrices:
             raise DataError(f"{folder / 'calib.txt'} lacks {key}; expected a line '{key}: ' with 12 numbers")
         self._K = matrices[key][:, :3]
+        _, self.frame_size = common_size([self.path(index) for index in self._indices])
+        check_intrinsics(self._K, *self.frame_size, f"{folder / 'calib.txt'}: {key}")
         # P = K [I | t] maps points of camera 0, so t is where camera 0 lies seen from this camera
         self._T_cam_cam0 = np.eye(4)
         self._T_cam_cam0[:3, 3] = np.linalg.solve(self._K, matrices[key][:, 3])
@@ -64,9 +69,13 @@ class OdometrySequence:
         """Numbers of the frames that exist, ascending."""
         return self._indices
 
+    def path(self, index: int) -> Path:
+        """Return the file of a frame."""
+        return self._images / self._files[index]
+
     def image(self, index: int) -> NDArray[np.uint8]:
         """Return the frame, h x w x 3, RGB; grey cameras give three equal channels."""
-        return read_image(self._images / self._files[index])
+        return read_image(self.path(index))
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
         """Return K of this camera, 3 x 3, in pixels counted from zero."""

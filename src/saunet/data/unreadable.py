@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from saunet.checks import DataError
+from saunet.data.frame_size import check_frame
 from saunet.data.windows import Selection, WindowDataset
 
 _PATIENCE = 100
@@ -60,7 +61,8 @@ def readable(selection: Selection, offsets: Sequence[int], with_depth: bool) -> 
     broken = set()
     for frame in sorted(needed):
         try:
-            drive.image(frame)
+            check_frame(drive, frame, drive.image(frame))
+            drive.intrinsics(frame)
             if with_depth and frame in selection.frames:
                 drive.depth(frame)
         except DataError as error:

@@ -19,6 +19,7 @@ from torch.utils.data import Dataset
 
 from saunet.checks import ConfigError, DataError
 from saunet.data.depth_maps import DepthMaps
+from saunet.data.frame_size import check_frame
 from saunet.data.partners import Odometer, partner_frames, partner_image
 from saunet.data.resize import resize_depth
 from saunet.data.sequences import Drive
@@ -178,6 +179,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         named = {f"frame {frame + offset}": drive.image(frame + offset) for offset in (0, *self.offsets)}
         if self.stereo:
             named[f"the stereo partner of frame {frame}"], T_stereo_tgt = partner_image(drive, frame)
+        check_frame(drive, frame, named[f"frame {frame}"])
         images = list(named.values())
         native = images[0].shape
         for what, image in named.items():
