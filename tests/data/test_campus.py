@@ -171,6 +171,20 @@ def test_a_video_that_cannot_be_decoded_is_named(tmp_path, content):
     assert not list((tmp_path / "cache").rglob("*"))
 
 
+def test_a_video_that_cannot_be_decoded_is_left_out_and_counted(tmp_path):
+    make_clip(tmp_path / "r", "a", frames(16))
+    (tmp_path / "r" / "b.avi").write_bytes(b"not a video")
+    with pytest.raises(DataError, match=r"b\.avi is not a video"):
+        module(tmp_path / "r").setup("fit")
+    data = module(tmp_path / "r", on_error="skip")
+    with pytest.warns(UserWarning, match=r"clip left out: .*b\.avi is not a video"):
+        data.setup("fit")
+    assert [drive.name for drive in data.drives()] == ["a"]
+    assert "1 clips that cannot be read" in data.summary("train")
+    with pytest.raises(DataError, match=r"hold no usable frame, such as .*b\.avi is not a video"), pytest.warns():
+        module(tmp_path / "r" / "b.avi", on_error="skip", camera=str(tmp_path / "r" / "camera.yaml")).setup("fit")
+
+
 def test_another_size_within_a_clip_and_a_camera_that_does_not_fit(tmp_path):
     pictures = frames(10)
     make_clip(tmp_path / "r", "a", [*pictures[:5], pictures[5][:100], *pictures[6:]])
@@ -252,8 +266,9 @@ def test_nothing_is_written_below_the_root(tmp_path):
     assert sorted((path, path.stat().st_mtime_ns) for path in [tmp_path / "r", *(tmp_path / "r").rglob("*")]) == before
 
 
-def test_a_cache_that_cannot_be_written_is_named(tmp_path):
+@pytest.mark.parametrize("on_error", ["raise", "skip"])
+def test_a_cache_that_cannot_be_written_is_named(tmp_path, on_error):
     make_video(tmp_path / "r" / "x.avi")
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(DataError, match=r"cannot keep the frames of .*x.avi in .*file.*set data.frames_cache"):
-        module(tmp_path / "r", frames_cache=str(tmp_path / "file" / "cache")).setup("fit")
+        module(tmp_path / "r", frames_cache=str(tmp_path / "file" / "cache"), on_error=on_error).setup("fit")

@@ -77,6 +77,59 @@ def test_without_records_flow_decides(tmp_path):
         data.setup("fit")
 
 
+def test_a_frame_that_cannot_be_read_is_named_or_passed_over(tmp_path):
+    drive = NumberDrive(indices=range(8))
+    place = [0, 0, 3, 6, None, 6, 6, 12]
+
+    def image(index):
+        if place[index] is None:
+            raise DataError("4 is empty")
+        return texture(place[index])
+
+    drive.image = image
+    with pytest.raises(DataError, match="4 is empty"):
+        static_by_flow(drive, range(8), 0.5)
+    assert static_by_flow(drive, range(8), 0.5, skip_unreadable=True) == {0, 1, 5, 6}
+
+
+@pytest.mark.parametrize("broken", ["empty", "small"])
+def test_static_frames_are_found_beside_a_bad_one(tmp_path, broken):
+    drive = make_drive(tmp_path, 1, frames=range(12), sides=(2,))
+    for frame in range(12):
+        picture = texture(3 * frame if frame != 4 else 9)[:20, :60]  # frame 4 is frame 3 again
+        cv2.imwrite(str(drive / "image_02" / "data" / f"{frame:010d}.png"), picture)
+    bad = drive / "image_02" / "data" / "0000000008.png"
+    bad.write_bytes(b"")
+    if broken == "small":
+        cv2.imwrite(str(bad), texture()[:7, :30])
+    options = {"root": str(tmp_path), "split": "all", "val_share": 0.0, "cameras": ["left"], "static": "flow"}
+    options |= {"height": 10, "width": 30, "batch_size": 2, "workers": 0}
+    with pytest.raises(DataError, match=r"0000000008\.png is (empty|30x7)"):
+        datamodules.build("kitti", **options).setup("fit")
+    data = datamodules.build("kitti", **options, on_error="skip")
+    data.setup("fit")
+    assert data.usage["train"][0].left_out["static"] == 1
+    with pytest.warns(UserWarning, match=r"sample skipped: .*0000000008\.png is (empty|30x7)"):
+        list(data.train_dataloader())
+    assert [each.split()[1] for each in data.skipped()] == [f"{frame:010d}" for frame in (7, 8, 9)]
+
+
+def test_a_broken_record_is_named_or_its_speed_unknown(tmp_path):
+    make_drive(tmp_path, 1, frames=range(12), sides=(2,))
+    records = tmp_path / name(1) / "oxts" / "data"
+    for frame in range(12):
+        record(records / f"{frame:010d}.txt", 8.0)
+    (records / "0000000000.txt").write_text("49.0 8.4")
+    options = {"root": str(tmp_path), "split": "all", "val_share": 0.0, "cameras": ["left"], "with_speed": True}
+    options |= {"height": 10, "width": 30, "batch_size": 2, "workers": 0, "static": "speed"}
+    with pytest.raises(DataError, match=r"0000000000\.txt: expected the 30 numbers"):
+        datamodules.build("kitti", **options).setup("fit")
+    data = datamodules.build("kitti", **options, on_error="skip")
+    with pytest.warns(UserWarning, match=r"speed unknown: .*0000000000\.txt"):
+        data.setup("fit")
+    assert len(data.datasets["train"]) == 10
+
+
 def test_a_real_moving_drive_is_not_static(kitti_mini):
     drive = KittiRaw(kitti_mini).drive("2011_09_26/2011_09_26_drive_9005_sync")
     assert static_by_flow(drive, range(6), 0.5) == set()

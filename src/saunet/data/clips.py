@@ -29,6 +29,10 @@ _ESTIMATE = 2
 """Frames by which a container's frame count may be off without anything being wrong."""
 
 
+class FramesCacheError(DataError):
+    """The folder for decoded frames and measurements cannot be written, which is no fault of a clip."""
+
+
 @dataclass(frozen=True)
 class Clip:
     """One recording on disk, before it was read."""
@@ -121,7 +125,8 @@ def read_clip(
         advance: Called with the frames decoded so far and their expected number, while a video is decoded.
 
     Raises:
-        DataError: if a video cannot be decoded or the cache cannot be written.
+        DataError: if a video cannot be decoded.
+        FramesCacheError: if the cache cannot be written.
     """
     if not clip.is_video:
         paths = frame_paths(clip.path)
@@ -181,7 +186,7 @@ def _decode(
             if not (folder / "clip.json").is_file():  # or else another process was faster
                 raise
     except OSError as reason:
-        raise DataError(
+        raise FramesCacheError(
             f"cannot keep the frames of {video} in {folder.parent}: {reason.strerror or reason}; "
             "set data.frames_cache to a folder with room that can be written"
         ) from reason

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from saunet.atomic import write_json
 from saunet.checks import DataError
+from saunet.data.clips import FramesCacheError
 from saunet.data.static import FLOW_WIDTH, MIN_FLOW, median_flow
 from saunet.images import read_image, resize
 
@@ -82,8 +83,8 @@ def measure(
         advance: Called after every image.
 
     Raises:
-        DataError: naming the first image that cannot be read, unless ``skip_unreadable``; or if the cache cannot be
-            written.
+        DataError: naming the first image that cannot be read, unless ``skip_unreadable``.
+        FramesCacheError: if the cache cannot be written.
     """
     file = cache / f"motion-{_key(paths, crop)}.json" if cache else None
     known = _read(file, len(paths)) if file else None
@@ -106,7 +107,7 @@ def measure(
     found = Motion(flow, change, tuple(unreadable))
     if file:
         plain = {"flow": _plain(flow), "change": _plain(change), "unreadable": unreadable}
-        write_json(file, plain, indent=None)
+        write_json(file, plain, FramesCacheError, indent=None)
     return found
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saunet.checks import DataError
+from saunet.data.frame_size import check_frame
 from saunet.data.sequences import Drive
 
 FLOW_WIDTH = 320
@@ -65,19 +66,30 @@ def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def static_by_flow(drive: Drive, frames: Sequence[int], min_flow: float) -> set[int]:
+def static_by_flow(drive: Drive, frames: Sequence[int], min_flow: float, *, skip_unreadable: bool = False) -> set[int]:
     """Return the frames that look like the frame before them (after them for the first), each image decoded once.
 
     Args:
         drive: The recording.
         frames: The frames to judge.
         min_flow: Median flow in pixels, at 320 pixels width, from which a frame counts as moving.
+        skip_unreadable: Count frames that cannot be read as moving in place of raising; who reads them later says so.
+
+    Raises:
+        DataError: naming the first frame that cannot be read or has another size, unless ``skip_unreadable``.
     """
     existing, wanted = set(drive.indices), set(frames)
     static: set[int] = set()
     last: tuple[int, NDArray[np.uint8]] | None = None
     for frame in sorted(existing & (wanted | {each - 1 for each in wanted} | {each + 1 for each in wanted})):
-        image = drive.image(frame)
+        try:
+            image = drive.image(frame)
+            check_frame(drive, frame, image)
+        except DataError:
+            if not skip_unreadable:
+                raise
+            existing.discard(frame)  # the frame after it is then judged as a first one
+            continue
         if last is not None and last[0] == frame - 1 and median_flow(last[1], image) < min_flow:
             static.add(frame)
             if frame - 2 not in existing:

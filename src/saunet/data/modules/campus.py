@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -12,7 +13,7 @@ from rich.progress import Progress
 from saunet.checks import ConfigError, DataError, in_range, one_of, positive
 from saunet.data.camera_file import check_crop
 from saunet.data.campus import CampusDrive
-from saunet.data.clips import Clip, default_cache, find_clips, read_clip
+from saunet.data.clips import Clip, FramesCacheError, default_cache, find_clips, read_clip
 from saunet.data.module import DepthDataModule
 from saunet.data.motion import measure
 from saunet.data.splits import Frame, hold_out
@@ -117,6 +118,7 @@ class CampusDataModule(DepthDataModule):
         self.frames_cache = default_cache() if frames_cache is None else Path(frames_cache).expanduser()
         self.max_width = int(positive("max_width", max_width))
         self._drives: list[CampusDrive] | None = None
+        self._broken: list[str] = []
 
     def prepare_data(self) -> None:
         """Decode videos and measure motion on one process, before the others look."""
@@ -137,7 +139,7 @@ class CampusDataModule(DepthDataModule):
                     one_of("conditions", condition, found)
                 clips = [clip for clip in clips if clip.camera.condition in self.conditions]
             with bar(self._place()[0] == 0) as shown:
-                self._drives = [self._drive(clip, shown) for clip in clips]
+                self._drives = [drive for drive in (self._usable_drive(clip, shown) for clip in clips) if drive]
         return self._drives
 
     @property
@@ -155,7 +157,8 @@ class CampusDataModule(DepthDataModule):
         """
         drives = {drive.name: drive for drive in self.drives()}
         if not any(drive.indices for drive in drives.values()):
-            raise DataError(f"the clips below {self.root} hold no usable frame, such as {next(iter(drives))}")
+            example = next(iter(drives), None) or self._broken[0]
+            raise DataError(f"the clips below {self.root} hold no usable frame, such as {example}")
         test = _matching(self.test_clips, list(drives), "test_clips")
         named = _matching(self.val_clips, [name for name in drives if name not in test], "val_clips")
         rest = {name: drive for name, drive in drives.items() if name not in test and name not in named}
@@ -183,12 +186,24 @@ class CampusDataModule(DepthDataModule):
             left_out = {} if split == "val" else dict(drive.left_out)
             if split == "train" and place == 0:
                 left_out["between training and validation"] = unused
+                left_out["clips that cannot be read"] = len(self._broken)
             if self.static == "drop" and split in ("train", "val"):
                 static = drive.static()
                 left_out["static"] = sum(frame in static for frame in wanted)
                 wanted = [frame for frame in wanted if frame not in static]
             selections.append(Selection(drive, wanted, left_out))
         return selections
+
+    def _usable_drive(self, clip: Clip, shown: Progress) -> CampusDrive | None:
+        """Return a clip as a drive; None where it cannot be read and that is to be skipped."""
+        try:
+            return self._drive(clip, shown)
+        except DataError as error:
+            if self.on_error != "skip" or isinstance(error, FramesCacheError):
+                raise
+            warnings.warn(f"clip left out: {error}", stacklevel=2)
+            self._broken.append(str(error))
+            return None
 
     def _drive(self, clip: Clip, shown: Progress) -> CampusDrive:
         task = shown.add_task(f"decoding {clip.path.name}", total=None, visible=clip.is_video)

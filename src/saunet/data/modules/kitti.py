@@ -11,16 +11,14 @@ from saunet.checks import ConfigError, DataError, in_range, one_of, suggest
 from saunet.data import splits
 from saunet.data.depth_maps import DENSE_KINDS, DepthMaps
 from saunet.data.image_cache import ImageCache
-from saunet.data.kitti import CAMERA_HEIGHT, CAMERAS, DEPTH_KINDS, DepthKind, KittiDrive, KittiRaw
+from saunet.data.kitti import CAMERA_HEIGHT, CAMERAS, DEPTH_KINDS, DepthKind, KittiRaw
 from saunet.data.module import DepthDataModule
 from saunet.data.partners import measured_distance
 from saunet.data.splits import Frame
-from saunet.data.static import MIN_FLOW, static_by_flow
+from saunet.data.standing import has_speed, moving
 from saunet.data.windows import Selection, reach
 from saunet.registry import datamodules
 
-MIN_SPEED = 0.5
-"""Metres a second under which a car counts as standing."""
 _PROTOCOLS = {"camera_z": "eigen_camera_z", "lidar_x": "eigen_lidar_x", "improved": "eigen_improved"}
 
 
@@ -144,6 +142,7 @@ class KittiDataModule(DepthDataModule):
             DataError: if there is no data root, or none of the split's drives is there.
         """
         raw = self._raw = self._raw or KittiRaw(self.root)
+        skip = self.on_error == "skip"
         if split in ("train", "val"):
             sides = {CAMERAS[camera][1] for camera in self.cameras}
             frames = [frame for frame in self._training(raw)[split == "val"] if frame.side in sides]
@@ -155,7 +154,7 @@ class KittiDataModule(DepthDataModule):
         kind: DepthKind = "camera_z" if split == "train" and self._depth == "lidar_x" else self._depth
         selections = _group(raw, frames, kind, between)
         if self.static != "keep" and split in ("train", "val"):
-            selections = [_moving(selection, by_speed=self.static == "speed") for selection in selections]
+            selections = [moving(each, by_speed=self.static == "speed", skip_unreadable=skip) for each in selections]
         if split == "test":
             selections = [_with_truth(selection) for selection in selections]
         if split == "train" and self.target_depth and not any(map(_has_truth, selections)):
@@ -163,7 +162,7 @@ class KittiDataModule(DepthDataModule):
                 f"target_depth is true but no training frame below {raw.root} has {kind} depth; "
                 "add the velodyne_points, or set data.target_depth=false"
             )
-        if split == "train" and self.odometer and not any(map(_has_speed, selections)):
+        if split == "train" and self.odometer and not any(has_speed(each, skip) for each in selections):
             raise DataError(
                 f"with_speed is true but no training frame below {raw.root} has an OXTS record; "
                 "add the oxts folders, or set data.with_speed=false"
@@ -266,22 +265,6 @@ def _group(
         )
         for (drive, side), wanted in numbers.items()
     ]
-
-
-def _moving(selection: Selection, by_speed: bool) -> Selection:
-    drive = selection.drive
-    existing = set(drive.indices)
-    frames = [frame for frame in selection.frames if frame in existing]
-    speeds = {frame: drive.speed(frame) if by_speed else None for frame in frames}  # type: ignore[attr-defined]
-    static = {frame for frame, speed in speeds.items() if speed is not None and speed < MIN_SPEED}
-    static |= static_by_flow(drive, [frame for frame, speed in speeds.items() if speed is None], MIN_FLOW)
-    kept = [frame for frame in selection.frames if frame not in static]
-    return Selection(drive, kept, {**selection.left_out, "static": len(static)})
-
-
-def _has_speed(selection: Selection) -> bool:
-    drive = selection.drive
-    return isinstance(drive, KittiDrive) and any(drive.speed(frame) is not None for frame in selection.frames)
 
 
 def _has_truth(selection: Selection) -> bool:
