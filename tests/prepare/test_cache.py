@@ -197,8 +197,74 @@ def test_broken_originals_stop_or_are_skipped(tree, tmp_path):
     ]
 
 
-def test_frames_of_two_sizes_are_named(tree, tmp_path):
+def test_frames_of_two_sizes_are_named_or_skipped(tree, tmp_path):
     odd = tree / name(1) / "image_02" / "data" / "0000000002.png"
     cv2.imwrite(str(odd), np.zeros((22, 60, 3), np.uint8))
-    with pytest.raises(DataError, match="have different sizes: 20x60 and 22x60"):
-        build_cache(kitti_recordings(tree, ["left"]), tmp_path / "cache", SMALL)
+    recordings = kitti_recordings(tree, ["left"])
+    with pytest.raises(DataError, match=r"0000000002\.png is 60x22 .* where the frames of '.*' are 60x20"):
+        build_cache(recordings, tmp_path / "cache", SMALL)
+    report = build_cache(recordings, tmp_path / "cache", SMALL, on_error="skip")
+    assert len(report.failures) == 1
+    assert "0000000002.png is 60x22" in report.failures[0]
+    listed = ImageCache(tmp_path / "cache").frames(recordings[0][0])
+    assert list(listed["frames"]) == [f"{number:010d}" for number in (0, 1, 3, 4, 5)]
+    again = build_cache(recordings, tmp_path / "cache", SMALL, on_error="skip")
+    assert (again.made, again.verified, len(again.failures)) == (0, 9, 1)
+
+
+def test_frames_of_two_sizes_are_named_where_the_recording_does_not_know_its_size(tmp_path):
+    class Drive:
+        name = "x"
+        indices = (0, 1)
+
+        def image(self, index):
+            return np.zeros((20 + 2 * index, 60, 3), np.uint8)
+
+        intrinsics = depth = pose = None
+
+    with pytest.raises(DataError, match=r"have different sizes: 20x60 \(frame 0\) and 22x60 \(frame 1\)"):
+        build_cache([(Drive(), [0, 1])], tmp_path / "cache", SMALL)
+
+
+def test_copies_of_changed_originals_are_made_again(tree, tmp_path):
+    recordings, folder = kitti_recordings(tree, ["left"]), tmp_path / "cache"
+    build_cache(recordings, folder, SMALL)
+    original = tree / name(1) / "image_02" / "data" / "0000000002.png"
+    before, copy = original.stat().st_mtime_ns, folder / name(1) / "l" / "0000000002.jpg"
+    cv2.imwrite(str(original), np.full((20, 60, 3), 200, np.uint8))
+    os.utime(original, ns=(before, before + 1))
+    report = build_cache(recordings, folder, SMALL)
+    assert (report.made, report.replaced, report.verified) == (1, 1, 9)
+    assert np.abs(read_image(copy).astype(int) - 200).max() < 5
+    os.utime(original, ns=(before, before + 2))  # touched, but the same picture
+    assert build_cache(recordings, folder, SMALL).verified == 10
+    listed = json.loads((folder / name(1) / "l" / "frames.json").read_text())
+    assert listed["originals"]["0000000002"] == [original.stat().st_size, before + 2]
+    del listed["originals"]  # as older versions wrote it: then all are compared
+    (folder / name(1) / "l" / "frames.json").write_text(json.dumps(listed))
+    cv2.imwrite(str(original), np.full((20, 60, 3), 100, np.uint8))
+    assert build_cache(recordings, folder, SMALL).replaced == 1
+    cv2.imwrite(str(original), np.full((10, 30, 3), 100, np.uint8))
+    for number in (0, 1, 3, 4, 5):
+        cv2.imwrite(str(original.with_name(f"{number:010d}.png")), np.full((10, 30, 3), 100, np.uint8))
+    with pytest.raises(DataError, match=r"frame 0 of '.*' has 10x30 .* come from 20x60; delete .* to make them anew"):
+        build_cache(kitti_recordings(tree, ["left"]), folder, SMALL)
+
+
+@pytest.mark.parametrize(
+    "content", ["{}", "[1]", "x", '{"native": [20], "frames": {}}', '{"native": [20, 60]}', '{"frames": {}}']
+)
+def test_a_damaged_list_is_one_sentence(tree, tmp_path, content):
+    recordings, folder = kitti_recordings(tree, ["left"]), tmp_path / "cache"
+    build_cache(recordings, folder, SMALL)
+    before = json.loads((folder / name(1) / "l" / "frames.json").read_text())
+    (folder / name(1) / "l" / "frames.json").write_text(content)
+    for use in (
+        lambda: build_cache(recordings, folder, SMALL),
+        lambda: ImageCache(folder).drive(recordings[0][0], [0]),
+    ):
+        with pytest.raises(DataError, match=r"frames\.json is damaged; delete it and run saunet-prepare cache again"):
+            use()
+    (folder / name(1) / "l" / "frames.json").unlink()
+    assert build_cache(recordings, folder, SMALL).verified == 10
+    assert json.loads((folder / name(1) / "l" / "frames.json").read_text()) == before

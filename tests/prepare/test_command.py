@@ -36,7 +36,7 @@ def test_each_job_runs_and_leaves_only_its_results(command, tree, tmp_path):
     assert (code, out.strip()) == (0, "10 frames made, 0 were there, 0 have no scan, 0 skipped"), err
     code, out, err = command("cache", *where, "folder=cache", "height=10", "width=30", "workers=0", "format=webp")
     assert code == 0, err
-    assert out.startswith("10 copies made (0 in place of damaged ones), 0 verified")
+    assert out.startswith("10 copies made (0 in place of damaged or outdated ones), 0 verified")
     teacher = f"input=maps/{name(1)}/depth_linear/l"
     code, out, err = command("teacher", *where, "drives=[0001_sync]", teacher, "folder=maps")
     assert (code, out.strip()) == (0, "6 frames made, 0 were there, 0 skipped"), err

@@ -69,7 +69,8 @@ def _cache(cfg: dict[str, Any], recordings: Any, workers: int) -> tuple[str, ...
     settings = CacheSettings(*(cfg[key] for key in ("height", "width", "format", "quality")))
     done = build_cache(recordings, cfg["folder"], settings, workers, cfg["on_error"])
     print(
-        f"{done.made} copies made ({done.replaced} in place of damaged ones), {done.verified} verified: {cfg['folder']}"
+        f"{done.made} copies made ({done.replaced} in place of damaged or outdated ones), {done.verified} verified: "
+        f"{cfg['folder']}"
     )
     return done.failures
 

@@ -1,7 +1,7 @@
 """Smaller copies of recordings, decoded in a fraction of the time; made once by ``saunet-prepare cache``.
 
 ``cache.json`` says what all copies have in common; ``frames.json`` of each recording lists its frames with their bytes
-and hashes and is written last, so that a recording without it is not finished.
+and hashes, and bytes and time of the originals, and is written last, so that a recording without it is not finished.
 """
 
 from __future__ import annotations
@@ -98,7 +98,14 @@ class ImageCache:
             DataError: if the file is damaged.
         """
         path = self.home(drive) / FRAMES
-        return self._json(path) if path.is_file() else {}
+        if not path.is_file():
+            return {}
+        plain = self._json(path)
+        native, lists = plain.get("native"), (plain.get("frames"), plain.get("originals", {}))
+        whole = isinstance(native, list) and len(native) == 2 and all(isinstance(n, int) and n > 0 for n in native)
+        if not whole or not all(isinstance(each, dict) for each in lists):
+            raise _damaged(path)
+        return plain
 
     def drive(self, drive: Drive, needed: Iterable[int] = ()) -> CachedDrive:
         """Return a recording that reads the copies.
@@ -131,7 +138,11 @@ class ImageCache:
         try:
             return dict(json.loads(path.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError) as reason:
-            raise DataError(f"{path} is damaged; delete it and run saunet-prepare cache again") from reason
+            raise _damaged(path) from reason
+
+
+def _damaged(path: Path) -> DataError:
+    return DataError(f"{path} is damaged; delete it and run saunet-prepare cache again")
 
 
 class CachedDrive:

@@ -1,7 +1,8 @@
 """Smaller copies of recordings, made once, so that training does not decode full images again and again.
 
 Whatever happens, the folder is a part of the finished cache: each copy appears when it is whole, a recording's list of
-hashes when all its copies are there. Run again, it checks what is there against the lists and makes the rest.
+hashes when all its copies are there. Run again, it checks what is there against the lists and makes the rest, and those
+copies anew whose originals have changed.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ import numpy as np
 
 from saunet.atomic import write_bytes, write_json
 from saunet.checks import DataError
+from saunet.data.frame_size import check_frame
 from saunet.data.image_cache import FRAMES, SETTINGS, CacheSettings, ImageCache
 from saunet.data.sequences import Drive
 from saunet.images import resize
 from saunet.prepare.leftovers import remove_partial
 from saunet.prepare.pool import OnError, Work
 
-Entry = tuple[int, str, tuple[int, int]]
-"""Bytes and SHA-256 of a copy, and (height, width) of its original."""
+Entry = tuple[int, str, tuple[int, int], list[int] | None]
+"""Bytes and SHA-256 of a copy; (height, width) of its original, and the `_state` of the original's file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +38,7 @@ class CacheReport:
     verified: int
     """Copies that were there and are whole."""
     replaced: int
-    """Of those written now: copies that were there and damaged."""
+    """Of those written now: copies that were there and damaged, or made from an original that has changed."""
     failures: tuple[str, ...]
     """One sentence for each frame that was skipped because its original is broken."""
 
@@ -69,21 +71,40 @@ class _Copy:
 
     def __call__(self, item: tuple[int, int]) -> tuple[str, Entry]:
         drive, frame = self.drives[item[0]], item[1]
-        path, known = self.cache.path(drive, frame), self.known[item[0]]
-        there = path.is_file()
+        path, known, key = self.cache.path(drive, frame), self.known[item[0]], f"{frame:010d}"
+        there, state = path.is_file(), _state(drive, frame)
         if there:
-            entry = known.get("frames", {}).get(f"{frame:010d}")
             data = path.read_bytes()
             digest = hashlib.sha256(data).hexdigest()
-            if entry == [len(data), digest]:
-                return "verified", (len(data), digest, tuple(known["native"]))
+            same = known.get("originals", {}).get(key) == state
+            if same and known.get("frames", {}).get(key) == [len(data), digest]:
+                return "verified", (len(data), digest, tuple(known["native"]), state)
         image = drive.image(frame)
+        check_frame(drive, frame, image)
+        size = (image.shape[0], image.shape[1])
+        if known and size != tuple(known["native"]):
+            raise DataError(
+                f"frame {frame} of '{drive.name}' has {size[0]}x{size[1]} (height x width) and its cached copies come "
+                f"from {known['native'][0]}x{known['native'][1]}; delete {path.parent} to make them anew"
+            )
         fresh = encode(image, self.cache.settings)
-        digest = hashlib.sha256(fresh).hexdigest()
+        entry = (len(fresh), hashlib.sha256(fresh).hexdigest(), size, state)
         if there and data == fresh:
-            return "verified", (len(fresh), digest, image.shape[:2])
+            return "verified", entry
         write_bytes(path, fresh)
-        return "replaced" if there else "made", (len(fresh), digest, image.shape[:2])
+        return "replaced" if there else "made", entry
+
+
+def _state(drive: Drive, frame: int) -> list[int] | None:
+    """Return bytes and time of change (ns) of a frame's original file; None where there is none to ask."""
+    path = getattr(drive, "path", None)
+    if not callable(path):
+        return None
+    try:
+        found = Path(path(frame)).stat()
+    except OSError:  # reading it says what is wrong
+        return None
+    return [found.st_size, found.st_mtime_ns]
 
 
 def build_cache(
@@ -104,7 +125,7 @@ def build_cache(
 
     Raises:
         DataError: if the folder holds something else or a cache of another version or other settings, a frame is
-            broken, frames of a recording differ in size, or the system refuses to write.
+            broken or has another size than its recording, or the system refuses to write.
     """
     cache = _open(Path(folder).expanduser(), settings)
     homes = [cache.home(drive) for drive, _ in recordings]
@@ -150,15 +171,17 @@ def _open(folder: Path, settings: CacheSettings) -> ImageCache:
 
 def _finish(home: Path, drive: Drive, known: dict[str, Any], entries: dict[int, Entry]) -> None:
     """Write the list of a recording's copies; those of other runs stay in it."""
-    sizes = {tuple(size) for _, _, size in entries.values()}
-    sizes |= {tuple(known["native"])} if known else set()
-    if len(sizes) > 1:
+    sizes = {size: frame for frame, (_, _, size, _) in entries.items()}
+    if len(sizes) > 1:  # of a recording that does not know its size by itself
+        examples = " and ".join(f"{h}x{w} (frame {sizes[h, w]})" for h, w in sorted(sizes))
         raise DataError(
-            f"frames of '{drive.name}' have different sizes: {' and '.join(f'{h}x{w}' for h, w in sorted(sizes))} "
-            "(height x width); a cache needs one size a recording"
+            f"frames of '{drive.name}' have different sizes: {examples} (height x width); "
+            "a cache needs one size a recording"
         )
-    frames = dict(known.get("frames", {}))
-    frames |= {f"{frame:010d}": [count, digest] for frame, (count, digest, _) in entries.items()}
-    content = {"native": list(sizes.pop()), "frames": dict(sorted(frames.items()))}
+    frames, originals = dict(known.get("frames", {})), dict(known.get("originals", {}))
+    frames |= {f"{frame:010d}": [count, digest] for frame, (count, digest, _, _) in entries.items()}
+    originals |= {f"{frame:010d}": state for frame, (_, _, _, state) in entries.items() if state}
+    content: dict[str, Any] = {"native": list(*sizes), "frames": dict(sorted(frames.items()))}
+    content |= {"originals": dict(sorted(originals.items()))} if originals else {}
     if content != known:
         write_json(home / FRAMES, content, indent=0)
