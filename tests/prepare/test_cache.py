@@ -220,7 +220,10 @@ def test_frames_of_two_sizes_are_named_where_the_recording_does_not_know_its_siz
         def image(self, index):
             return np.zeros((20 + 2 * index, 60, 3), np.uint8)
 
-        intrinsics = depth = pose = None
+        def intrinsics(self, index):
+            return np.eye(3)
+
+        depth = pose = intrinsics
 
     with pytest.raises(DataError, match=r"have different sizes: 20x60 \(frame 0\) and 22x60 \(frame 1\)"):
         build_cache([(Drive(), [0, 1])], tmp_path / "cache", SMALL)

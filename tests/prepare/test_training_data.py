@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from prepare_tree import name
 
-from saunet.checks import DataError
+from saunet.checks import ConfigError, DataError
 from saunet.data.depth_maps import DepthMaps
 from saunet.data.image_cache import CacheSettings
 from saunet.data.resize import resize_depth
@@ -113,6 +113,23 @@ def test_the_other_camera_comes_from_the_cache_too(tree, tmp_path):
     assert sample["frames"].shape[0] == 2
     assert data.datasets["train"].drives[0].partner().image(0).shape == (10, 36, 3)
     assert sample["T_stereo_tgt"][0, 3] == pytest.approx(-0.5)
+
+
+def test_a_cache_smaller_than_the_training_size_is_refused_or_told(tree, tmp_path, recwarn):
+    recordings, cache = kitti_recordings(tree, ["left"]), str(tmp_path / "cache")
+    build_cache(recordings, cache, CacheSettings(10, 30))
+    for size in ({"height": 12}, {"width": 36}, {"height": 40, "width": 120}):
+        with pytest.raises(
+            ConfigError, match=r"holds images of 10x30 .* loads .* though the originals are larger; make"
+        ):
+            module(tree, cache=cache, **size).setup("fit")
+    module(tree, cache=cache, translate=0.0).setup("fit")
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r"holds images of 10x30 .* training loads 12x36, .* height=12 width=36"):
+        module(tree, cache=cache, translate=0.2).setup("fit")
+    build_cache(recordings, str(tmp_path / "full"), CacheSettings(20, 60))  # originals that are small themselves
+    module(tree, cache=str(tmp_path / "full"), height=40, width=120).setup("fit")
+    assert not recwarn.list
 
 
 def test_a_cache_that_does_not_fit_is_one_sentence(tree, tmp_path):

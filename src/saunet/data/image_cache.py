@@ -7,6 +7,7 @@ and hashes, and bytes and time of the originals, and is written last, so that a 
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from saunet.checks import DataError, in_range, one_of, positive
+from saunet.checks import ConfigError, DataError, in_range, one_of, positive
 from saunet.data.depth_maps import place
 from saunet.data.sequences import Drive, MeasuredDrive, StereoDrive
 from saunet.geometry.camera import scale_intrinsics
@@ -157,7 +158,8 @@ class CachedDrive:
     def __init__(self, drive: Drive, cache: ImageCache, frames: dict[str, Any]) -> None:
         self.name = drive.name
         self._drive, self._cache = drive, cache
-        self._native: tuple[int, int] = (frames["native"][0], frames["native"][1])
+        self.originals: tuple[int, int] = (frames["native"][0], frames["native"][1])
+        """(height, width) of the images that the copies were made from."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "_drive":  # while unpickling there is no drive to ask yet
@@ -196,9 +198,38 @@ class CachedDrive:
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
         """Return K in pixels of the smaller frame."""
-        settings, (height, width) = self._cache.settings, self._native
+        settings, (height, width) = self._cache.settings, self.originals
         K = torch.from_numpy(np.asarray(self._drive.intrinsics(index), dtype=np.float64))
         return scale_intrinsics(K, settings.width / width, settings.height / height).numpy()
+
+
+def check_enlarged(
+    cache: ImageCache, drives: Iterable[CachedDrive], size: tuple[int, int], margin: tuple[int, int]
+) -> None:
+    """Check that training does not enlarge copies of originals that are larger: detail that is there would be lost.
+
+    Args:
+        cache: The cache.
+        drives: Recordings that read it.
+        size: (height, width) of the images trained on.
+        margin: Rows and columns that frames are loaded larger. A cache without them is warned about only: its images
+            are enlarged by some percent, and making it anew takes long.
+
+    Raises:
+        ConfigError: if copies are smaller than ``size`` and their originals are not.
+    """
+    copies, loaded = (cache.settings.height, cache.settings.width), (size[0] + margin[0], size[1] + margin[1])
+    room = [tuple(map(min, loaded, drive.originals)) for drive in drives]
+    if not any(each[0] > copies[0] or each[1] > copies[1] for each in room):
+        return
+    told = (
+        f"the cache at {cache.folder} holds images of {copies[0]}x{copies[1]} (height x width) and training loads "
+        f"{loaded[0]}x{loaded[1]}, so that they are enlarged though the originals are larger"
+    )
+    fix = f"make another with height={loaded[0]} width={loaded[1]}, or set data.height, data.width or data.translate"
+    if any(min(each[0], size[0]) > copies[0] or min(each[1], size[1]) > copies[1] for each in room):
+        raise ConfigError(f"{told}; {fix}")
+    warnings.warn(f"{told}; {fix}", stacklevel=2)
 
 
 class CachedStereoDrive(CachedDrive):

@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader
 
 from saunet.checks import ConfigError, DataError, in_range, one_of, positive
 from saunet.data.depth_maps import DepthMaps
-from saunet.data.image_cache import CachedDrive, ImageCache
+from saunet.data.image_cache import CachedDrive, ImageCache, check_enlarged
 from saunet.data.manifest import read_manifest
 from saunet.data.partners import Odometer
 from saunet.data.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, evenly, share
@@ -172,7 +172,6 @@ class DepthDataModule(LightningDataModule):
                 f"frames need neighbours at {list(offsets)}{partner}: check the data root, the split and the offsets"
             )
         self.usage[split] = usage
-        margin = (round(self.height * self.translate), round(self.width * self.translate))
         kind = SkippingWindows if self.on_error == "skip" and split == "train" else WindowDataset
         return kind(
             self._recordings(split, selections, windows),
@@ -180,7 +179,7 @@ class DepthDataModule(LightningDataModule):
             offsets=offsets,
             height=self.height,
             width=self.width,
-            margin=margin if split == "train" else (0, 0),
+            margin=self._margin(split),
             with_depth=split in ("val", "test"),
             with_target_depth=self.target_depth and split in self.neighbours and "target_depth" not in self.maps,
             with_pose=self.with_pose and split in self.neighbours,
@@ -188,6 +187,10 @@ class DepthDataModule(LightningDataModule):
             odometer=self.odometer if split in self.neighbours else None,
             maps=self.maps if split in self.neighbours else {},
         )
+
+    def _margin(self, split: str) -> tuple[int, int]:
+        share = self.translate if split == "train" else 0.0
+        return round(self.height * share), round(self.width * share)
 
     def _recordings(
         self, split: str, selections: Sequence[Selection], windows: Sequence[tuple[int, int]]
@@ -199,10 +202,13 @@ class DepthDataModule(LightningDataModule):
         if self.on_error == "raise":  # else a copy that is missing is a sample to skip
             for position, frame in windows:
                 needed[position].update(frame + offset for offset in (0, *self.offsets))
-        return [
+        drives = [
             self.copies.drive(selection.drive, needed[position]) if position in needed else selection.drive
             for position, selection in enumerate(selections)
         ]
+        cached = [drive for drive in drives if isinstance(drive, CachedDrive)]
+        check_enlarged(self.copies, cached, (self.height, self.width), self._margin(split))
+        return drives
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Return shuffled training batches, the same for any number of devices."""
