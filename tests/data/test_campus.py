@@ -84,11 +84,31 @@ def test_stride_by_time_in_folders_and_videos(tmp_path):
     pictures = frames(20, 2)
     make_clip(tmp_path / "r", "b", pictures)
     make_video(tmp_path / "r" / "v.avi", pictures, fps=10)
-    data = module(tmp_path / "r", fps=5.0)
+    data = module(tmp_path / "r", fps=5.0, val_share=0.0)
     folder, video = data.drives()
     assert [drive.recorded(3) for drive in (folder, video)] == [6, 6]
     assert len(folder.indices) == len(video.indices) == 10
     assert np.array_equal(folder.image(3), pictures[6])
+    data.setup("fit")
+    assert [drive.left_out["passed over by fps"] for drive in (folder, video)] == [10, 10]
+    assert "20 passed over by fps" in data.summary("train")
+    facts = next((tmp_path / "cache").rglob("clip.json"))
+    facts.write_text(facts.read_text().replace('"count"', '"other"'))  # as older versions wrote it
+    assert module(tmp_path / "r", fps=5.0).drives()[1].left_out["passed over by fps"] == 9
+    facts.write_text(facts.read_text().replace('"numbers":', '"numbers": [], "n":'))
+    with pytest.raises(DataError, match=r"clip\.json is damaged"):
+        module(tmp_path / "r", fps=5.0).drives()
+
+
+def test_a_folder_is_one_clip_however_many_links_lead_to_it(tmp_path):
+    make_clip(tmp_path / "r", "a/b", frames(2))
+    (tmp_path / "r" / "loop").symlink_to(".")
+    (tmp_path / "r" / "a" / "0").symlink_to("b")
+    make_clip(tmp_path / "elsewhere", "c", frames(2), camera=None)
+    for link in ("x", "y"):
+        (tmp_path / "r" / link).symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "back").symlink_to(tmp_path / "r")
+    assert [clip.name for clip in find_clips(tmp_path / "r")] == ["a/b", "x/c"]
 
 
 def test_doubled_and_static_frames_are_left_out_and_counted(tmp_path):

@@ -68,7 +68,7 @@ class Board:
             if columns * rows // 2 > len(words.bytesList):
                 raise ConfigError(
                     f"dictionary {dictionary} has {len(words.bytesList)} markers and the board needs "
-                    f"{columns * rows // 2}; choose a larger one, such as DICT_4X4_250"
+                    f"{columns * rows // 2}; {_larger(columns * rows // 2)}"
                 )
             self._charuco = cv2.aruco.CharucoBoard((columns, rows), self.square, marker * self.square, words)
             self._detector = cv2.aruco.CharucoDetector(self._charuco)
@@ -113,3 +113,11 @@ class Board:
             return None
         points = np.asarray(self._charuco.getChessboardCorners())[np.asarray(numbers).ravel()]
         return BoardView(points.astype(np.float32), np.asarray(corners, dtype=np.float32).reshape(-1, 2))
+
+
+def _larger(markers: int) -> str:
+    """Say what to do for a board of so many markers: the smallest of OpenCV's usual dictionaries that has them."""
+    for size in (50, 100, 250, 1000):
+        if markers <= size:
+            return f"choose a larger one, such as DICT_4X4_{size}"
+    return "use fewer squares; the largest usual dictionaries, such as DICT_4X4_1000, have 1000"

@@ -74,9 +74,9 @@ def calibrate(
     positive("max_error", max_error)
     most = max(FEWEST_VIEWS, int(positive("views", views)))
     found: list[BoardView] = []
-    looked_at, size, example, fps = 0, (0, 0), None, None
-    for image, rate, total in _pictures(Path(source).expanduser(), 3 * most):
-        looked_at, fps = looked_at + 1, rate
+    looked_at, size, example = 0, (0, 0), None
+    for image, total in _pictures(Path(source).expanduser(), 3 * most):
+        looked_at += 1
         if size != (0, 0) and image.shape[:2] != size:
             raise DataError(
                 f"{source} mixes pictures of {size[1]}x{size[0]} and {image.shape[1]}x{image.shape[0]}; "
@@ -98,8 +98,9 @@ def calibrate(
     problem = _problem(error, uncertainty, max_error, float(K[0, 0]) / size[1])
     if problem:
         raise DataError(f"the calibration from {source} is not to be trusted: {problem}")
+    # Without fps, also where the source is a video: it is that recording's, and other recordings have their own.
     camera = CameraFile(
-        Path(source), K, size, tuple(distortion), model, fps, reprojection_error=error if error > 0 else None
+        Path(source), K, size, tuple(distortion), model, reprojection_error=error if error > 0 else None
     )
     coverage = _coverage(used, size)
     return Calibration(camera, error, uncertainty, coverage, tuple(used), looked_at, len(chosen) - len(used), example)
@@ -117,19 +118,19 @@ def check_picture(result: Calibration) -> UInt8[np.ndarray, "_ _ 3"]:
 
 
 def _pictures(source: Path, most: int) -> Any:
-    """Yield (image, frames a second, number of pictures), evenly spread where there are more than ``most``."""
+    """Yield (image, number of pictures), evenly spread where there are more than ``most``."""
     if source.is_dir():
         paths = frame_paths(source)
         if not paths:
             raise DataError(f"no images in {source}; give a folder of pictures of the board, or a video")
         for place in evenly(len(paths), most):
-            yield read_image(paths[place]), None, min(most, len(paths))
+            yield read_image(paths[place]), min(most, len(paths))
         return
     with VideoReader(source) as reader:
         step = max(1, (reader.declared or 0) // most)
         for number, image in enumerate(reader):
             if number % step == 0:
-                yield image, round(reader.fps, 3), (reader.declared or 0) // step or None
+                yield image, (reader.declared or 0) // step or None
 
 
 def _most_different(found: Sequence[BoardView], size: tuple[int, int], most: int) -> list[BoardView]:

@@ -122,7 +122,7 @@ class CampusDrive:
 def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tuple[dict[int, int], dict[str, int]]:
     """Return frame number -> place in the recording, and how many places got none, by reason."""
     count = len(recording.paths)
-    left_out = {"not decodable": recording.missing}
+    left_out = {"not decodable": recording.missing, "passed over by fps": recording.passed_over}
     if motion is None:
         return {place: place for place in range(count)}, left_out
     broken = np.isin(np.arange(count), motion.unreadable)

@@ -60,6 +60,8 @@ class Recording:
     """Frames a second as recorded; None where nobody says."""
     missing: int = 0
     """Frames at the end that a video claims to hold and that cannot be decoded."""
+    passed_over: int = 0
+    """Frames between those taken, which the frame rate asked for does not need."""
 
 
 def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]:
@@ -131,19 +133,21 @@ def read_clip(
     if not clip.is_video:
         paths = frame_paths(clip.path)
         numbers = _below(every(clip.camera.fps, fps), len(paths))
-        return Recording(tuple(paths[number] for number in numbers), numbers, clip.camera.fps)
+        taken = tuple(paths[number] for number in numbers)
+        return Recording(taken, numbers, clip.camera.fps, passed_over=len(paths) - len(taken))
     folder = cache / f"{clip.path.stem[:60]}-{_key(clip.path, fps, max_width)}"
     if not (folder / "clip.json").is_file():
         _decode(clip.path, fps, folder, max_width, advance)
     try:
         facts = json.loads((folder / "clip.json").read_text(encoding="utf-8"))
         numbers, rate, missing = tuple(facts["numbers"]), float(facts["fps"]), int(facts["missing"])
-    except (OSError, ValueError, KeyError, TypeError) as reason:
+        count = int(facts.get("count", numbers[-1] + 1))  # not written by older versions; then without the last few
+    except (OSError, ValueError, LookupError, TypeError) as reason:
         raise DataError(f"{folder / 'clip.json'} is damaged ({reason}); delete the folder {folder}") from reason
     paths = frame_paths(folder)
     if len(paths) != len(numbers):
         raise DataError(f"{folder} holds {len(paths)} of {len(numbers)} frames; delete it, so that it is made again")
-    return Recording(tuple(paths), numbers, rate, missing)
+    return Recording(tuple(paths), numbers, rate, missing, count - len(numbers))
 
 
 def default_cache() -> Path:
@@ -177,6 +181,7 @@ def _decode(
             "video": str(video.absolute()),
             "fps": rate,
             "numbers": numbers,
+            "count": count,
             "missing": missing if missing > _ESTIMATE else 0,
         }
         write_json(partial / "clip.json", facts, indent=None)
@@ -204,10 +209,20 @@ def _below(numbers: Iterator[int], count: int) -> tuple[int, ...]:
     return tuple(itertools.takewhile(lambda number: number < count, numbers))
 
 
-def _clip_paths(folder: Path) -> Iterator[Path]:
-    """Yield the folders that hold images and the video files, at any depth."""
-    for place, folders, files in os.walk(folder, followlinks=True):
+def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
+    """Yield the folders that hold images and the video files, at any depth; a folder once, however linked.
+
+    Links are followed last, so that what lies below the folder itself keeps its own name.
+    """
+    seen = set() if seen is None else seen
+    links: list[Path] = []
+    for place, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
+        if os.path.realpath(place) in seen:
+            folders.clear()
+            continue
+        seen.add(os.path.realpath(place))
+        links += [Path(place) / name for name in folders if os.path.islink(os.path.join(place, name))]
         suffixes = {Path(name).suffix.lower() for name in files if not name.startswith(".")}
         if suffixes & IMAGE_SUFFIXES:
             yield Path(place)
@@ -216,6 +231,8 @@ def _clip_paths(folder: Path) -> Iterator[Path]:
             for name in files
             if not name.startswith(".") and Path(name).suffix.lower() in VIDEO_SUFFIXES
         )
+    for link in sorted(links):
+        yield from _clip_paths(link, seen)
 
 
 def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraFile:
