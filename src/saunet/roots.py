@@ -203,7 +203,8 @@ class PrepareConfig:
     """Root of ``saunet-prepare``; which keys belong to which job: ``saunet.cli.prepare.KEYS``."""
 
     job: str = MISSING
-    root: str = MISSING
+    data: Any = None
+    root: str | None = None
     folder: str | None = None
     cameras: list[str] = field(default_factory=lambda: ["left", "right"])
     drives: list[str] = field(default_factory=list)

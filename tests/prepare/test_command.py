@@ -49,6 +49,12 @@ def test_each_job_runs_and_leaves_only_its_results(command, tree, tmp_path):
         (["densfy"], "the first word is the job, not 'densfy'; did you mean 'densify'? jobs: densify, teacher, cache"),
         ([], "the first word is the job"),
         (["densify"], "root is not set; add root=..."),
+        (
+            ["cache", "data=campus", "data.root=raw", "root=raw", "folder=c"],
+            "root is for KITTI raw trees without data=",
+        ),
+        (["cache", "data=synthetic", "folder=c"], "SyntheticDataModule reads no copies made by saunet-prepare; use"),
+        (["densify", "data=campus", "data.root=raw"], "data belongs to saunet-prepare cache, not to densify"),
         (["densify", "root=raw", "quality=3"], "quality belongs to saunet-prepare cache, not to densify"),
         (["cache", "root=raw"], "a cache needs a folder of its own; set folder=..."),
         (["densify", "root=/nowhere"], "no data root at /nowhere"),

@@ -12,11 +12,13 @@ from saunet.checks import ConfigError, one_of, suggest
 from saunet.cli._app import pick_device, run
 from saunet.roots import PrepareConfig
 
-SHARED = ("job", "root", "folder", "cameras", "drives", "split", "on_error")
+KITTI = ("root", "cameras", "drives", "split")
+"""Keys that choose recordings of a KITTI raw tree."""
+SHARED = ("job", *KITTI, "folder", "on_error")
 KEYS = {
     "densify": (*SHARED, "kinds", "depth", "workers"),
     "teacher": (*SHARED, "checkpoint", "input", "values", "device"),
-    "cache": (*SHARED, "height", "width", "format", "quality", "workers"),
+    "cache": (*SHARED, "data", "height", "width", "format", "quality", "workers"),
 }
 """Job -> the keys that it uses."""
 
@@ -24,7 +26,6 @@ KEYS = {
 def prepare(cfg: DictConfig) -> None:
     """Do one job and say what was done."""
     from saunet.data.module import available_cores
-    from saunet.prepare.recordings import kitti_recordings
 
     one_of("job", cfg.job, KEYS)
     plain = config.plain(cfg)
@@ -33,12 +34,27 @@ def prepare(cfg: DictConfig) -> None:
         if key not in KEYS[cfg.job] and value != getattr(default, key):
             owners = " and ".join(job for job, keys in KEYS.items() if key in keys)
             raise ConfigError(f"{key} belongs to saunet-prepare {owners}, not to {cfg.job}; leave it out")
+        if plain["data"] and key in KITTI and value != getattr(default, key):
+            raise ConfigError(f"{key} is for KITTI raw trees without data=...; with it, set data.{key} or leave it out")
     workers = available_cores() if cfg.workers is None else cfg.workers
-    depth = one_of("depth", cfg.depth, ("camera_z", "improved"))
-    recordings = kitti_recordings(cfg.root, plain["cameras"], plain["drives"], cfg.split, depth)  # type: ignore[arg-type]
-    failures = _JOBS[cfg.job](plain, recordings, workers)
+    one_of("depth", cfg.depth, ("camera_z", "improved"))
+    failures = _JOBS[cfg.job](plain, _recordings(plain), workers)
     for failure in failures:
         print(f"saunet-prepare: skipped: {failure}", file=sys.stderr)
+
+
+def _recordings(cfg: dict[str, Any]) -> Any:
+    from saunet.prepare.recordings import kitti_recordings, module_recordings
+    from saunet.registry import instantiate
+
+    if cfg["data"]:
+        data = instantiate(cfg["data"])
+        if cfg["on_error"] == "skip":
+            data.on_error = "skip"
+        return module_recordings(data)
+    if cfg["root"] is None:
+        raise ConfigError("root is not set; add root=... to the command line")
+    return kitti_recordings(cfg["root"], cfg["cameras"], cfg["drives"], cfg["split"], cfg["depth"])
 
 
 def _densify(cfg: dict[str, Any], recordings: Any, workers: int) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -79,6 +80,27 @@ class CampusDrive:
     def static(self) -> frozenset[int]:
         """Return the numbers of the frames in which the picture does not move."""
         return frozenset(index for index, place in self._places.items() if place in self._still)
+
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        """(height, width) of `image`.
+
+        Raises:
+            DataError: if the frames do not belong to the camera.
+        """
+        return self._lens.height, self._lens.width
+
+    @functools.cached_property
+    def origin(self) -> str:
+        """What the numbers and the pixels of the frames depend on, as a hash: camera, crop, and which file is which.
+
+        Raises:
+            DataError: if the frames do not belong to the camera.
+        """
+        camera, lens = self.clip.camera, self._lens
+        files = [(index, self.recorded(index), self.path(index).name) for index in self._indices]
+        text = repr((lens.K.tolist(), lens.recorded, self.frame_size, camera.model, camera.distortion, files))
+        return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
 
     def path(self, index: int) -> Path:
         """Return the image file of a frame (in the cache, where the clip is a video)."""

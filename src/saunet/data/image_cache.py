@@ -108,6 +108,31 @@ class ImageCache:
             raise _damaged(path)
         return plain
 
+    def check_origin(self, drive: Drive, frames: dict[str, Any]) -> None:
+        """Check that copies were made from the images that a recording has now.
+
+        Args:
+            drive: The recording.
+            frames: What ``frames.json`` says of it.
+
+        Raises:
+            DataError: if its images have another size now, or its frames another camera or other numbers.
+        """
+        size = getattr(drive, "frame_size", None)
+        made_from, now = frames["native"], list(size) if size else frames["native"]
+        remedy = f"delete {self.home(drive)} and complete the cache: {self._command()}"
+        if made_from != now:
+            raise DataError(
+                f"the copies of '{drive.name}' in the cache come from images of {made_from[0]}x{made_from[1]} and they "
+                f"are {now[0]}x{now[1]} (height x width) now; {remedy}"
+            )
+        if frames.get("origin", "") != origin(drive):
+            raise DataError(
+                f"the copies of '{drive.name}' in the cache were made from other files, with another camera or with "
+                f"other settings (data.fps, parallax, static, crop, max_width), which changes what its frames are; use "
+                f"the same, or {remedy}"
+            )
+
     def drive(self, drive: Drive, needed: Iterable[int] = ()) -> CachedDrive:
         """Return a recording that reads the copies.
 
@@ -121,6 +146,7 @@ class ImageCache:
         frames = self.frames(drive)
         if not frames:
             raise DataError(f"the cache at {self.folder} does not hold '{drive.name}'; complete it: {self._command()}")
+        self.check_origin(drive, frames)
         # Not isinstance: that would ask the drive where its partner is, and a recording of one camera may not know.
         kind = CachedStereoDrive if hasattr(type(drive), "partner") else CachedDrive
         missing = sorted(f"{frame:010d}" for frame in needed if f"{frame:010d}" not in frames["frames"])
@@ -132,7 +158,7 @@ class ImageCache:
         return kind(drive, self, frames)
 
     def _command(self) -> str:
-        return f"saunet-prepare cache root=... folder={self.folder}"
+        return f"saunet-prepare cache root=... folder={self.folder} (data=... data.root=... where it is not KITTI raw)"
 
     @staticmethod
     def _json(path: Path) -> dict[str, Any]:
@@ -140,6 +166,11 @@ class ImageCache:
             return dict(json.loads(path.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError) as reason:
             raise _damaged(path) from reason
+
+
+def origin(drive: Drive) -> str:
+    """Return what a recording's frames depend on beside their files, as it says itself; empty where that is nothing."""
+    return str(getattr(drive, "origin", ""))
 
 
 def _damaged(path: Path) -> DataError:

@@ -50,13 +50,14 @@ class DepthDataModule(LightningDataModule):
         target_depth: Training batches carry the depth of the target, for losses that use it.
         with_pose: Batches carry the true motion.
         stereo: Training and validation batches carry the stereo partner as one more source, which makes depth metric.
+        cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
         manifest: File of frames to leave out of training and validation, as ``saunet-doctor`` writes it.
         on_error: A file that cannot be read: ``raise`` stops and names it. ``skip`` names and counts it and goes on: in
             training with another sample, while the frames of other splits are all read beforehand.
 
     Raises:
         ConfigError: if a parameter is out of range.
-        DataError: if the manifest cannot be read.
+        DataError: if the manifest or the cache cannot be read.
     """
 
     neighbours: Sequence[str] = ("train", "val")
@@ -65,6 +66,8 @@ class DepthDataModule(LightningDataModule):
     """Name of the evaluation protocol that fits this data set's ground truth."""
     ground_truth: str = "camera_z"
     """What kind of depth evaluation batches carry, as the protocols call it."""
+    cacheable: bool = True
+    """Whether ``saunet-prepare cache`` can make copies for it."""
 
     def __init__(
         self,
@@ -81,6 +84,7 @@ class DepthDataModule(LightningDataModule):
         target_depth: bool = False,
         with_pose: bool = False,
         stereo: bool = False,
+        cache: str | None = None,
         manifest: str | None = None,
         on_error: Literal["raise", "skip"] = "raise",
     ) -> None:
@@ -98,7 +102,7 @@ class DepthDataModule(LightningDataModule):
         self.augment = Augment(self.height, self.width, flip, colour)
         self.prepare = Prepare(self.height, self.width)
         self.maps: dict[str, DepthMaps] = {}
-        self.copies: ImageCache | None = None
+        self.copies = ImageCache(cache) if cache else None
         self.odometer: Odometer | None = None
         self.usage: dict[str, list[Usage]] = {}
         self.datasets: dict[str, WindowDataset] = {}

@@ -44,6 +44,7 @@ class OdometrySequence:
             there = ", ".join(sequences(root)) or "none"
             raise DataError(f"no sequence '{sequence}' at {folder.parent.absolute()}; sequences there: {there}")
         self.name = f"odometry/{sequence} {side}"
+        self.origin = camera  # of which the name says only left or right
         self._images = folder / f"image_{number}"
         self._files = frame_files(self._images)
         if not self._files:

@@ -19,7 +19,7 @@ import numpy as np
 from saunet.atomic import write_bytes, write_json
 from saunet.checks import DataError
 from saunet.data.frame_size import check_frame
-from saunet.data.image_cache import FRAMES, SETTINGS, CacheSettings, ImageCache
+from saunet.data.image_cache import FRAMES, SETTINGS, CacheSettings, ImageCache, origin
 from saunet.data.sequences import Drive
 from saunet.images import resize
 from saunet.prepare.leftovers import remove_partial
@@ -82,11 +82,6 @@ class _Copy:
         image = drive.image(frame)
         check_frame(drive, frame, image)
         size = (image.shape[0], image.shape[1])
-        if known and size != tuple(known["native"]):
-            raise DataError(
-                f"frame {frame} of '{drive.name}' has {size[0]}x{size[1]} (height x width) and its cached copies come "
-                f"from {known['native'][0]}x{known['native'][1]}; delete {path.parent} to make them anew"
-            )
         fresh = encode(image, self.cache.settings)
         entry = (len(fresh), hashlib.sha256(fresh).hexdigest(), size, state)
         if there and data == fresh:
@@ -132,6 +127,9 @@ def build_cache(
     for home in homes:
         remove_partial(home)
     known = tuple(cache.frames(drive) for drive, _ in recordings)
+    for (drive, _), frames in zip(recordings, known, strict=True):
+        if frames:
+            cache.check_origin(drive, frames)
     items = [(place, frame) for place, (_, frames) in enumerate(recordings) for frame in frames]
     work: Work[tuple[int, int], tuple[str, Entry]] = Work(
         _Copy(tuple(drive for drive, _ in recordings), cache, known), workers, on_error
@@ -171,9 +169,11 @@ def _open(folder: Path, settings: CacheSettings) -> ImageCache:
 
 def _finish(home: Path, drive: Drive, known: dict[str, Any], entries: dict[int, Entry]) -> None:
     """Write the list of a recording's copies; those of other runs stay in it."""
-    sizes = {size: frame for frame, (_, _, size, _) in entries.items()}
+    sizes = {size: f"frame {frame}" for frame, (_, _, size, _) in entries.items()}
+    if known:
+        sizes.setdefault((known["native"][0], known["native"][1]), "those before")
     if len(sizes) > 1:  # of a recording that does not know its size by itself
-        examples = " and ".join(f"{h}x{w} (frame {sizes[h, w]})" for h, w in sorted(sizes))
+        examples = " and ".join(f"{h}x{w} ({sizes[h, w]})" for h, w in sorted(sizes))
         raise DataError(
             f"frames of '{drive.name}' have different sizes: {examples} (height x width); "
             "a cache needs one size a recording"
@@ -183,5 +183,6 @@ def _finish(home: Path, drive: Drive, known: dict[str, Any], entries: dict[int, 
     originals |= {f"{frame:010d}": state for frame, (_, _, _, state) in entries.items() if state}
     content: dict[str, Any] = {"native": list(*sizes), "frames": dict(sorted(frames.items()))}
     content |= {"originals": dict(sorted(originals.items()))} if originals else {}
+    content |= {"origin": origin(drive)} if origin(drive) else {}
     if content != known:
         write_json(home / FRAMES, content, indent=0)

@@ -1,13 +1,16 @@
-"""Which frames a preparation is about: all below a root, or those of a split."""
+"""Which frames a preparation is about: all below a root, those of a split, or all recordings of a data module."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 from saunet.checks import ConfigError, DataError, one_of, suggest
 from saunet.data import splits
 from saunet.data.kitti import CAMERAS, DepthKind, KittiDrive, KittiRaw
+from saunet.data.module import DepthDataModule
+from saunet.data.sequences import Drive, StereoDrive
 
 Recording = tuple[KittiDrive, list[int]]
 """A recording and the frames of it that are wanted."""
@@ -55,6 +58,31 @@ def kitti_recordings(
     if not found:
         raise DataError(f"the drives below {raw.root} hold no frames of cameras {list(cameras)} and split '{split}'")
     return found
+
+
+def module_recordings(data: DepthDataModule) -> list[tuple[Drive, Sequence[int]]]:
+    """Return the recordings that a data module trains and validates on, with all frames of each.
+
+    Args:
+        data: The data module, with the settings of the training; with ``stereo`` the other cameras come along.
+
+    Raises:
+        ConfigError: if the module cannot read prepared copies.
+        DataError: if its data are missing or broken.
+    """
+    if not data.cacheable:
+        raise ConfigError(
+            f"{type(data).__name__} reads no copies made by saunet-prepare; use data=kitti, kitti_odometry or campus"
+        )
+    data.prepare_data()
+    drives: dict[str, Drive] = {}
+    for split in ("train", "val"):
+        for drive, *_ in data.select(split):
+            drives.setdefault(drive.name, drive)
+            if data.stereo:
+                partner = cast(StereoDrive, drive).partner()
+                drives.setdefault(partner.name, partner)
+    return [(drive, drive.indices) for drive in drives.values() if len(drive.indices)]
 
 
 def _frames(split: str) -> set[tuple[str, int, str]] | None:

@@ -54,6 +54,7 @@ class CampusDataModule(DepthDataModule):
         flip: Probability of mirroring in training.
         colour: Probability of colour jitter in training.
         seed: Decides order, augmentation, and what is held out.
+        cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
         manifest: Frames to leave out, as ``saunet-doctor`` wrote them.
         on_error: A file that cannot be read: ``raise`` stops and names it, ``skip`` names, counts and passes it over.
 
@@ -89,6 +90,7 @@ class CampusDataModule(DepthDataModule):
         flip: float = 0.5,
         colour: float = 0.5,
         seed: int = 0,
+        cache: str | None = None,
         manifest: str | None = None,
         on_error: Literal["raise", "skip"] = "raise",
     ) -> None:
@@ -102,6 +104,7 @@ class CampusDataModule(DepthDataModule):
             flip=flip,
             colour=colour,
             seed=seed,
+            cache=cache,
             manifest=manifest,
             on_error=on_error,
         )

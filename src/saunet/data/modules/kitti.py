@@ -10,7 +10,6 @@ from typing import Literal
 from saunet.checks import ConfigError, DataError, in_range, one_of, suggest
 from saunet.data import splits
 from saunet.data.depth_maps import DENSE_KINDS, DepthMaps
-from saunet.data.image_cache import ImageCache
 from saunet.data.kitti import CAMERA_HEIGHT, CAMERAS, DEPTH_KINDS, DepthKind, KittiRaw
 from saunet.data.module import DepthDataModule
 from saunet.data.partners import measured_distance
@@ -111,6 +110,7 @@ class KittiDataModule(DepthDataModule):
             seed=seed,
             target_depth=target_depth or dense != "none",
             stereo=stereo,
+            cache=cache,
             manifest=manifest,
             on_error=on_error,
         )
@@ -132,7 +132,6 @@ class KittiDataModule(DepthDataModule):
             self.maps["target_depth"] = DepthMaps(dense, maps)
         if teacher:
             self.maps["target_teacher"] = DepthMaps("teacher", maps)
-        self.copies = ImageCache(cache) if cache else None
         self.odometer = measured_distance if with_speed else None
 
     def select(self, split: str) -> Sequence[Selection]:

@@ -37,6 +37,7 @@ class KittiOdometryDataModule(DepthDataModule):
         with_pose: Batches carry the true motion.
         stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
             ``offsets: []`` it is the only one.
+        cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
         manifest: Frames to leave out of training and validation, as ``saunet-doctor`` wrote them.
         on_error: A file that cannot be read: ``raise`` stops and names it, ``skip`` names, counts and passes it over.
 
@@ -66,6 +67,7 @@ class KittiOdometryDataModule(DepthDataModule):
         seed: int = 0,
         with_pose: bool = False,
         stereo: bool = False,
+        cache: str | None = None,
         manifest: str | None = None,
         on_error: Literal["raise", "skip"] = "raise",
     ) -> None:
@@ -81,6 +83,7 @@ class KittiOdometryDataModule(DepthDataModule):
             seed=seed,
             with_pose=with_pose,
             stereo=stereo,
+            cache=cache,
             manifest=manifest,
             on_error=on_error,
         )

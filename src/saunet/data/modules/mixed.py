@@ -61,6 +61,8 @@ class MixedDataModule(DepthDataModule):
             are of different kinds.
     """
 
+    cacheable = False
+
     def __init__(
         self,
         *,

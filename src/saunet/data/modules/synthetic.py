@@ -51,6 +51,7 @@ class SyntheticDataModule(DepthDataModule):
     """
 
     protocol = "synthetic"
+    cacheable = False  # it renders, once, into a cache of its own
     ground_truth = "exact"
 
     def __init__(
