@@ -45,7 +45,9 @@ def test_flops_of_a_stage_in_closed_form() -> None:
     dim, heads, window, side = 8, 2, 4, 8
     stage = SwinStage(dim, 2, heads, window, 4.0, (0.0, 0.0))
     tokens = side**2
-    linear = 2 * tokens * dim * (3 * dim + dim + 2 * 4 * dim)  # queries, keys, values; projection; two layers of the MLP
+    linear = (
+        2 * tokens * dim * (3 * dim + dim + 2 * 4 * dim)
+    )  # queries, keys, values; projection; two layers of the MLP
     whole = 2 * 2 * tokens * window**2 * dim  # pairs within 2x2 whole windows, scores and weighted sums
     rows = (2**2 + 4**2 + 2**2) ** 2  # shifted by 2, eight rows fall into 2, 4 and 2; pairs of tokens in all windows
     merging = 2 * (tokens // 4) * 4 * dim * 2 * dim

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import builtins
+import functools
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +55,37 @@ def test_every_combination_is_measured(results: list[Measurement]) -> None:
 
 def test_compiled_networks_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     compiled: list[nn.Module] = []
-    monkeypatch.setattr(torch, "compile", lambda network: compiled.append(network) or network)
+    monkeypatch.setattr(torch, "compile", lambda network, **_: compiled.append(network) or network)
     (row,) = run_suite({"ours": Networks(Tiny())}, Plan(sizes=["8x8"], modes=["compiled"], runs=1, warmup=0))
     assert row.mode == "compiled"
     assert len(compiled) == 1
+
+
+def test_every_compiled_row_runs_code_for_its_own_shape(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten shapes: the compiler's own limit is eight, and from the second on it would write code for any shape."""
+    shapes: list[list[object]] = []
+
+    def backend(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> Callable[..., object]:
+        shapes.extend(list(each.shape) for each in inputs if isinstance(each, torch.Tensor) and each.ndim == 4)
+        return graph.forward
+
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
+    plan = Plan(sizes=[f"{8 * i}x16" for i in range(1, 6)], modes=["compiled"], batch_sizes=[1, 2], runs=2, warmup=1)
+    rows = run_suite({"ours": Networks(Tiny())}, plan)
+    images = [shape for shape in shapes if shape[1] == 3 and shape[2] != 3]  # the others are weights
+    assert images == [[row.batch_size, 3, int(row.size.partition("x")[0]), 16] for row in rows]
+    assert all(type(side) is int for shape in images for side in shape)
+
+
+def test_sizes_are_checked_before_anything_is_measured() -> None:
+    network = Tiny()
+    network.size_divisor = 8  # type: ignore[assignment]
+    ticks: list[str] = []
+    with pytest.raises(
+        ConfigError, match=r"12x16 .* the encoder stride of ours, 8; the nearest valid size is (8|16)x16"
+    ):
+        run_suite({"ours": Networks(network)}, Plan(sizes=["8x16", "12x16"]), lambda text, *_: ticks.append(text))
+    assert not ticks
 
 
 @pytest.mark.parametrize(
@@ -68,6 +97,9 @@ def test_compiled_networks_are_measured(monkeypatch: pytest.MonkeyPatch) -> None
         ({"modes": ["complied"]}, "did you mean 'compiled'"),
         ({"devices": ["tpu9"]}, "device 'tpu9' cannot be used here"),
         ({"batch_sizes": [0]}, "batch_sizes is 0"),
+        ({"batch_sizes": []}, "batch_sizes is empty, so nothing would be measured; give at least one, such as 1"),
+        ({"sizes": []}, "sizes is empty, .* such as 192x640"),
+        ({"modes": ()}, "modes is empty"),
         ({"runs": 0}, "runs is 0"),
     ],
 )
