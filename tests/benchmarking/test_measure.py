@@ -41,7 +41,7 @@ def test_flops_count_attention() -> None:
 
 
 def test_flops_of_a_stage_in_closed_form() -> None:
-    """Two blocks, of which the second's windows are shifted by half, and a merging, as prediction on a CPU runs them."""
+    """Two blocks, the second's windows shifted by half, and a merging, as prediction on a CPU runs them."""
     dim, heads, window, side = 8, 2, 4, 8
     stage = SwinStage(dim, 2, heads, window, 4.0, (0.0, 0.0))
     tokens = side**2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import dataclasses
 import functools
 import io
 import json
@@ -97,7 +98,7 @@ def test_sizes_are_checked_before_anything_is_measured() -> None:
         ({"modes": ["complied"]}, "did you mean 'compiled'"),
         ({"devices": ["tpu9"]}, "device 'tpu9' cannot be used here"),
         ({"batch_sizes": [0]}, "batch_sizes is 0"),
-        ({"batch_sizes": []}, "batch_sizes is empty, so nothing would be measured; give at least one, such as 1"),
+        ({"batch_sizes": []}, "batch_sizes is empty, so nothing would be measured; give some, such as 1"),
         ({"sizes": []}, "sizes is empty, .* such as 192x640"),
         ({"modes": ()}, "modes is empty"),
         ({"runs": 0}, "runs is 0"),
@@ -114,6 +115,36 @@ def test_tables_stand_beside_the_paper(results: list[Measurement]) -> None:
     text = console.export_text()
     assert "58.8 (SAU-Net)" in text
     assert text.count("sau_net") == 2 + 8
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_no_number_is_cut(results: list[Measurement], width: int) -> None:
+    row = dataclasses.replace(results[0], model="sau_net (changed)", median=1.7089, p90=1.8089, warmup=12.345)
+    other = dataclasses.replace(row, model="ours", size="320x1024", device="cuda", mode="compiled", batch_size=16)
+    for rows in ([row], [row, other], [other, *results]):
+        console = Console(width=width, record=True, file=io.StringIO())
+        console.print(size_table(rows), speed_table(rows, width))
+        text = console.export_text()
+        assert "…" not in text
+        for each in rows:
+            numbers = each.median * 1e3, each.p90 * 1e3, each.throughput
+            words = [
+                *(f"{number:.1f}" for number in numbers),
+                *each.model.split(),
+                each.size,
+                each.precision,
+                each.mode,
+            ]
+            assert all(word in text for word in words)
+
+
+def test_settings_that_all_share_are_said_once(results: list[Measurement]) -> None:
+    console = Console(width=160, record=True, file=io.StringIO())
+    console.print(speed_table(results))
+    text = console.export_text()
+    assert "ms a call, cpu, eager;" in text
+    assert text.count("eager") == 1
+    assert text.count("bf16") == 8
 
 
 def test_json_has_everything(results: list[Measurement], tmp_path: Path) -> None:

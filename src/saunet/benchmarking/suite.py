@@ -54,9 +54,8 @@ class Plan:
     def __post_init__(self) -> None:
         for field in fields(self):
             if isinstance(field.default, tuple) and not getattr(self, field.name):
-                raise ConfigError(
-                    f"{field.name} is empty, so nothing would be measured; give at least one, such as {field.default[0]}"
-                )
+                usual = field.default[0]
+                raise ConfigError(f"{field.name} is empty, so nothing would be measured; give some, such as {usual}")
         for size in self.sizes:
             _parse(size)
         for device in self.devices:
@@ -183,7 +182,7 @@ def _compiled(network: nn.Module) -> Callable[[Tensor], object]:
     Else, after other shapes, the compiler would write code for any shape, and after eight of them fall back to eager.
     """
     torch.compiler.reset()
-    return torch.compile(network, dynamic=False)  # type: ignore[no-any-return]
+    return torch.compile(network, dynamic=False)
 
 
 def _home(module: nn.Module) -> torch.device:

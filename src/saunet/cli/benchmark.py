@@ -55,7 +55,7 @@ def benchmark(cfg: DictConfig) -> None:
         )
     console = Console()
     console = console if console.is_terminal else Console(width=160)
-    console.print(size_table(results), speed_table(results))
+    console.print(size_table(results), speed_table(results, console.width))
     output = Path(cfg.output_dir)
     write_measurements(results, output / "benchmark.json")
     if cfg.figure:

@@ -33,7 +33,7 @@ def streams(tokens: Tensor, block: nn.Module) -> bool:
         and not torch.compiler.is_compiling()
         and not torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
         and not torch.is_autocast_enabled("cpu")
-        and _get_current_dispatch_mode() is None  # type: ignore[no-untyped-call]
+        and _get_current_dispatch_mode() is None
         and not block.training
         and all(_untouched(module) for module in block.children() for module in module.modules())
     )
