@@ -17,7 +17,7 @@ ALLOWED: dict[str, set[str]] = {
     "registry": {"schema", "checks"},
     "geometry": {"types", "checks"},
     "layers": {"checks"},
-    "models": {"registry", "types", "checks", "layers", "geometry.depth", "geometry.pose"},
+    "models": {"registry", "types", "checks", "layers", "geometry.depth", "geometry.pose", "torch_files"},
     "losses": {"registry", "types", "checks", "geometry"},
     "metrics": {"types", "checks", "geometry.depth"},
     "data": {
@@ -32,12 +32,13 @@ ALLOWED: dict[str, set[str]] = {
         "videos",
     },
     "atomic": {"checks"},
+    "torch_files": {"checks"},
     "progress": set(),
     "images": {"checks", "atomic"},
     "trajectories": {"checks", "atomic"},
     "videos": {"checks"},
     "record": {"registry", "checks"},
-    "checkpoint": {"registry", "types", "checks", "models", "atomic", "record"},
+    "checkpoint": {"registry", "types", "checks", "models", "atomic", "record", "torch_files"},
     "evaluation": {
         "types",
         "checks",

@@ -6,7 +6,6 @@ plain containers. It is read with ``weights_only=True``, and only registered com
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from saunet.checks import CheckpointError, ConfigError
 from saunet.models.depth import DepthNet
 from saunet.record import ModelRecord, Scale
 from saunet.registry import instantiate
+from saunet.torch_files import read_plain
 
 __all__ = [
     "Checkpoint",
@@ -186,19 +186,7 @@ def _load_plain(path: Path) -> Any:
         raise CheckpointError(f"{path} is a folder; give the checkpoint file in it, such as {path / 'last.ckpt'}")
     if not path.exists():
         raise CheckpointError(f"no checkpoint at {path}; check the path")
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as reason:
-        if any(mark in str(reason) for mark in ("GLOBAL", "Unsupported class", "Trying to")):
-            raise CheckpointError(
-                f"{path} holds pickled objects, which could run code when read, so it is refused; "
-                "save plain containers and tensors only, as saunet-train does"
-            ) from reason
-        raise CheckpointError(f"{path} is not a checkpoint, or is damaged; copy it again") from reason
-    except OSError as reason:
-        raise CheckpointError(f"cannot read {path}: {reason.strerror or reason}") from reason
-    except (RuntimeError, EOFError, ValueError, KeyError, TypeError, AttributeError, IndexError) as reason:
-        raise CheckpointError(f"{path} is damaged or truncated and cannot be read; copy it again") from reason
+    return read_plain(path, "a checkpoint")
 
 
 def _more(names: Sequence[str]) -> str:

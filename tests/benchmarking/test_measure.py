@@ -8,10 +8,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 from torch import nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
 
 from saunet.benchmarking.measure import count_flops, count_parameters, matmul_ceiling, measure_latency, peak_memory
 from saunet.checks import ConfigError
 from saunet.layers.window_attention import WindowAttention
+from saunet.layers.window_block import SwinStage
+from saunet.models.depth import DepthNet
+from saunet.registry import decoders, encoders
 
 CPU = torch.device("cpu")
 
@@ -33,6 +38,31 @@ def test_flops_count_attention() -> None:
     layer = WindowAttention(8, 2, 4)
     tokens, projections, attention = 64, 2 * 64 * 8 * (24 + 8), 2 * 2 * 64 * 16 * 8
     assert count_flops(layer, torch.zeros(1, 8, tokens // 8, 8)) == projections + attention
+
+
+def test_flops_of_a_stage_in_closed_form() -> None:
+    """Two blocks, the second's windows shifted by half, and a merging, as prediction on a CPU runs them."""
+    dim, heads, window, side = 8, 2, 4, 8
+    stage = SwinStage(dim, 2, heads, window, 4.0, (0.0, 0.0))
+    tokens = side**2
+    linear = (
+        2 * tokens * dim * (3 * dim + dim + 2 * 4 * dim)
+    )  # queries, keys, values; projection; two layers of the MLP
+    whole = 2 * 2 * tokens * window**2 * dim  # pairs within 2x2 whole windows, scores and weighted sums
+    rows = (2**2 + 4**2 + 2**2) ** 2  # shifted by 2, eight rows fall into 2, 4 and 2; pairs of tokens in all windows
+    merging = 2 * (tokens // 4) * 4 * dim * 2 * dim
+    expected = 2 * linear + whole + 2 * 2 * rows * dim + merging
+    assert count_flops(stage, torch.zeros(1, side, side, dim)) == expected
+
+
+@pytest.mark.parametrize("decoder", ["aunet", "unet"])
+def test_flops_do_not_depend_on_the_way_that_blocks_run(decoder: str) -> None:
+    network = DepthNet(encoders.build("stratified_nano"), decoders.partial(decoder)).eval()
+    image = torch.zeros(1, 3, 64, 96)
+    counter = FlopCounterMode(display=False)
+    with sdpa_kernel(SDPBackend.MATH), counter:  # with gradients, layer by layer
+        network(image)
+    assert count_flops(network, image) == counter.get_total_flops()
 
 
 def test_latency_of_known_calls(monkeypatch: pytest.MonkeyPatch) -> None:

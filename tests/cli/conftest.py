@@ -15,6 +15,7 @@ import pytest
 
 from saunet import config
 from saunet.cli._app import run
+from saunet.cli.benchmark import benchmark
 from saunet.cli.calibrate import calibrate
 from saunet.cli.doctor import doctor
 from saunet.cli.evaluate import evaluate
@@ -25,6 +26,7 @@ from saunet.data.synthetic import SyntheticDrive
 from saunet.data.synthetic.kitti_writer import write_raw
 
 TASKS = {
+    "benchmark": benchmark,
     "train": train,
     "evaluate": evaluate,
     "odometry": odometry,

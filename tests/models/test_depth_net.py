@@ -76,6 +76,11 @@ def test_depth_limits(limits):
         _small(min_depth=limits[0], max_depth=limits[1])
 
 
+def test_an_encoder_of_several_frames_is_refused():
+    with pytest.raises(ConfigError, match="encoder has frames 2; depth comes from one image: frames=1"):
+        DepthNet(encoders.build("resnet18", blocks=(1, 1, 1, 1), frames=2), decoders.partial("unet"))
+
+
 def test_half_precision_keeps_disparity_fine():
     net = _small().eval()
     image = torch.rand(1, 3, HEIGHT, WIDTH)

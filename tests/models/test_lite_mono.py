@@ -94,6 +94,18 @@ def test_wrong_stages(kwargs):
         encoders.build("lite_mono", **kwargs)
 
 
+@pytest.mark.parametrize("kwargs", [{"rates": ()}, {"rates": (1, 0)}, {"last_rates": (-2,)}])
+def test_wrong_rates(kwargs):
+    with pytest.raises(ConfigError, match="dilation rates are 1 or more, and rates is not empty"):
+        encoders.build("lite_mono", **kwargs)
+
+
+def test_last_stage_may_go_through_the_rates_alone():
+    with torch.device("meta"):
+        stage = encoders.build("lite_mono", depths=(2, 2, 5), last_rates=()).stages[2]
+    assert [b.depthwise.dilation[0] for b in stage if isinstance(b, DilatedBlock)] == [1, 2, 3, 1]
+
+
 def test_wrong_drop_path():
     with pytest.raises(ConfigError, match=r"drop_path is 1\.5"):
         encoders.build("lite_mono", drop_path=1.5)

@@ -14,12 +14,14 @@ from torch import Tensor
 
 from saunet.checks import CheckpointError
 from saunet.models import pretrained_files
+from saunet.models.depth import DepthNet
 from saunet.models.encoders.resnet import ResNet
 from saunet.models.encoders.stratified import StratifiedTransformer
 from saunet.models.encoders.swin import SwinTransformer
 from saunet.models.pretrained import load_pretrained
 from saunet.models.pretrained_files import PUBLIC_WEIGHTS, locate
-from saunet.models.pretrained_keys import resample_bias_table
+from saunet.models.pretrained_keys import resample_bias_table, to_our_names
+from saunet.registry import decoders, encoders, poses
 
 State = dict[str, Tensor]
 
@@ -169,6 +171,26 @@ def test_weights_can_be_asked_for_when_building(tmp_path: Path) -> None:
         assert torch.equal(built.layers[0].blocks[0].mlp.fc1.weight, source.layers[0].blocks[0].mlp.fc1.weight)
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("name", ["stratified_nano", "resnet18"])
+def test_a_checkpoint_of_ours_gives_its_depth_encoder(name: str, compiled: bool, tmp_path: Path) -> None:
+    depth, pose = DepthNet(encoders.build(name), decoders.partial("unet")), poses.build("resnet18")
+    state = torch.nn.ModuleDict({"depth": depth, "pose": pose}).state_dict()
+    if compiled:
+        state = {key.replace("depth.", "depth._orig_mod.", 1): value for key, value in state.items()}
+    path = save(tmp_path / "best.ckpt", {"state_dict": state, "saunet": {"format": 1}})
+    built = encoders.build(name, weights=path)
+    for key, value in depth.encoder.state_dict().items():
+        assert torch.equal(value, built.state_dict()[key]), key
+
+
+def test_an_exported_model_gives_its_depth_encoder() -> None:
+    """The names in ``model.safetensors``; how the file is read is torch's affair."""
+    encoder = encoders.build("stratified_nano")
+    names = to_our_names({f"depth.encoder.{key}": value for key, value in encoder.state_dict().items()})
+    assert names.keys() == encoder.state_dict().keys()
+
+
 class TestPartialFiles:
     @pytest.mark.parametrize(
         ("changes", "message"),
@@ -187,6 +209,37 @@ class TestPartialFiles:
         with pytest.raises(CheckpointError, match=message):
             load_pretrained(target, save(tmp_path / "w.pth", official(swin(**changes))))
         assert all(torch.equal(value, before[key]) for key, value in target.state_dict().items())
+
+    @pytest.mark.parametrize(
+        ("key", "value", "message"),
+        [
+            ("layers.0.blocks.0.attn.relative_position_bias_table", torch.zeros(24, 1), "is 24x1, the network's 25x1"),
+            ("layers.0.blocks.0.attn.relative_position_bias_table", torch.zeros(0, 1), "is 0x1, the network's 25x1"),
+            ("layers.0.downsample.reduction.weight", torch.zeros(16, 33), "is 16x33, the network's 16x32"),
+        ],
+    )
+    @pytest.mark.parametrize("dialect", [official, openmmlab])
+    def test_shapes_that_have_no_meaning(
+        self, dialect: Callable[[SwinTransformer], State], key: str, value: Tensor, message: str, tmp_path: Path
+    ) -> None:
+        source = swin()
+        state = dialect(source)
+        theirs = key
+        if dialect is openmmlab:
+            theirs = "backbone." + key.replace("layers.", "stages.").replace(".attn.", ".attn.w_msa.")
+        assert theirs in state
+        with pytest.raises(CheckpointError, match=message):
+            load_pretrained(swin(seed=2), save(tmp_path / "w.pth", {**state, theirs: value}))
+
+    def test_first_layer_without_channels(self, tmp_path: Path) -> None:
+        state = {**ResNet((1, 1, 1, 1)).state_dict(), "conv1.weight": torch.zeros(64, 0, 7, 7)}
+        with pytest.raises(CheckpointError, match=r"conv1\.weight is 64x0x7x7"):
+            load_pretrained(ResNet((1, 1, 1, 1)), save(tmp_path / "w.pth", state))
+
+    def test_bias_tables_under_unknown_names(self, tmp_path: Path) -> None:
+        path = save(tmp_path / "w.pth", {"stage.attn.relative_position_bias_table": torch.zeros(25, 1)})
+        with pytest.raises(CheckpointError, match="holds no weights of this SwinTransformer"):
+            load_pretrained(swin(), path)
 
     def test_are_taken_where_allowed(self, tmp_path: Path) -> None:
         source, target = swin(depths=(1, 1)), swin(seed=2)
@@ -244,18 +297,20 @@ class TestFiles:
             else:
                 assert public.filename.endswith(f"-{public.sha256}.pth")
 
-    @pytest.mark.parametrize("content", [b"", b"not weights", b"PK\x03\x04 half a zip"])
+    @pytest.mark.parametrize(
+        "content", [b"", b"not weights", b"PK\x03\x04 half a zip", b"error code: 1010", b"image,depth\n1,2\n"]
+    )
     def test_unreadable_file_is_refused(self, content: bytes, tmp_path: Path) -> None:
         (tmp_path / "w.pth").write_bytes(content)
-        with pytest.raises(CheckpointError, match=r"w\.pth cannot be read as weights"):
+        with pytest.raises(CheckpointError, match=r"w\.pth is (not a file of weights, or is damaged|damaged or trunc)"):
             load_pretrained(swin(), str(tmp_path / "w.pth"))
 
     def test_pickled_code_is_refused(self, tmp_path: Path) -> None:
         torch.save({"model": swin()}, tmp_path / "w.pth")
-        with pytest.raises(CheckpointError, match="cannot be read as weights"):
+        with pytest.raises(CheckpointError, match=r"w\.pth holds pickled objects, .* refused"):
             load_pretrained(swin(), str(tmp_path / "w.pth"))
 
-    @pytest.mark.parametrize("content", [{"epoch": 3}, [1, 2]])
+    @pytest.mark.parametrize("content", [{"epoch": 3}, [1, 2], {0: torch.zeros(2)}])
     def test_file_without_weights_is_refused(self, content: object, tmp_path: Path) -> None:
         torch.save(content, tmp_path / "w.pth")
         with pytest.raises(CheckpointError, match="holds no weights"):

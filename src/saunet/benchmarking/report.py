@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
+from rich.console import Console
 from rich.table import Table
 
 from saunet.atomic import replacing, write_json
@@ -28,10 +29,12 @@ _MARKERS = "os^Dv<>Pp*hX"
 def size_table(results: Sequence[Measurement]) -> Table:
     """Return parameters and FLOPs by model and image size, with the paper's Table 2 where it has the system."""
     table = Table(title="Size (M = 10^6 parameters; GFLOP of the depth network for one image)")
-    for heading in ("model", "size"):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("depth M", "pose M", "total M", "paper M", "GFLOP"):
+    table.add_column("model")
+    table.add_column("size", no_wrap=True)
+    for heading in ("depth M", "pose M", "total M"):
         table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("paper M", justify="right")
+    table.add_column("GFLOP", justify="right", no_wrap=True)
     printed = {row.method: row.megaparameters for row in published().table2}
     for row in {(row.model, row.size): row for row in results}.values():
         method = PAPER_METHODS.get(row.model)
@@ -46,21 +49,46 @@ def size_table(results: Sequence[Measurement]) -> Table:
     return table
 
 
-def speed_table(results: Sequence[Measurement]) -> Table:
-    """Return time and memory of every measurement; times in milliseconds."""
-    table = Table(title="Speed (ms a call; share of the speed of one large matrix product)")
-    for heading in ("model", "size", "device", "precision", "mode", "batch"):
-        table.add_column(heading, no_wrap=True)
+def speed_table(results: Sequence[Measurement], width: int = 160) -> Table:
+    """Return time and memory of every measurement; times in milliseconds.
+
+    Settings that all measurements share are said in the title. Where the rest does not fit, they stand in one column
+    that wraps, so that no number is cut.
+
+    Args:
+        results: Measurements.
+        width: Characters a line may have.
+    """
+    settings: dict[str, list[str]] = {
+        "model": [row.model for row in results],
+        "size": [row.size for row in results],
+        "device": [row.device for row in results],
+        "precision": [row.precision for row in results],
+        "mode": [row.mode for row in results],
+        "batch": [str(row.batch_size) for row in results],
+    }
+    shared = [name for name, values in settings.items() if len(set(values)) == 1 and name != "model"]
+    said = "".join(f", {'batch ' * (name == 'batch')}{settings.pop(name)[0]}" for name in shared)
+    title = f"Speed (ms a call{said}; share of the speed of one large matrix product)"
+    labels = list(zip(*settings.values(), strict=True))
+    table = _speed_table(Table(title=title), list(settings), labels, results)
+    if Console(width=1000).measure(table).maximum <= width:
+        return table
+    folded = Table(title=title, show_lines=True)
+    return _speed_table(folded, [" ".join(settings)], [(" ".join(label),) for label in labels], results)
+
+
+def _speed_table(
+    table: Table, headings: Sequence[str], labels: Sequence[tuple[str, ...]], results: Sequence[Measurement]
+) -> Table:
+    """Fill a table with measurements behind their labels; a label of one column may wrap."""
+    for heading in headings:
+        table.add_column(heading, no_wrap=len(headings) > 1)
     for heading in ("median", "p90", "warm-up", "images/s", "peak MB", "share"):
         table.add_column(heading, justify="right", no_wrap=True)
-    for row in results:
+    for label, row in zip(labels, results, strict=True):
         table.add_row(
-            row.model,
-            row.size,
-            row.device,
-            row.precision,
-            row.mode,
-            str(row.batch_size),
+            *label,
             f"{row.median * 1e3:.1f}",
             f"{row.p90 * 1e3:.1f}",
             f"{row.warmup * 1e3:.0f}",

@@ -5,14 +5,14 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from saunet.benchmarking.measure import count_flops, count_parameters, matmul_ceiling, measure_latency, peak_memory
-from saunet.checks import ConfigError, one_of, positive
+from saunet.checks import ConfigError, divisible, one_of, positive
 
 _DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 _MODES = ("eager", "compiled")
@@ -40,7 +40,7 @@ class Plan:
         warmup: Calls before that.
 
     Raises:
-        ConfigError: for a word, number or device that cannot work.
+        ConfigError: for an empty sequence, or a word, number or device that cannot work.
     """
 
     sizes: Sequence[str] = ("192x640",)
@@ -52,6 +52,10 @@ class Plan:
     warmup: int = 3
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            if isinstance(field.default, tuple) and not getattr(self, field.name):
+                usual = field.default[0]
+                raise ConfigError(f"{field.name} is empty, so nothing would be measured; give some, such as {usual}")
         for size in self.sizes:
             _parse(size)
         for device in self.devices:
@@ -104,8 +108,10 @@ def run_suite(
         progress: Called with a line of text, steps done and all steps.
 
     Raises:
-        ConfigError: if a size does not fit a model.
+        ConfigError: if a size does not fit a model; nothing has been measured then.
     """
+    for (name, networks), size in itertools.product(models.items(), plan.sizes):
+        divisible(*_parse(size), getattr(networks.depth, "size_divisor", 1), by=f"the encoder stride of {name},")
     cases = list(itertools.product(models, plan.devices, plan.precisions, plan.sizes, plan.modes, plan.batch_sizes))
     steps, done = len(cases) * (plan.runs + plan.warmup), 0
     ceilings = {
@@ -144,7 +150,7 @@ def _measure(
     flops = count_flops(networks.depth, torch.zeros(1, 3, height, width, device=_home(networks.depth)))
     network = copy.deepcopy(networks.depth).eval().to(device, dtype)
     image = torch.rand(batch, 3, height, width, device=device).to(dtype)
-    forward: Callable[[Tensor], object] = torch.compile(network) if mode == "compiled" else network
+    forward: Callable[[Tensor], object] = _compiled(network) if mode == "compiled" else network
     with torch.no_grad():
         memory = peak_memory(lambda: network(image), device)
         latency = measure_latency(lambda: forward(image), device, plan.runs, plan.warmup, tick)
@@ -168,6 +174,15 @@ def _measure(
         memory=memory,
         ceiling_share=batch * flops / latency.median / ceiling,
     )
+
+
+def _compiled(network: nn.Module) -> Callable[[Tensor], object]:
+    """Compile for one shape of input, as if nothing had been compiled before.
+
+    Else, after other shapes, the compiler would write code for any shape, and after eight of them fall back to eager.
+    """
+    torch.compiler.reset()
+    return torch.compile(network, dynamic=False)
 
 
 def _home(module: nn.Module) -> torch.device:

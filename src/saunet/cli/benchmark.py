@@ -3,38 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig
 
-from saunet import config
+from saunet.checks import positive
 from saunet.cli._app import pick_device, run
-
-
-def build(model: DictConfig) -> Any:
-    """Build the networks of a ``model`` config node, with random weights."""
-    from saunet.benchmarking import Networks
-    from saunet.models.depth import DepthNet
-    from saunet.registry import instantiate
-
-    node = config.plain(model)
-    depth = DepthNet(instantiate(node["encoder"]), instantiate(node["decoder"]), node["min_depth"], node["max_depth"])
-    return Networks(depth, instantiate(node["pose"]) if node["pose"] else None)
+from saunet.cli._models import CHANGED, build, chosen
 
 
 def benchmark(cfg: DictConfig) -> None:
     """Measure the chosen model, or each of ``models``, print a table, and write JSON and a picture."""
     import torch
-    from hydra import compose
-    from hydra.core.hydra_config import HydraConfig
     from rich.console import Console
 
     from saunet.benchmarking import Plan, run_suite
     from saunet.benchmarking.report import draw_figure, size_table, speed_table, write_measurements
     from saunet.progress import bar
 
-    if cfg.threads:
-        torch.set_num_threads(cfg.threads)
+    if cfg.threads is not None:
+        torch.set_num_threads(int(positive("threads", cfg.threads)))
     plan = Plan(
         sizes=list(cfg.sizes),
         devices=[pick_device(name) for name in cfg.devices],
@@ -44,10 +31,9 @@ def benchmark(cfg: DictConfig) -> None:
         runs=cfg.runs,
         warmup=cfg.warmup,
     )
-    if cfg.models:
-        models = {name: build(compose("benchmark", overrides=[f"model={name}"]).model) for name in cfg.models}
-    else:
-        models = {HydraConfig.get().runtime.choices["model"]: build(cfg.model)}
+    nodes, accuracy = chosen(cfg), dict(cfg.abs_rel)
+    models = {label: build(node) for label, node in nodes.items()}
+    accuracy |= {label: accuracy[name] for label in nodes if (name := label.removesuffix(CHANGED)) in accuracy}
     with bar() as shown:
         task = shown.add_task("")
         results = run_suite(
@@ -55,11 +41,11 @@ def benchmark(cfg: DictConfig) -> None:
         )
     console = Console()
     console = console if console.is_terminal else Console(width=160)
-    console.print(size_table(results), speed_table(results))
+    console.print(size_table(results), speed_table(results, console.width))
     output = Path(cfg.output_dir)
     write_measurements(results, output / "benchmark.json")
     if cfg.figure:
-        draw_figure(results, output / "benchmark.png", dict(cfg.abs_rel))
+        draw_figure(results, output / "benchmark.png", accuracy)
     print(f"results: {output}")
 
 

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.utils._python_dispatch import _get_current_dispatch_mode
 
 from saunet.layers.window_attention import WindowAttention
 from saunet.layers.window_plan import window_groups, window_order
@@ -23,8 +24,8 @@ _CACHED_ELEMENTS = 1_500_000
 def streams(tokens: Tensor, block: nn.Module) -> bool:
     """Return whether a block may work in pieces: on a CPU, in prediction, while nobody is watching its layers.
 
-    Gradients, autocast, a compiler, exporter or tracer, hooks and layers that somebody replaced (quantised, adapted)
-    get the plain way through the layers' own ``forward``.
+    Gradients, autocast, a compiler, exporter or tracer, a dispatch mode (which counts FLOPs by the operators it knows),
+    hooks and layers that somebody replaced (quantised, adapted) get the plain way through the layers' own ``forward``.
     """
     return (
         tokens.device.type == "cpu"
@@ -32,6 +33,7 @@ def streams(tokens: Tensor, block: nn.Module) -> bool:
         and not torch.compiler.is_compiling()
         and not torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
         and not torch.is_autocast_enabled("cpu")
+        and _get_current_dispatch_mode() is None
         and not block.training
         and all(_untouched(module) for module in block.children() for module in module.modules())
     )

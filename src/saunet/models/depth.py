@@ -33,7 +33,7 @@ class DepthNet(nn.Module):
         size_divisor: Image height and width must be multiples of it.
 
     Raises:
-        ConfigError: if not 0 < min_depth < max_depth, or the decoder does not fit the encoder.
+        ConfigError: if not 0 < min_depth < max_depth, the encoder takes several frames, or the decoder does not fit.
     """
 
     def __init__(
@@ -46,6 +46,9 @@ class DepthNet(nn.Module):
         super().__init__()
         if not 0 < min_depth < max_depth:
             raise ConfigError(f"min_depth is {min_depth} and max_depth {max_depth}; needed: 0 < min_depth < max_depth")
+        frames = getattr(encoder, "frames", 1)  # a pose network's encoder may see several
+        if frames != 1:
+            raise ConfigError(f"the depth network's encoder has frames {frames}; depth comes from one image: frames=1")
         self.encoder = encoder
         self.decoder = decoder(features=encoder.features)
         self.features = encoder.features

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -42,7 +43,8 @@ class LoadReport:
 def load_pretrained(module: nn.Module, weights: str, *, allow_partial: bool = False) -> LoadReport:
     """Give an encoder public weights.
 
-    Names may be those of torchvision, timm, the original Swin repository, its dense backbone, OpenMMLab or Monodepth2.
+    Names may be those of torchvision, timm, the original Swin repository, its dense backbone, OpenMMLab or Monodepth2,
+    or our own: of a saunet checkpoint the depth encoder is taken.
     Bias tables are resampled when the window differs, and a first layer for several frames gets the weights of one,
     repeated and divided. An encoder names in ``not_pretrained`` the parts that no public file has; they may stay.
 
@@ -113,8 +115,10 @@ def _fit(name: str, value: Tensor, own: Tensor) -> Tensor | None:
     if value.shape == own.shape:
         return value
     if name.endswith("relative_position_bias_table") and value.shape[1:] == own.shape[1:]:
-        return resample_bias_table(value, len(own))
-    if value.ndim == own.ndim == 4 and own.shape[1] % value.shape[1] == 0 and name == "conv1.weight":
+        square = len(value) > 0 and math.isqrt(len(value)) ** 2 == len(value)
+        return resample_bias_table(value, len(own)) if square else None
+    frames_fit = value.ndim == own.ndim == 4 and value.shape[1] > 0 and own.shape[1] % value.shape[1] == 0
+    if name == "conv1.weight" and frames_fit:
         stacked = tile_frames(value, own.shape[1] // value.shape[1])
         return stacked if stacked.shape == own.shape else None
     return None

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import pickle
 import sys
 import urllib.error
 import urllib.parse
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from saunet.checks import CheckpointError, suggest
+from saunet.torch_files import read_plain
 
 _TORCHVISION = "https://download.pytorch.org/models"
 _MICROSOFT = "https://github.com/SwinTransformer/storage/releases/download/v1.0.0"
@@ -112,19 +112,12 @@ def read_state(path: Path) -> dict[str, Tensor]:
     Raises:
         CheckpointError: if the file cannot be read or holds no weights.
     """
-    try:
-        content: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, OSError, EOFError, ValueError, KeyError) as reason:
-        first = (str(reason).splitlines() or [type(reason).__name__])[0]
-        raise CheckpointError(
-            f"{path} cannot be read as weights ({first}); give a file written by torch.save"
-        ) from reason
+    content = read_plain(path, "a file of weights")
     for wrapper in ("model", "state_dict", "model_state_dict"):
         if isinstance(content, dict) and isinstance(content.get(wrapper), dict):
             content = content[wrapper]
-    tensors = (
-        {key: value for key, value in content.items() if isinstance(value, Tensor)} if isinstance(content, dict) else {}
-    )
+    entries = content.items() if isinstance(content, dict) else ()
+    tensors = {key: value for key, value in entries if isinstance(key, str) and isinstance(value, Tensor)}
     if not tensors:
         raise CheckpointError(f"{path} holds no weights (a mapping of names to tensors); give a file with a state_dict")
     return tensors

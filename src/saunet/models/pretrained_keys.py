@@ -2,7 +2,7 @@
 
 Swin: the original repository and its dense-prediction backbone, torchvision, timm (which since 0.9 books the 2x2
 merging under the following stage) and OpenMMLab (whose merging unfolds its 2x2 neighbours in another channel order).
-ResNet: torchvision and timm, which agree, and Monodepth2's encoders.
+ResNet: torchvision and timm, which agree, and Monodepth2's encoders. A saunet checkpoint gives its depth encoder.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from torch import Tensor
 
 _STATIC = ("relative_position_index", "attn_mask", "relative_coords_table")
 """Last parts of names of buffers that depend on sizes only."""
-_WRAPPERS = ("module.", "backbone.", "encoder.")
+_WRAPPERS = ("module.", "depth.", "backbone.", "encoder.")
+"""What other trainers and our own put in front of an encoder's names; ours holds a pose network's weights too."""
 
 
 def to_our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -32,18 +33,23 @@ def to_our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     elif any(".attn.w_msa." in key for key in state):
         state = {key: _from_unfold_order(key, value) for key, value in _renamed(state, _from_openmmlab).items()}
     elif any(key.startswith("layers.0.blocks.0.attn.") for key in state):
-        stages = 1 + max(int(found[1]) for key in state if (found := re.match(r"layers\.(\d+)\.", key)))
-        if f"layers.{stages - 1}.downsample.reduction.weight" in state:  # the last stage is never followed by a merging
+        last = f"layers.{_stages(state) - 1}"
+        if f"{last}.downsample.reduction.weight" in state:  # the last stage is never followed by a merging
             state = _renamed(state, _from_timm)
-    if any("relative_position_bias_table" in key for key in state):
-        stages = 1 + max(int(found[1]) for key in state if (found := re.match(r"layers\.(\d+)\.", key)))
+    stages = _stages(state)
+    if stages and any("relative_position_bias_table" in key for key in state):
         state = _renamed(state, lambda key: re.sub(r"^norm\.", f"norm{stages - 1}.", key))
     return {key: value for key, value in state.items() if not re.match(r"(head|fc)\.", key)}
 
 
+def _stages(state: Mapping[str, Tensor]) -> int:
+    """Return the number of stages that the names speak of; 0 for names that are not a Swin's."""
+    return 1 + max((int(found[1]) for key in state if (found := re.match(r"layers\.(\d+)\.", key))), default=-1)
+
+
 def _unwrapped(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Strip what training frameworks put in front of the names."""
-    result = dict(state)
+    result = {key.replace("_orig_mod.", ""): value for key, value in state.items()}
     for wrapper in _WRAPPERS * 2:
         inside = {key[len(wrapper) :]: value for key, value in result.items() if key.startswith(wrapper)}
         if inside:  # what is outside a backbone is a head
@@ -82,8 +88,8 @@ def _from_openmmlab(key: str) -> str:
 
 def _from_unfold_order(key: str, value: Tensor) -> Tensor:
     """Reorder merged channels from (c, row, column), as an unfold gives them, to Swin's (column, row, c)."""
-    if ".downsample." not in key:
-        return value
+    if ".downsample." not in key or value.ndim == 0 or value.shape[-1] % 4:
+        return value  # no merging's, or of a shape that fits none and is refused for that
     split = value.reshape(*value.shape[:-1], value.shape[-1] // 4, 2, 2)
     return split.transpose(-3, -1).reshape(value.shape)
 

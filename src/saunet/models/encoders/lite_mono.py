@@ -34,7 +34,7 @@ class LiteMonoEncoder(nn.Module):
         dims: Channels of the three stages.
         depths: Blocks in each stage, the global block included.
         rates: Dilation rates that a stage's blocks go through again and again.
-        last_rates: Dilation rates of the last dilated blocks of the last stage.
+        last_rates: Dilation rates of the last dilated blocks of the last stage; none leaves them to ``rates``.
         heads: Heads of the channel attention.
         expansion: How much wider the pointwise layers are.
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
@@ -44,7 +44,8 @@ class LiteMonoEncoder(nn.Module):
         size_divisor: Input height and width must be multiples of it.
 
     Raises:
-        ConfigError: if there are not three stages of at least two blocks, or the heads do not divide the channels.
+        ConfigError: if there are not three stages of at least two blocks, a dilation rate is below 1 or ``rates`` is
+            empty, or the heads do not divide the channels.
     """
 
     mean: Tensor
@@ -61,9 +62,13 @@ class LiteMonoEncoder(nn.Module):
         drop_path: float = 0.2,
     ) -> None:
         super().__init__()
-        dims, depths = tuple(dims), tuple(depths)
+        dims, depths, rates, last_rates = tuple(dims), tuple(depths), tuple(rates), tuple(last_rates)
         if len(dims) != 3 or len(depths) != 3 or min(depths) < 2:
             raise ConfigError(f"dims is {dims} and depths {depths}; Lite-Mono has three stages of at least two blocks")
+        if not rates or min(rates + last_rates) < 1:
+            raise ConfigError(
+                f"rates is {rates} and last_rates {last_rates}; dilation rates are 1 or more, and rates is not empty"
+            )
         in_range("drop_path", drop_path, 0, 0.99)
         self.register_buffer("mean", torch.tensor(0.45), persistent=False)
         self.register_buffer("std", torch.tensor(0.225), persistent=False)
@@ -77,7 +82,7 @@ class LiteMonoEncoder(nn.Module):
         drops = iter([drop_path * i / (sum(depths) - 1) for i in range(sum(depths))])
         stages = []
         for stage, (dim, depth) in enumerate(zip(dims, depths, strict=True)):
-            dilations = _dilations(depth - 1, tuple(rates), tuple(last_rates) if stage == 2 else ())
+            dilations = _dilations(depth - 1, rates, last_rates if stage == 2 else ())
             blocks: list[nn.Module] = [DilatedBlock(dim, rate, expansion, next(drops)) for rate in dilations]
             blocks.append(GlobalBlock(dim, heads, expansion, next(drops), position=stage == 0))
             stages.append(nn.Sequential(*blocks))
