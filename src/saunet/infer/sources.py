@@ -21,7 +21,7 @@ class Source:
 
 
 def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Path) -> list[Source]:
-    """Return the images that ``inputs`` name, each input's in natural order; what lies in ``output_dir`` does not count.
+    """Return the images that ``inputs`` name, each input's in natural order, without what lies in ``output_dir``.
 
     Raises:
         DataError: if an input does not exist or holds no image.
