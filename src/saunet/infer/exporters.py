@@ -141,8 +141,11 @@ def run_eager(network: DepthNet) -> Run:
 
 
 def run_onnx(path: Path) -> Run:
-    """Return an ONNX file as a function of arrays, with as many threads as torch uses."""
-    session = open_session(path, threads=torch.get_num_threads())
+    """Return an ONNX file as a function of arrays, with as many threads as torch uses.
+
+    They do not spin, else they would hold the cores while the network that it is compared with is timed.
+    """
+    session = open_session(path, threads=torch.get_num_threads(), spinning=False)
     return lambda image: session.run([OUTPUT], {INPUT: image})[0]
 
 
