@@ -224,6 +224,31 @@ def test_network_that_fixes_its_batch_size(network: DepthNet, record: ModelRecor
         assert program(torch.zeros(1, 3, 32, 64)).shape == (1, 1, 32, 64)
 
 
+@pytest.mark.parametrize("name", ["onnx", "program", "compiled", "safetensors"])
+def test_full_disk(checkpoint: Path, tmp_path: Path, name: str) -> None:
+    """A file size limit in a process of its own stands for a full disk; the compiler itself is left out."""
+    code = (
+        "import resource, signal, sys, torch\n"
+        "from saunet.checks import DataError\n"
+        "from saunet.infer.export import export_model\n"
+        "def compiled(program, package_path):\n"
+        "    torch.export.save(program, package_path)\n"
+        "torch._inductor.aoti_compile_and_package = compiled\n"
+        "import shutil; shutil.which = lambda name: name\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
+        "try:\n"
+        "    export_model(sys.argv[1], sys.argv[2], [sys.argv[3]])\n"
+        "except DataError as error:\n    print(error)\n"
+    )
+    arguments = [sys.executable, "-c", code, str(checkpoint), str(tmp_path / "out"), name]
+    result = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith(f"cannot write {tmp_path / 'out'}/model.")
+    assert "File too large; check the folder, its rights and its space" in result.stdout
+    assert list((tmp_path / "out").iterdir()) == []
+
+
 TINY: dict[str, dict[str, Any]] = {
     "StratifiedTransformer": {"dim": 8, "depths": (2, 1, 1, 1), "heads": (1, 1, 2, 2), "window": (4, 4, 4, 4)},
     "SwinTransformer": {"dim": 8, "depths": (2, 1, 1, 1), "heads": (1, 1, 2, 2), "window": (4, 4, 4, 4)},
