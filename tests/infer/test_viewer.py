@@ -124,6 +124,7 @@ def browser() -> Iterator[Any]:
         opened.close()
 
 
+@pytest.mark.slow  # fast, but only the session of the slow tests installs playwright
 def test_orbit_scrub_and_play_in_a_browser(browser: Any, tmp_path: Path) -> None:
     write_viewer(tmp_path / "x.html", clip(), CAMERA, width=160)
     page = browser.new_page()
@@ -167,6 +168,7 @@ def test_orbit_scrub_and_play_in_a_browser(browser: Any, tmp_path: Path) -> None
     assert all(url.startswith(("file:", "data:")) for url in requests)
 
 
+@pytest.mark.slow  # as above
 def test_a_damaged_page_says_so_in_a_browser(browser: Any, tmp_path: Path) -> None:
     write_viewer(tmp_path / "x.html", clip(), CAMERA, width=160)
     text = (tmp_path / "x.html").read_text()
