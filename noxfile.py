@@ -47,8 +47,8 @@ def tests(session: nox.Session) -> None:
 
 @nox.session
 def slow(session: nox.Session) -> None:
-    """Run the tests marked slow, those of the extra sweep's launchers among them."""
-    install(session, "-e", ".[dev,sweep]")
+    """Run the tests marked slow, those of the extra sweep's launchers and those in a browser among them."""
+    install(session, "-e", ".[dev,sweep,browser]")
     session.run("pytest", "-m", "slow and not gpu", *session.posargs)
 
 

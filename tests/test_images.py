@@ -18,6 +18,7 @@ from saunet.data.windows import WindowDataset
 from saunet.images import (
     as_rgb_bytes,
     image_size,
+    natural_order,
     network_input,
     read_bytes,
     read_depth,
@@ -70,10 +71,13 @@ def test_exif_rotation_is_applied(tmp_path: Path, picture: NDArray[np.uint8], or
     exif = image.getexif()
     exif[0x112] = orientation
     image.save(tmp_path / "x.jpg", exif=exif, quality=95)
+    image.save(tmp_path / "x.png", exif=exif)
     expected = np.rot90(picture, turns)
-    got = read_image(tmp_path / "x.jpg")
-    assert got.shape == expected.shape
-    assert np.abs(got.astype(int) - expected).mean() < 4
+    for name in ("x.jpg", "x.png"):
+        got = read_image(tmp_path / name)
+        assert got.shape == expected.shape
+        assert image_size(tmp_path / name) == expected.shape[:2]
+        assert np.abs(got.astype(int) - expected).mean() < 4
 
 
 def test_one_pixel(tmp_path: Path) -> None:
@@ -154,6 +158,12 @@ class TestWrite:
             write_image(tmp_path / "x.png", picture[:, ::-1])
         assert [path.name for path in tmp_path.iterdir()] == ["x.png"]
         assert np.array_equal(read_image(tmp_path / "x.png"), picture)
+
+
+def test_names_are_ordered_by_their_numbers() -> None:
+    wanted = [Path(name) for name in ("a2/frame_1", "a2/frame_02", "a2/frame_2", "a2/frame_10", "a10/frame_1", "b")]
+    for paths in (wanted[::-1], sorted(wanted)):
+        assert sorted(paths, key=natural_order) == wanted
 
 
 def test_resize_follows_the_pixel_convention() -> None:

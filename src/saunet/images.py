@@ -6,6 +6,7 @@ written whole. There is one reader and one resize, so that a model sees in use w
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,13 @@ from saunet.checks import DataError, one_of
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 """File name endings that are taken for images when a folder is read."""
+
+
+def natural_order(name: str | Path) -> tuple[list[tuple[int, int, str]], str]:
+    """Return the key that sorts names of files by the numbers in them: ``frame_2`` before ``frame_10``."""
+    text = str(name)
+    parts = [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", text)]
+    return parts, text  # frame_1 and frame_01 are equal as numbers
 
 
 def read_bytes(path: str | Path) -> UInt8[np.ndarray, " n"]:
@@ -69,18 +77,15 @@ def read_depth(path: str | Path) -> Float32[np.ndarray, "h w"]:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Return (height, width) of an image; a PNG is not decoded for that.
+    """Return (height, width) of an image as `read_image` gives it; a PNG is not decoded for that, unless it is turned.
 
     Raises:
         DataError: if it is missing, empty or not an image.
     """
-    try:
-        with open(path, "rb") as file:
-            head = file.read(24)
-    except OSError:  # the full reader below says what is wrong
-        head = b""
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR" and len(head) == 24:
-        return int.from_bytes(head[20:24], "big"), int.from_bytes(head[16:20], "big")
+    data = read_bytes(path).tobytes()
+    # A PNG's EXIF rotation may stand before or after the picture.
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and data[12:16] == b"IHDR" and len(data) >= 24 and b"eXIf" not in data:
+        return int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
     shape = _decode(path, cv2.IMREAD_GRAYSCALE).shape
     return shape[0], shape[1]
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import signal
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from saunet.infer.colour import RunningRange, colourise
 from saunet.infer.odometer import Odometer
 from saunet.infer.predictor import Predictor
 from saunet.infer.video import predict_clip
+from saunet.infer.viewer import ViewerWriter
 from saunet.videos import VideoReader
 
 Picture = NDArray[np.uint8]
@@ -135,6 +138,76 @@ def test_interrupting_a_camera_completes_everything(
     assert names(tmp_path) == [
         "camera0_disparity.mp4", "camera0_points.html", "camera0_trajectory.png", "camera0_trajectory.txt",
     ]  # fmt: skip
+
+
+class RunningCamera(VideoReader):
+    """Gives frames until somebody stops it."""
+
+    def __init__(self, source: int) -> None:
+        self.fps, self.declared = 20.0, None
+
+    def __iter__(self) -> Iterator[Picture]:
+        return itertools.cycle(list(clip(4)))
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+@pytest.fixture
+def ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type, str, list[int]], None]]:
+    """Press Ctrl-C right after certain calls of a method: before what called it has taken note of its end."""
+    if threading.current_thread() is not threading.main_thread():
+        pytest.skip("signals arrive in the main thread, and the tests run in another")
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell job ignores it
+
+    def press(owner: type, method: str, calls: list[int]) -> None:
+        original, count = getattr(owner, method), itertools.count(1)
+
+        def pressed(*arguments: Any) -> Any:
+            result = original(*arguments)
+            if next(count) in calls:
+                signal.raise_signal(signal.SIGINT)
+            return result
+
+        monkeypatch.setattr(owner, method, pressed)
+
+    monkeypatch.setattr("saunet.infer.clips.VideoReader", RunningCamera)
+    yield press
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(
+    ("owner", "method"),
+    [
+        (cv2.VideoWriter, "write"),
+        (VideoWriter, "write"),
+        (ViewerWriter, "add"),
+        (Odometer, "add"),
+        (Predictor, "disparity"),
+    ],
+)
+def test_ctrl_c_in_the_middle_of_a_frame_keeps_the_recording(
+    predictor: Predictor, tmp_path: Path, odometer: Odometer, ctrl_c: Callable[..., None], owner: type, method: str
+) -> None:
+    ctrl_c(owner, method, [3])
+    outputs = ("mp4", "html", "trajectory", "npy")
+    summary = predict_clip(predictor, 0, tmp_path, outputs, camera=[90], odometer=odometer)
+    assert summary.frames == 3
+    with VideoReader(tmp_path / "camera0_disparity.mp4") as reader:
+        assert len(list(reader)) == 3
+    assert len((tmp_path / "camera0_trajectory.txt").read_text().splitlines()) == 3
+    assert len(list((tmp_path / "camera0").iterdir())) == 3
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_pressed_twice_discards_the_recording(
+    predictor: Predictor, tmp_path: Path, ctrl_c: Callable[..., None]
+) -> None:
+    ctrl_c(ViewerWriter, "add", [2])
+    ctrl_c(ViewerWriter, "add", [2])  # around the first
+    with pytest.raises(KeyboardInterrupt):
+        predict_clip(predictor, 0, tmp_path, ("mp4", "html"), camera=[90])
+    assert names(tmp_path) == []
 
 
 def test_refused(predictor: Predictor, video: Path, tmp_path: Path) -> None:

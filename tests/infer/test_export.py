@@ -21,11 +21,11 @@ import saunet
 from saunet.checkpoint import ModelRecord, Scale, atomic_save, build_networks
 from saunet.checks import CheckpointError, ConfigError, DataError
 from saunet.images import write_image
-from saunet.infer import export
+from saunet.infer import export, exporters
 from saunet.infer.card import fingerprint
 from saunet.infer.export import export_model
 from saunet.infer.exporters import export_onnx, export_program
-from saunet.infer.onnx import OnnxPredictor
+from saunet.infer.onnx import OnnxPredictor, open_session
 from saunet.infer.parity import Parity
 from saunet.infer.predictor import Predictor
 from saunet.models.depth import DepthNet
@@ -86,6 +86,7 @@ def test_folder_has_files_config_report_and_card(exported: tuple[Path, list[Pari
         assert report.depth_difference < 1e-3
         assert (report.batch, report.random, report.real) == ("any", 2, 1)
         assert min(report.eager_ms, report.exported_ms, report.megabytes) > 0
+        assert report.eager_ms == reports[0].eager_ms
     assert ModelRecord.from_plain(json.loads((folder / "config.json").read_text())) == record
     stored = json.loads((folder / "report.json").read_text())
     assert stored["files"] == [dataclasses.asdict(report) for report in reports]
@@ -136,6 +137,20 @@ def test_predicting_from_onnx_does_not_import_torch(exported: tuple[Path, list[P
     result = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
     assert (tmp_path / "out" / "x_disparity.png").exists()
+
+
+def test_the_comparison_leaves_the_cores_to_the_original(
+    exported: tuple[Path, list[Parity]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sessions: list[Any] = []
+
+    def noted(*arguments: Any, **settings: Any) -> Any:
+        sessions.append(open_session(*arguments, **settings))
+        return sessions[-1]
+
+    monkeypatch.setattr(exporters, "open_session", noted)
+    exporters.run_onnx(exported[0] / "model.onnx")
+    assert sessions[0].get_session_options().get_session_config_entry("session.intra_op.allow_spinning") == "0"
 
 
 def test_fixed_batch_is_filled_up(network: DepthNet, record: ModelRecord, tmp_path: Path, picture: Picture) -> None:
@@ -207,6 +222,31 @@ def test_network_that_fixes_its_batch_size(network: DepthNet, record: ModelRecor
         export_program(network, record, tmp_path / f"{batch}.pt2", batch=batch)
         program = torch.export.load(tmp_path / f"{batch}.pt2").module()
         assert program(torch.zeros(1, 3, 32, 64)).shape == (1, 1, 32, 64)
+
+
+@pytest.mark.parametrize("name", ["onnx", "program", "compiled", "safetensors"])
+def test_full_disk(checkpoint: Path, tmp_path: Path, name: str) -> None:
+    """A file size limit in a process of its own stands for a full disk; the compiler itself is left out."""
+    code = (
+        "import resource, signal, sys, torch\n"
+        "from saunet.checks import DataError\n"
+        "from saunet.infer.export import export_model\n"
+        "def compiled(program, package_path):\n"
+        "    torch.export.save(program, package_path)\n"
+        "torch._inductor.aoti_compile_and_package = compiled\n"
+        "import shutil; shutil.which = lambda name: name\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
+        "try:\n"
+        "    export_model(sys.argv[1], sys.argv[2], [sys.argv[3]])\n"
+        "except DataError as error:\n    print(error)\n"
+    )
+    arguments = [sys.executable, "-c", code, str(checkpoint), str(tmp_path / "out"), name]
+    result = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith(f"cannot write {tmp_path / 'out'}/model.")
+    assert "File too large; check the folder, its rights and its space" in result.stdout
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 TINY: dict[str, dict[str, Any]] = {

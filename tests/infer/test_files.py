@@ -114,6 +114,14 @@ def test_camera_numbers_belong_to_the_first_image_that_can_be_read(
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.parametrize("pattern", ["", "frame_*.png"])
+def test_frames_come_in_the_order_of_their_numbers(picture: NDArray[np.uint8], tmp_path: Path, pattern: str) -> None:
+    for number in range(1, 13):
+        write_image(tmp_path / "in" / f"frame_{number}.png", picture)
+    found = find_sources(tmp_path / "in" / pattern, tmp_path / "out")
+    assert [source.stem for source in found] == [f"frame_{number}" for number in range(1, 13)]
+
+
 def test_single_image_glob_and_several(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
     assert len(predict_files(predictor, folder / "a.png", tmp_path / "1").written) == 2
     assert len(predict_files(predictor, str(folder / "**" / "*.png"), tmp_path / "2").written) == 4

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from saunet.infer.parity import compare
+from saunet.infer.parity import Run, compare, timed
 
 IMAGES = [np.full((1, 3, 4, 6), value, np.float32) for value in (0.2, 0.8)]
 
@@ -21,6 +21,20 @@ def test_the_largest_difference_of_all_images_counts() -> None:
     assert found.difference == pytest.approx(0.01)
     assert found.depth_difference == pytest.approx(0.1 / 1.4)
     assert (found.random, found.real) == (2, 0)
+
+
+def test_every_file_is_timed_against_one_and_the_same_original() -> None:
+    calls: list[str] = []
+
+    def named(name: str) -> Run:
+        return lambda images: calls.append(name) or disparity(images)
+
+    reports = [compare(name, disparity, disparity, IMAGES, (), 10.0) for name in "ab"]
+    found = timed(reports, named("eager"), [named("a"), named("b")], IMAGES[0], repeats=3)
+    assert calls == ["eager", "a", "b"] * 5  # two rounds to warm up
+    assert [report.file for report in found] == ["a", "b"]
+    assert found[0].eager_ms == found[1].eager_ms
+    assert [report.difference for report in found] == [0, 0]
 
 
 @pytest.mark.parametrize("place", [0, 1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import itertools
 import json
 import re
 import shutil
@@ -35,10 +36,11 @@ def clip(count: int = 3) -> Iterator[Prediction]:
 
 
 def content(path: Path) -> dict[str, Any]:
-    found = re.search(r'<script id="clip" type="application/json">(.*?)</script>', path.read_text(), re.DOTALL)
-    assert found is not None
-    loaded: dict[str, Any] = json.loads(found.group(1))
-    return loaded
+    """What the page says of the clip, and its frames, each in an element of its own."""
+    text = path.read_text()
+    (head,) = re.findall(r'<script id="clip" type="application/json">(.*?)</script>', text)
+    frames = re.findall(r'<script class="frame" type="application/json">(.*?)</script>', text)
+    return {**json.loads(head), "frames": [json.loads(frame) for frame in frames]}
 
 
 def test_points_survive(tmp_path: Path) -> None:
@@ -70,6 +72,16 @@ def test_page_fetches_nothing_and_a_title_cannot_break_it(tmp_path: Path) -> Non
     assert not re.search(r"https?://|src=|@import|url\(", text)
     assert "default-src 'none'" in text
     assert content(tmp_path / "x.html")["title"] == "</script><b>x"
+
+
+def test_no_text_in_the_page_grows_with_the_clip(tmp_path: Path) -> None:
+    """Browsers limit the length of one text: half a gigabyte of JSON in one piece left the page blank."""
+    longest = []
+    for count in (1, 30):
+        write_viewer(tmp_path / "x.html", itertools.islice(itertools.cycle(clip(1)), count), CAMERA, width=160)
+        scripts = re.findall(r"<script[^>]*>(.*?)</script>", (tmp_path / "x.html").read_text(), re.DOTALL)
+        longest.append(max(map(len, scripts)))
+    assert longest[0] == longest[1]
 
 
 def test_constant_depth(tmp_path: Path) -> None:
@@ -104,14 +116,18 @@ def browser() -> Iterator[Any]:
         pytest.skip("no Chromium is installed")
     with playwright.sync_playwright() as started:
         flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        opened = started.chromium.launch(executable_path=binary, args=flags)
-        yield opened
+        minutes = 5 * 60_000.0  # on a busy machine everything takes long
+        opened = started.chromium.launch(executable_path=binary, args=flags, timeout=minutes)
+        context = opened.new_context(viewport={"width": 800, "height": 400})
+        context.set_default_timeout(minutes)
+        yield context
         opened.close()
 
 
+@pytest.mark.slow  # fast, but only the session of the slow tests installs playwright
 def test_orbit_scrub_and_play_in_a_browser(browser: Any, tmp_path: Path) -> None:
     write_viewer(tmp_path / "x.html", clip(), CAMERA, width=160)
-    page = browser.new_page(viewport={"width": 800, "height": 400})
+    page = browser.new_page()
     problems: list[str] = []
     requests: list[str] = []
     page.on("pageerror", lambda error: problems.append(str(error)))
@@ -150,3 +166,24 @@ def test_orbit_scrub_and_play_in_a_browser(browser: Any, tmp_path: Path) -> None
     page.get_by_role("button", name="pause").click()
     assert problems == []
     assert all(url.startswith(("file:", "data:")) for url in requests)
+
+
+@pytest.mark.slow  # as above
+def test_a_damaged_page_says_so_in_a_browser(browser: Any, tmp_path: Path) -> None:
+    write_viewer(tmp_path / "x.html", clip(), CAMERA, width=160)
+    text = (tmp_path / "x.html").read_text()
+    second = text.index('{"image"', text.index('{"image"') + 1)
+    page = browser.new_page()
+    for damaged, words in (
+        (text[:second] + text[second + 1 :], "frame 2 cannot be read"),
+        (text.replace('{"title"', '{"title', 1), "this page cannot be read"),
+    ):
+        (tmp_path / "x.html").write_text(damaged)
+        page.goto((tmp_path / "x.html").as_uri())
+        if words.startswith("frame"):
+            page.wait_for_selector('body[data-frame="0"]')
+            assert page.locator("#problem").is_hidden()
+            page.locator("#scrub").fill("1")
+        page.wait_for_selector("#problem:visible")
+        assert words in page.locator("#problem").inner_text()
+        assert "is the file whole?" in page.locator("#problem").inner_text()

@@ -11,7 +11,6 @@ import hashlib
 import itertools
 import json
 import os
-import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from pathlib import Path
 from saunet.atomic import write_json
 from saunet.checks import DataError
 from saunet.data.camera_file import FILE_NAME, CameraFile, read_camera
-from saunet.images import IMAGE_SUFFIXES, encode_jpeg, resize
+from saunet.images import IMAGE_SUFFIXES, encode_jpeg, natural_order, resize
 from saunet.videos import VIDEO_SUFFIXES, VideoReader
 
 QUALITY = 95
@@ -78,7 +77,7 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
     root = Path(root).expanduser()
     if not root.exists():
         raise DataError(f"no data root at {root.absolute()}; set data.root to a folder of clips, or to a video")
-    paths = [root] if root.is_file() else sorted(_clip_paths(root), key=lambda path: _natural(str(path)))
+    paths = [root] if root.is_file() else sorted(_clip_paths(root), key=natural_order)
     if root.is_file() and root.suffix.lower() not in VIDEO_SUFFIXES:
         raise DataError(f"{root} is neither a folder nor a video; videos end in {' '.join(sorted(VIDEO_SUFFIXES))}")
     if not paths:
@@ -93,7 +92,7 @@ def frame_paths(folder: Path) -> list[Path]:
     """Return the images directly in a folder in natural order: ``frame_2`` before ``frame_10``."""
     with os.scandir(folder) as entries:
         names = [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
-    return [folder / name for name in sorted(names, key=_natural) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
+    return [folder / name for name in sorted(names, key=natural_order) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
 
 
 def every(recorded: float | None, wanted: float | None) -> Iterator[int]:
@@ -253,8 +252,3 @@ def _name(path: Path, base: Path) -> str:
     if path == base:
         return path.absolute().name
     return path.relative_to(base).as_posix()
-
-
-def _natural(text: str) -> list[tuple[int, int, str]]:
-    parts = re.split(r"(\d+)", text)
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]

@@ -21,7 +21,7 @@ from saunet.images import network_input, read_image
 from saunet.infer import exporters
 from saunet.infer.card import model_card
 from saunet.infer.folder import CONFIG, WEIGHTS, read_model, restored
-from saunet.infer.parity import Parity, Run, compare
+from saunet.infer.parity import Parity, Run, compare, timed
 from saunet.infer.sources import image_paths
 from saunet.models.depth import DepthNet
 from saunet.progress import bar
@@ -92,7 +92,7 @@ def export_model(
     random, real = _random(record), _real(record, images)
     _clear(folder, overwrite)
     eager, span = exporters.run_eager(network), 1 / record.min_depth - 1 / record.max_depth
-    reports = []
+    reports, runs = list[Parity](), list[Run]()
     with bar(progress) as shown:
         task = shown.add_task("exporting", total=len(dict.fromkeys(formats)))
         for name in dict.fromkeys(formats):
@@ -118,7 +118,9 @@ def export_model(
                         f"disparity range, more than {TOLERANCE:g}, so it is not written; report encoder and decoder"
                     )
             reports.append(report)
+            runs.append(run)
             shown.advance(task)
+    reports = timed(reports, eager, runs, random[0])
     about = {"threads": torch.get_num_threads(), "machine": platform.machine(), "versions": _versions()}
     content = {"tolerance": TOLERANCE, **about, "files": [asdict(report) for report in reports]}
     write_json(folder / REPORT, content)

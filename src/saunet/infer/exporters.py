@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import io
 import json
 import logging
 import shutil
@@ -92,7 +93,9 @@ def export_program(network: DepthNet, record: ModelRecord, path: str | Path, bat
         ConfigError: if the network cannot be exported this way.
     """
     program, takes = _program(network, record, batch)
-    torch.export.save(program, path, extra_files={METADATA: json.dumps(record.to_plain())})
+    content = io.BytesIO()  # torch's own writer, on a full disk, cannot even be closed and ends the process
+    torch.export.save(program, content, extra_files={METADATA: json.dumps(record.to_plain())})
+    Path(path).write_bytes(content.getbuffer())
     return takes
 
 
@@ -108,11 +111,13 @@ def export_compiled(network: DepthNet, record: ModelRecord, path: str | Path, ba
     if shutil.which("g++") is None and shutil.which("clang++") is None and shutil.which("cl") is None:
         raise ConfigError("the format 'compiled' needs a C++ compiler and found none; install g++, or leave it out")
     program, takes = _program(network, record, batch)
+    content = io.BytesIO()
     try:
         with torch.no_grad():
-            torch._inductor.aoti_compile_and_package(program, package_path=str(path))
+            torch._inductor.aoti_compile_and_package(program, package_path=content)
     except RuntimeError as reason:
         raise ConfigError(f"compiling failed: {str(reason).strip().splitlines()[0]}; export 'program'") from reason
+    Path(path).write_bytes(content.getbuffer())
     return takes
 
 
@@ -141,8 +146,11 @@ def run_eager(network: DepthNet) -> Run:
 
 
 def run_onnx(path: Path) -> Run:
-    """Return an ONNX file as a function of arrays, with as many threads as torch uses."""
-    session = open_session(path, threads=torch.get_num_threads())
+    """Return an ONNX file as a function of arrays, with as many threads as torch uses.
+
+    They do not spin, else they would hold the cores while the network that it is compared with is timed.
+    """
+    session = open_session(path, threads=torch.get_num_threads(), spinning=False)
     return lambda image: session.run([OUTPUT], {INPUT: image})[0]
 
 

@@ -86,8 +86,14 @@ def flip_blend(
     return np.asarray(right * disparity + left * other + (1 - left - right) * mean, dtype=np.float32)
 
 
-def open_session(path: Path, device: str = "cpu", threads: int = 0) -> Any:
+def open_session(path: Path, device: str = "cpu", threads: int = 0, spinning: bool = True) -> Any:
     """Open an ONNX file with onnxruntime.
+
+    Args:
+        path: The file.
+        device: ``"cpu"`` or ``"cuda"``.
+        threads: Threads to use; 0 lets onnxruntime choose.
+        spinning: Let threads that wait for work keep their cores busy, for a while also after a run.
 
     Raises:
         CheckpointError: if the file is missing or broken.
@@ -106,6 +112,8 @@ def open_session(path: Path, device: str = "cpu", threads: int = 0) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
+    if not spinning:
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=[wanted])
     except Exception as reason:  # onnxruntime's errors share no base class but Exception

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +28,12 @@ class Parity:
     """Random images compared."""
     real: int
     """Real images compared."""
-    eager_ms: float
-    """Median time of the original for one image, on the CPU."""
-    exported_ms: float
-    """Median time of the exported file for one image, on the CPU."""
     megabytes: float = 0.0
     """Size of the file."""
+    eager_ms: float = 0.0
+    """Median time of the original for one image, on the CPU; see `timed`."""
+    exported_ms: float = 0.0
+    """Median time of the exported file for one image, on the CPU."""
 
 
 def compare(
@@ -67,8 +67,23 @@ def compare(
         apart = np.abs(got - wanted)
         difference = float(np.maximum(difference, apart.max() / span))  # NaN stays NaN: it passes no tolerance
         relative = float(np.maximum(relative, (apart / np.abs(got)).max()))  # |1/got - 1/wanted| * wanted
-    eager_ms, exported_ms = milliseconds([eager, exported], random[0])
-    return Parity(file, batch, difference, relative, len(random), len(real), eager_ms, exported_ms, round(megabytes, 3))
+    return Parity(file, batch, difference, relative, len(random), len(real), round(megabytes, 3))
+
+
+def timed(
+    reports: Sequence[Parity], eager: Run, exported: Sequence[Run], image: NDArray[np.float32], repeats: int = 11
+) -> list[Parity]:
+    """Return the comparisons with times: of the original, which is the same in all, and of each file.
+
+    Args:
+        reports: The comparisons.
+        eager: The original.
+        exported: The exported file of each comparison.
+        image: The input, 1 x 3 x h x w.
+        repeats: Calls of each that count.
+    """
+    first, *others = milliseconds([eager, *exported], image, repeats)
+    return [replace(report, eager_ms=first, exported_ms=own) for report, own in zip(reports, others, strict=True)]
 
 
 def milliseconds(runs: Sequence[Run], image: NDArray[np.float32], repeats: int = 11) -> list[float]:

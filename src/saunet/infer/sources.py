@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import glob
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from saunet.checks import ConfigError, DataError
-from saunet.images import IMAGE_SUFFIXES
+from saunet.images import IMAGE_SUFFIXES, natural_order
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,7 @@ class Source:
 
 
 def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Path) -> list[Source]:
-    """Return the images that ``inputs`` name, each input's sorted by name; what lies in ``output_dir`` does not count.
+    """Return the images that ``inputs`` name, each input's in natural order, without what lies in ``output_dir``.
 
     Raises:
         DataError: if an input does not exist or holds no image.
@@ -62,7 +62,7 @@ def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Pa
 
 
 def image_paths(item: str | Path) -> list[Path]:
-    """Return the images that a file, folder or pattern names, sorted.
+    """Return the images that a file, folder or pattern names, in natural order: ``frame_2`` before ``frame_10``.
 
     Raises:
         DataError: if it does not exist or holds no image.
@@ -81,14 +81,17 @@ def _expand(item: str | Path) -> tuple[Path, list[Path]]:
     """Return the folder that results' names are relative to, and the images."""
     path = Path(item)
     if path.is_dir():
-        return path, sorted(p for p in path.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+        return path, _images(path.rglob("*"))
     if path.is_file():
         return path.parent, [path]
     if glob.has_magic(str(item)):
         fixed = _before_magic(path.parts)
-        matches = sorted(Path(match) for match in glob.glob(str(item), recursive=True))
-        return Path(*fixed), [p for p in matches if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()]
+        return Path(*fixed), _images(Path(match) for match in glob.glob(str(item), recursive=True))
     raise DataError(f"no file or folder at {item}; check the path")
+
+
+def _images(paths: Iterable[Path]) -> list[Path]:
+    return sorted((p for p in paths if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()), key=natural_order)
 
 
 def _before_magic(parts: Sequence[str]) -> list[str]:

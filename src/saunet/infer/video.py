@@ -13,6 +13,7 @@ from saunet.checks import ConfigError, one_of, positive
 from saunet.infer.clips import Clip, Source, open_clip
 from saunet.infer.colour import PALETTES, RunningRange
 from saunet.infer.files import OUTPUTS, Style
+from saunet.infer.interrupt import interrupt_noted
 from saunet.infer.pipeline import ImagePredictor
 from saunet.infer.pointcloud import Camera
 from saunet.infer.sinks import LAYOUTS, FrameSink, Sink, TrajectorySink, VideoSink, ViewerSink
@@ -63,8 +64,8 @@ def render_video(
 ) -> VideoSummary:
     """Write a video of image and disparity, with colours that are stable over the clip.
 
-    One frame is in memory at a time, so a source may be of any length. Ctrl-C ends a camera's video cleanly; else it
-    discards the unfinished file.
+    One frame is in memory at a time, so a source may be of any length. Ctrl-C ends a camera's video cleanly; a second
+    one, or one with another source, discards the unfinished file.
 
     Args:
         predictor: The model.
@@ -116,8 +117,8 @@ def predict_clip(
 ) -> ClipSummary:
     """Predict a clip once and write any of its results, with colours that are stable over the clip.
 
-    A batch of frames is in memory at a time. Ctrl-C ends a camera's results cleanly; else it discards those that are
-    not complete, and files of single frames stay.
+    A batch of frames is in memory at a time. Ctrl-C ends a camera's results cleanly after the batch at hand; a second
+    one, or one with another source, discards those that are not complete, and files of single frames stay.
 
     Args:
         predictor: The model.
@@ -197,21 +198,24 @@ def _run(
     """Predict every frame into every sink; with ``finish``, Ctrl-C ends the clip instead of discarding results."""
     count = 0
     with contextlib.ExitStack() as stack:
+        stopped = stack.enter_context(interrupt_noted(finish))
         for sink in sinks:
             stack.enter_context(sink)
         shown = stack.enter_context(bar(progress))
         task = shown.add_task("rendering", total=max_frames or clip.declared)
         frames = itertools.islice(clip, max_frames)
         try:
-            while batch := list(itertools.islice(frames, batch_size)):
+            while not stopped() and (batch := list(itertools.islice(frames, batch_size))):
                 for result in predictor.predict_batch(batch):
                     now = limits.update(result.disparity)
                     for sink in sinks:
                         sink.add(result, now)
                     count += 1
                 shown.advance(task, len(batch))
+            if stopped() and count == 0:
+                raise KeyboardInterrupt
         except KeyboardInterrupt:
-            if not finish or count == 0:
+            if not finish or stopped() or count == 0:
                 raise
     return count
 

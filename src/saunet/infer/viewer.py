@@ -22,7 +22,7 @@ from saunet.infer.pointcloud import Camera, jumps
 from saunet.infer.prediction import Prediction
 
 _TEMPLATE = "viewer.html"
-_MARK = "@CLIP@"
+_MARKS = ("@CLIP@", "@FRAMES@")
 _LEVELS = 65534
 
 
@@ -69,7 +69,8 @@ class ViewerWriter:
 
     def __enter__(self) -> ViewerWriter:
         template = resources.files("saunet.infer").joinpath(_TEMPLATE).read_text(encoding="utf-8")
-        self._before, self._after = template.split(_MARK)
+        self._before, rest = template.split(_MARKS[0])
+        self._between, self._after = rest.split(_MARKS[1])
         temporary = self._open.enter_context(replacing(self.path))
         try:
             self._page = self._open.enter_context(temporary.open("w", encoding="utf-8"))
@@ -85,9 +86,9 @@ class ViewerWriter:
             if not isinstance(self._camera, Camera):
                 self._camera = Camera.from_numbers(self._camera, *prediction.depth.shape)
             head = _head(prediction, self._camera.resized(self._rows, self._width), self._title, self._fps)
-            self._page.write(self._before + _json(head)[:-1] + ',"frames":[')
+            self._page.write(self._before + _json(head) + self._between)
         frame = _frame(prediction, self._rows, self._width, self._max_depth, self._edge)
-        self._page.write(("," if self.count else "") + _json(frame))
+        self._page.write(f'<script class="frame" type="application/json">{_json(frame)}</script>\n')
         self.count += 1
 
     def __exit__(
@@ -98,7 +99,7 @@ class ViewerWriter:
                 raise error
             if self.count == 0:
                 raise DataError(f"no frame was given, so {self.path} was not written")
-            self._page.write("]}" + self._after)
+            self._page.write(self._after)
 
 
 def write_viewer(
