@@ -163,6 +163,30 @@ def test_folder_into_files_and_a_page(tool: Callable[..., Any], checkpoint: Path
     assert "outputs is 'color'; did you mean 'colour'" in tool("predict", *arguments[:3], "outputs=[color]").err
 
 
+def test_one_picture_does_not_import_the_trainer(checkpoint: Path, image: Path, tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        "from saunet.cli.predict import main\n"
+        "main()\n"
+        "trainer = ('lightning', 'torchmetrics', 'kornia', 'scipy', 'matplotlib', 'saunet.losses', 'saunet.data')\n"
+        "print([name for name in trainer if name in sys.modules])"
+    )
+    arguments = [sys.executable, "-c", code, f"checkpoint={checkpoint}", "input=a.png", "output=out"]
+    result = subprocess.run(arguments, capture_output=True, text=True, cwd=tmp_path, check=True)
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_ctrl_c_while_components_are_imported(
+    tool: Callable[..., Any], checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("saunet.cli._app.register_configs", interrupted)
+    outcome = tool("predict", f"checkpoint={checkpoint}", "input=a.png", "output=out")
+    assert (outcome.code, outcome.err) == (130, "saunet-predict: interrupted\n")
+
+
 def test_camera_that_is_not_there(tool: Callable[..., Any], checkpoint: Path, tmp_path: Path) -> None:
     outcome = tool("predict", f"checkpoint={checkpoint}", "input=97", "output=out")
     assert outcome.code == 1

@@ -77,7 +77,7 @@ def _predict_clip(cfg: DictConfig, predictor: Any, source: Any, outputs: list[st
 
 def main() -> None:
     """Entry point of ``saunet-predict``."""
-    run("predict", predict)
+    run("predict", predict, kinds=())
 
 
 if __name__ == "__main__":
