@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,19 @@ def config_dir() -> Path:
     raise ConfigError(f"no configuration files beside {package}; reinstall saunet")
 
 
-def register_configs() -> None:
-    """Put the root schemas and every registered component into Hydra's config store."""
+def register_configs(kinds: Collection[str] = tuple(REGISTRIES)) -> None:
+    """Put the root schemas and every registered component of these kinds into Hydra's config store.
+
+    Args:
+        kinds: Kinds of components, keys of `saunet.registry.REGISTRIES`; all by default. Their packages are imported.
+    """
     store = ConfigStore.instance()
     for root in ROOTS:
         if root in (ModelConfig, ScaleConfig):  # parts of roots
             continue
         store.store(name=f"{root.__name__.removesuffix('Config').lower()}_schema", node=root)
-    for registry in REGISTRIES.values():
+    for kind in kinds:
+        registry = REGISTRIES[kind]
         if registry.group is None:
             continue
         for entry in registry:

@@ -95,6 +95,10 @@ class PredictConfig:
     rectify: str | None = None
     max_depth: float | None = None
     max_frames: int | None = None
+    fps: float | None = None
+    layout: str = "auto"
+    memory: float = 0.95
+    codec: str = "mp4v"
     flip: bool = False
     keep_aspect: bool = False
     scale: ScaleConfig = field(default_factory=ScaleConfig)

@@ -20,7 +20,9 @@ from saunet.images import read_image
 from saunet.infer.clips import VideoWriter
 from saunet.infer.files import predict_files
 from saunet.infer.pointcloud import Camera, point_cloud, write_ply
+from saunet.infer.video import predict_clip
 from saunet.roots import PredictConfig
+from saunet.videos import VideoReader
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +60,38 @@ def test_the_tool_writes_what_the_library_writes_by_default() -> None:
     config = PredictConfig()
     assert config.outputs is None  # ("colour", "png16") for images, ("mp4",) for a clip
     assert defaults["outputs"] == ("colour", "png16")
-    for key in ("palette", "camera", "max_depth", "batch_size", "overwrite"):
-        assert getattr(config, key) == defaults[key]
+    of_clips = {name: p.default for name, p in inspect.signature(predict_clip).parameters.items()}
+    for key in ("palette", "camera", "max_depth", "batch_size", "max_frames", "overwrite"):
+        assert getattr(config, key) == defaults[key] == of_clips[key]
+    for key in ("fps", "layout", "memory", "codec"):
+        assert getattr(config, key) == of_clips[key]
+
+
+def test_what_a_clip_looks_like_can_be_chosen(
+    tool: Callable[..., Any], checkpoint: Path, video: Path, image: Path, tmp_path: Path
+) -> None:
+    for source, name in (("drive.mp4", "drive"), ("*.png", tmp_path.name)):
+        outcome = tool(
+            "predict", f"checkpoint={checkpoint}", f"input={source}", "output=out", "outputs=[mp4]",
+            "fps=30", "layout=beside", "codec=vp09", "memory=0",
+        )  # fmt: skip
+        assert outcome.code == 0, outcome.err
+        with VideoReader(tmp_path / "out" / f"{name}_disparity.mp4") as reader:
+            assert reader.fps == pytest.approx(30)
+            assert reader.width > reader.height
+    refused = tool("predict", f"checkpoint={checkpoint}", "input=drive.mp4", "output=out2", "codec=h264")
+    refused.says("codec is 'h264'", "allowed: mp4v, vp09")
+
+
+def test_number_of_frames(tool: Callable[..., Any], checkpoint: Path, video: Path, image: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "b.png"), cv2.imread(str(image)))
+    for source, name in (("drive.mp4", "drive/000000_depth.npy"), ("*.png", "a_depth.npy")):
+        arguments = (f"checkpoint={checkpoint}", f"input={source}", f"output=out_{source[-3:]}", "outputs=[npy]")
+        for wrong in (-1, 0):
+            tool("predict", *arguments, f"max_frames={wrong}").says(f"max_frames is {wrong}; it must be greater than 0")
+        assert tool("predict", *arguments, "max_frames=1").code == 0
+        folder = tmp_path / f"out_{source[-3:]}"
+        assert [str(path.relative_to(folder)) for path in folder.rglob("*.npy")] == [name]
 
 
 def test_point_clouds_need_the_camera_and_get_it(
@@ -129,6 +161,30 @@ def test_folder_into_files_and_a_page(tool: Callable[..., Any], checkpoint: Path
     assert outcome.code == 0, outcome.err
     assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == [".html", ".json", ".npy"]
     assert "outputs is 'color'; did you mean 'colour'" in tool("predict", *arguments[:3], "outputs=[color]").err
+
+
+def test_one_picture_does_not_import_the_trainer(checkpoint: Path, image: Path, tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        "from saunet.cli.predict import main\n"
+        "main()\n"
+        "trainer = ('lightning', 'torchmetrics', 'kornia', 'scipy', 'matplotlib', 'saunet.losses', 'saunet.data')\n"
+        "print([name for name in trainer if name in sys.modules])"
+    )
+    arguments = [sys.executable, "-c", code, f"checkpoint={checkpoint}", "input=a.png", "output=out"]
+    result = subprocess.run(arguments, capture_output=True, text=True, cwd=tmp_path, check=True)
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_ctrl_c_while_components_are_imported(
+    tool: Callable[..., Any], checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("saunet.cli._app.register_configs", interrupted)
+    outcome = tool("predict", f"checkpoint={checkpoint}", "input=a.png", "output=out")
+    assert (outcome.code, outcome.err) == (130, "saunet-predict: interrupted\n")
 
 
 def test_camera_that_is_not_there(tool: Callable[..., Any], checkpoint: Path, tmp_path: Path) -> None:
@@ -203,8 +259,9 @@ class TestBadInput:
         data = (tmp_path / "x.avi").read_bytes()
         (tmp_path / "x.avi").write_bytes(data[: len(data) * 6 // 10])
         outcome = run("x.avi", "outputs=[mp4,npy]")
-        assert outcome.code == 0, outcome.err
+        assert outcome.code == 1
         assert "frames earlier than it declares: it may be truncated" in outcome.err
+        assert (tmp_path / "out" / "x_disparity.mp4").is_file()
         count = len(list((tmp_path / "out" / "x").iterdir()))
         assert 2 < count < 9
         assert f"{count} frames" in outcome.out

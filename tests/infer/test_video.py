@@ -61,6 +61,23 @@ def test_colour_channels_keep_their_order(tmp_path: Path) -> None:
     assert frame[1:].max() < 40
 
 
+def test_codec_that_plays_in_browsers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with VideoWriter(tmp_path / "x.mp4", 12, "vp09") as writer:
+        for frame in clip(9):
+            writer.write(frame)
+    assert b"vp09" in (tmp_path / "x.mp4").read_bytes()
+    with VideoReader(tmp_path / "x.mp4") as reader:
+        frames = list(reader)
+    assert max(np.abs(a.astype(int) - b).mean() for a, b in zip(frames, clip(9), strict=True)) < 4
+    with pytest.raises(ConfigError, match="codec is 'avc1', allowed: mp4v, vp09"):
+        VideoWriter(tmp_path / "x.mp4", 12, "avc1")
+    monkeypatch.setattr(cv2.VideoWriter, "isOpened", lambda self: False)  # an OpenCV that lacks it
+    message = r"vp09, with which this OpenCV cannot write .*y\.mp4; set codec=mp4v"
+    with pytest.raises(ConfigError, match=message), VideoWriter(tmp_path / "y.mp4", 12, "vp09") as writer:
+        writer.write(next(clip(1)))
+    assert [path.name for path in tmp_path.iterdir()] == ["x.mp4"]
+
+
 def test_odd_sizes_are_made_even(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "x.mp4", 10) as writer:
         for frame in clip(3, 31, 45):

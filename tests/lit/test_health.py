@@ -12,7 +12,7 @@ import torch
 from saunet.checks import ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.lit.health import HealthMonitor, health, holes
-from saunet.lit.loading import LoaderMonitor, Loading
+from saunet.lit.loading import LoaderMonitor, Loading, sentence
 from saunet.types import DepthPyramid, LossTerms
 
 
@@ -92,6 +92,21 @@ def test_loading_figures() -> None:
     assert (loading.reached, loading.needed, loading.share) == pytest.approx((36.0, 60.0, 0.4))
 
 
+@pytest.mark.parametrize(("cacheable", "cached"), [(True, False), (True, True), (False, False)])
+def test_copies_are_advised_where_the_data_can_be_read_from_them(
+    cacheable: bool, cached: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer, data = tiny.tiny_trainer(tmp_path), tiny.tiny_walls()
+    data.cacheable = cacheable
+    if cached:
+        monkeypatch.setattr(data, "copies", object())
+    monkeypatch.setattr(trainer, "datamodule", data, raising=False)
+    monkeypatch.setattr("saunet.lit.loading.available_cores", lambda: 0)
+    said = sentence(Loading(images=360, seconds=10.0, waited=4.0), trainer)
+    assert ("with saunet-prepare cache" in said) == (cacheable and not cached)
+    assert ("use a faster disk or more cores" in said) == (not cacheable or cached)
+
+
 @pytest.mark.parametrize("slow", [True, False])
 def test_a_slow_loader_is_named_with_its_figures_and_a_fast_one_is_not(
     slow: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
@@ -126,3 +141,4 @@ def test_a_slow_loader_is_named_with_its_figures_and_a_fast_one_is_not(
     if slow:
         assert "75 images/s arrive and the model could use 300 (75% of the time" in said[0]
         assert "raise data.workers (now 0" in said[0]
+        assert "load smaller copies made once with saunet-prepare cache" in said[0]

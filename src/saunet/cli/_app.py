@@ -8,13 +8,12 @@ import re
 import shutil
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import wraps
 from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
@@ -31,8 +30,11 @@ from saunet.registry import REGISTRIES
 from saunet.roots import ROOTS
 
 
-def run(name: str, task: Callable[[DictConfig], Any]) -> None:
+def run(name: str, task: Callable[[DictConfig], Any], kinds: Collection[str] = tuple(REGISTRIES)) -> None:
     """Run ``task`` as the Hydra application whose root config is ``conf/<name>.yaml``.
+
+    ``kinds`` are those of the components that the config may name: a tool without losses and data sets starts without
+    importing what they are made of, Lightning among it.
 
     What a user can mend ends in one sentence and exit code 1; only a defect of the program shows a traceback.
     ``HYDRA_FULL_ERROR=1`` shows it always. In a sweep, the other jobs go on, and failures are named at the end.
@@ -41,14 +43,14 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
     # A process that DDP started inherits the variable from us, not from the user.
     debug = before == "1" and "LOCAL_RANK" not in os.environ
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then lets exceptions through instead of printing them its own way
-    register_configs()
 
     folders: list[Path] = []  # of a single run, once they exist
     failed: list[Exception] = []
 
     @wraps(task)
     def required(cfg: DictConfig) -> Any:
-        _one_voice()
+        if "data" in kinds:
+            _one_voice()
         hydra_cfg = HydraConfig.get()
         if hydra_cfg.mode == RunMode.MULTIRUN:
             return _job(name, task, cfg)
@@ -65,6 +67,7 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
             failed.append(error)  # raised again outside of Hydra, which would print a line of its own before ours
 
     try:
+        register_configs(kinds)
         sys.argv[1:] = expand_globs(sys.argv[1:], config_dir())
         hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(required)()
         if failed:
@@ -114,6 +117,8 @@ def _end_sweep(name: str) -> None:
 
 def pick_device(name: str) -> str:
     """Return the device that ``auto`` stands for: a GPU where there is one; any other name as it is."""
+    import torch
+
     return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
 
 

@@ -21,13 +21,13 @@ def rectify(cfg: DictConfig, predictor: Any) -> Any:
         ConfigError: if it does not go with other settings.
         DataError: if the camera file cannot be read.
     """
+    if not cfg.rectify:
+        return None
     from saunet.data.camera_file import read_camera
     from saunet.data.lens import Straightener
     from saunet.infer.pointcloud import Camera
     from saunet.scale import METHODS
 
-    if not cfg.rectify:
-        return None
     if cfg.scale.method in METHODS:
         raise ConfigError(
             f"scale.method={cfg.scale.method} measures on the images as they are, so it does not go with rectify; "

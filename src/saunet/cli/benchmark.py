@@ -51,7 +51,7 @@ def benchmark(cfg: DictConfig) -> None:
 
 def main() -> None:
     """Entry point of ``saunet-benchmark``."""
-    run("benchmark", benchmark)
+    run("benchmark", benchmark, kinds=("encoder", "decoder", "pose"))
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ def export(cfg: DictConfig) -> None:
 
 def main() -> None:
     """Entry point of ``saunet-export``."""
-    run("export", export)
+    run("export", export, kinds=())
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ def predict(cfg: DictConfig) -> None:
         "camera": rectified if cfg.camera is None else list(cfg.camera),
         "max_depth": cfg.max_depth,
         "batch_size": cfg.batch_size,
+        "max_frames": cfg.max_frames,
         "overwrite": cfg.overwrite,
     }
     clip_outputs = [output for output in outputs if is_clip or output in CLIP_OUTPUTS]
@@ -65,16 +66,18 @@ def _predict_clip(cfg: DictConfig, predictor: Any, source: Any, outputs: list[st
         from saunet.infer.odometer import Odometer
 
         odometer = Odometer.from_model(locate(cfg.checkpoint), predictor.scale, pick_device(cfg.device), cfg.batch_size)
-    clip = predict_clip(predictor, source, cfg.output, outputs, odometer=odometer, max_frames=cfg.max_frames, **shared)
+    shown = {key: cfg[key] for key in ("fps", "layout", "memory", "codec")}
+    clip = predict_clip(predictor, source, cfg.output, outputs, odometer=odometer, **shown, **shared)
     print(f"{clip.frames} frames: {', '.join(map(str, clip.paths))}")
     if clip.missing:
         message = f"{source} ends {clip.missing} frames earlier than it declares: it may be truncated"
         print(f"saunet-predict: {message}", file=sys.stderr)
+        raise SystemExit(1)
 
 
 def main() -> None:
     """Entry point of ``saunet-predict``."""
-    run("predict", predict)
+    run("predict", predict, kinds=())
 
 
 if __name__ == "__main__":

@@ -12,10 +12,13 @@ import numpy as np
 from jaxtyping import UInt8
 
 from saunet.atomic import replacing
-from saunet.checks import DataError, one_of, positive
+from saunet.checks import ConfigError, DataError, one_of, positive
 from saunet.images import IMAGE_SUFFIXES, read_image
 from saunet.infer.sources import find_sources, image_paths
 from saunet.videos import VideoReader
+
+CODECS: tuple[str, ...] = ("mp4v", "vp09")
+"""``mp4v`` (MPEG-4) is quick and plays in players such as VLC; ``vp09`` (VP9) plays in browsers, and is slower."""
 
 
 class VideoWriter:
@@ -26,16 +29,17 @@ class VideoWriter:
     Args:
         path: The file to write, ending in ``.mp4``.
         fps: Frames a second.
+        codec: One of `CODECS`.
 
     Raises:
-        ConfigError: for another ending or a frame rate that is not positive.
+        ConfigError: for another ending, codec, or a frame rate that is not positive.
         DataError: if the system refuses to write, or the written file does not play back (a full disk).
     """
 
-    def __init__(self, path: str | Path, fps: float | int) -> None:
+    def __init__(self, path: str | Path, fps: float | int, codec: str = "mp4v") -> None:
         self.path = Path(path)
         one_of(f"the suffix of {self.path.name}", self.path.suffix.lower(), [".mp4"])
-        self.fps = positive("fps", fps)
+        self.fps, self.codec = positive("fps", fps), one_of("codec", codec, CODECS)
         self.count = 0
         self._writer: cv2.VideoWriter | None = None
         self._size = (0, 0)
@@ -50,12 +54,18 @@ class VideoWriter:
 
         Raises:
             DataError: if a frame has another size, or the file cannot be opened.
+            ConfigError: if this OpenCV lacks the codec.
         """
         if self._writer is None:
             self._size = (frame.shape[0], frame.shape[1])
             even = (self._size[1] + self._size[1] % 2, self._size[0] + self._size[0] % 2)
-            self._writer = cv2.VideoWriter(str(self._temporary), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, even)
+            self._writer = cv2.VideoWriter(str(self._temporary), cv2.VideoWriter.fourcc(*self.codec), self.fps, even)
             if not self._writer.isOpened():
+                self._temporary.touch()  # where it is the system that refuses, this says why
+                if self.codec != "mp4v":
+                    raise ConfigError(
+                        f"codec is {self.codec}, with which this OpenCV cannot write {self.path}; set codec=mp4v"
+                    )
                 raise DataError(f"cannot write {self.path}; check the folder, its rights and its space")
         if frame.shape[:2] != self._size:
             raise DataError(

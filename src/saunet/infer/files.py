@@ -77,6 +77,7 @@ def predict_files(
     camera: Camera | Sequence[float | int] | None = None,
     max_depth: float | int | None = None,
     batch_size: int = 1,
+    max_frames: int | None = None,
     overwrite: bool = False,
     progress: bool = True,
 ) -> Summary:
@@ -94,6 +95,7 @@ def predict_files(
             ``fx, fy, cx, cy`` in pixels of the first image (scaled for images of another size).
         max_depth: Leave points out of ``"ply"`` that are farther, in the unit of depth.
         batch_size: Images that go through the network together.
+        max_frames: Take the first so many images; all by default.
         overwrite: Predict again what is already there, and allow a folder that another model wrote.
         progress: Show a progress bar on a terminal.
 
@@ -109,12 +111,14 @@ def predict_files(
         one_of("outputs", output, OUTPUTS)
     one_of("palette", palette, PALETTES)
     positive("batch_size", batch_size)
+    if max_frames is not None:
+        positive("max_frames", max_frames)
     if not outputs:
         raise ConfigError(f"outputs is empty; allowed: {', '.join(OUTPUTS)}")
     if "ply" in outputs and camera is None:
         raise ConfigError("outputs has 'ply', which needs the camera's true intrinsics; give camera fx, fy, cx, cy")
     folder = Path(output_dir)
-    sources = find_sources(inputs, folder)
+    sources = find_sources(inputs, folder)[:max_frames]
     _check_folder(folder, sources)
     if camera is not None and not isinstance(camera, Camera):
         camera = Camera.from_numbers(camera, *_first_size(sources))

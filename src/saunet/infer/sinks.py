@@ -57,15 +57,24 @@ class VideoSink(Sink):
         layout: How image and disparity are arranged, one of ``LAYOUTS``.
         palette: Colours of the disparity, one of ``PALETTES``.
         labels: Write what is shown into the picture.
+        codec: One of `saunet.infer.clips.CODECS`.
 
     Raises:
-        ConfigError: for a layout or palette that does not exist.
+        ConfigError: for a layout, palette or codec that does not exist.
     """
 
-    def __init__(self, path: Path, fps: float | int, layout: str = "auto", palette: str = "magma", labels: bool = True):
+    def __init__(
+        self,
+        path: Path,
+        fps: float | int,
+        layout: str = "auto",
+        palette: str = "magma",
+        labels: bool = True,
+        codec: str = "mp4v",
+    ) -> None:
         self._layout = one_of("layout", layout, LAYOUTS)
         self._palette = one_of("palette", palette, PALETTES)
-        self._writer, self._labels, self.paths = VideoWriter(path, fps), labels, (path,)
+        self._writer, self._labels, self.paths = VideoWriter(path, fps, codec), labels, (path,)
 
     def __enter__(self) -> VideoSink:
         self._writer.__enter__()

@@ -58,6 +58,7 @@ def render_video(
     layout: str = "auto",
     palette: str = "magma",
     memory: float = 0.95,
+    codec: str = "mp4v",
     max_frames: int | None = None,
     labels: bool = True,
     progress: bool = True,
@@ -75,12 +76,13 @@ def render_video(
         layout: ``"stacked"`` (disparity below), ``"beside"``, or ``"auto"``.
         palette: Colour map.
         memory: Weight of the past in the running colour range; see `RunningRange`.
+        codec: How the video is encoded, one of `saunet.infer.clips.CODECS`; ``"vp09"`` plays in browsers.
         max_frames: Stop after so many frames.
         labels: Name the two pictures.
         progress: Show a progress bar on a terminal.
 
     Raises:
-        ConfigError: for an unknown layout or palette, or an output that is the source.
+        ConfigError: for an unknown layout, palette or codec, or an output that is the source.
         DataError: if the source cannot be read or the system refuses to write.
     """
     one_of("layout", layout, LAYOUTS)
@@ -88,9 +90,11 @@ def render_video(
     limits = RunningRange(memory)
     if isinstance(source, str | Path) and Path(source).resolve() == Path(output).resolve():
         raise ConfigError(f"the output {output} is the source; choose another name")
+    if max_frames is not None:
+        positive("max_frames", max_frames)
     clip = open_clip(source)
     with contextlib.closing(clip):
-        sink = VideoSink(Path(output), fps if fps is not None else clip.fps, layout, palette, labels)
+        sink = VideoSink(Path(output), fps if fps is not None else clip.fps, layout, palette, labels, codec)
         camera = isinstance(source, int)
         frames = _run(predictor, clip, [sink], limits, 1, max_frames, progress, finish=camera)
     return VideoSummary(Path(output), frames, _missing(clip, frames, max_frames))
@@ -107,6 +111,7 @@ def predict_clip(
     layout: str = "auto",
     palette: str = "magma",
     memory: float = 0.95,
+    codec: str = "mp4v",
     camera: Camera | Sequence[float | int] | None = None,
     max_depth: float | int | None = None,
     odometer: Odometer | None = None,
@@ -131,6 +136,7 @@ def predict_clip(
         layout: Of the video: ``"stacked"``, ``"beside"``, or ``"auto"``.
         palette: Colour map.
         memory: Weight of the past in the running colour range; see `RunningRange`.
+        codec: How the video is encoded, one of `saunet.infer.clips.CODECS`; ``"vp09"`` plays in browsers.
         camera: True intrinsics, which ``"ply"`` and ``"html"`` need: a `Camera`, or numbers as `Camera.from_numbers`
             takes them, in pixels of the first frame.
         max_depth: Leave points out that are farther, in the unit of depth.
@@ -151,6 +157,8 @@ def predict_clip(
         raise ConfigError(f"outputs is empty; allowed: {', '.join((*OUTPUTS, *CLIP_OUTPUTS))}")
     one_of("palette", palette, PALETTES)
     positive("batch_size", batch_size)
+    if max_frames is not None:
+        positive("max_frames", max_frames)
     for output in outputs:
         if output in ("ply", "html") and camera is None:
             raise ConfigError(
@@ -168,7 +176,7 @@ def predict_clip(
         paths = {output: folder / f"{title}{_NAMES[output]}" for output in CLIP_OUTPUTS}
         frame_outputs = [output for output in dict.fromkeys(outputs) if output in OUTPUTS]
         if "mp4" in outputs:
-            sinks.append(VideoSink(paths["mp4"], rate, layout, palette))
+            sinks.append(VideoSink(paths["mp4"], rate, layout, palette, codec=codec))
         if frame_outputs:
             sinks.append(FrameSink(folder / title, frame_outputs, Style(palette, max_depth=max_depth), camera))
         if "html" in outputs and camera is not None:

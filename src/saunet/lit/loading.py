@@ -89,11 +89,14 @@ def sentence(loading: Loading, trainer: Trainer) -> str:
     workers = getattr(trainer.train_dataloader, "num_workers", 0)
     cores = available_cores()
     each = " on this process" if trainer.world_size > 1 else ""
-    advice = f"raise data.workers (now {workers}, there are {cores} cores), or " if workers < cores else ""
+    data = getattr(trainer, "datamodule", None)
+    advice = [f"raise data.workers (now {workers}, there are {cores} cores)"] if workers < cores else []
+    if getattr(data, "cacheable", False) and data.copies is None:  # type: ignore[union-attr]
+        advice.append("load smaller copies made once with saunet-prepare cache")
     return (
         f"the loader is the bottleneck: {loading.reached:.0f} images/s arrive{each} and the model could use "
-        f"{loading.needed:.0f} ({loading.share:.0%} of the time is spent waiting); {advice}load smaller files made "
-        "once with saunet-prepare"
+        f"{loading.needed:.0f} ({loading.share:.0%} of the time is spent waiting); "
+        f"{', or '.join(advice or ['use a faster disk or more cores'])}"
     )
 
 
