@@ -30,6 +30,22 @@ def blocks(*kinds: str) -> list[Block]:
     ]
 
 
+def inline() -> list[tuple[str, str]]:
+    """Return each page's code in the running text that sets a key of a tool, once a page."""
+    found = dict.fromkeys(
+        (page.name, code.replace("\\|", "|"))
+        for page in PAGES
+        for code in re.findall(r"`([^`\n]+)`", _FENCE.sub("", page.read_text(encoding="utf-8")))
+    )
+    return [(page, code) for page, code in found if re.match(r"(saunet-[a-z]+ (\.\.\. )?)?[+~]?[a-z_@./]+=", code)]
+
+
+def tools(page: str) -> list[str]:
+    """Return the tools that a page names."""
+    text = next(path for path in PAGES if path.name == page).read_text(encoding="utf-8")
+    return list(dict.fromkeys(re.findall(r"\bsaunet-([a-z]+)", text)))
+
+
 def commands(*kinds: str) -> list[tuple[str, str]]:
     """Return each command of the project's tools in such blocks, with its page; comments and line breaks removed."""
     found = []
