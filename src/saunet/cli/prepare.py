@@ -23,7 +23,7 @@ KEYS = {
 
 def prepare(cfg: DictConfig) -> None:
     """Do one job and say what was done."""
-    from saunet.data.module import available_cores
+    from saunet.data.workers import available_cores
     from saunet.prepare.recordings import kitti_recordings
 
     one_of("job", cfg.job, KEYS)

@@ -11,7 +11,7 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_info
 
 from saunet.checks import in_range, positive
-from saunet.data.module import available_cores
+from saunet.data.workers import available_cores
 
 
 @dataclass(frozen=True, slots=True)

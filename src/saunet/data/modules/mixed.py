@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from functools import partial
 from typing import Any, Literal
 
@@ -130,6 +130,13 @@ class MixedDataModule(DepthDataModule):
                 drive.name = f"{name}/{selection.drive.name}"
                 selections.append(selection._replace(drive=drive))
         return selections
+
+    def _check_manifests(self, names: Set[str]) -> None:
+        super()._check_manifests(names)
+        for name in self._names["train"]:
+            start = f"{name}/"
+            own = {each.removeprefix(start) for each in names if each.startswith(start)}
+            self.sources[name]._check_manifests(own)
 
     def _fitted(self, name: str, source: DepthDataModule) -> DepthDataModule:
         """Give a source the mixture's settings; refuse those it was given that contradict."""
