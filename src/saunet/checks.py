@@ -19,6 +19,10 @@ class DataError(SaunetError, ValueError):
     """A file or data set that is missing, broken or does not fit."""
 
 
+class UnreadableError(DataError):
+    """A file that is there and cannot be read: empty, truncated, or not what its name says."""
+
+
 class CheckpointError(SaunetError, ValueError):
     """A checkpoint that cannot be read or does not belong to the model at hand."""
 

@@ -105,12 +105,13 @@ def test_the_doctor_ends_with_an_error_where_training_would(tool: Tool, tmp_path
     arguments = ("data=campus", "data.root=clips", "data.frames_cache=cache", "output_dir=doctor")
     outcome = tool("doctor", *arguments)
     assert outcome.code == 1
-    assert "error: the train split cannot be used: no camera.yaml" in outcome.out
+    assert "error: the train, val and test splits cannot be used: no camera.yaml" in outcome.out
     assert (tmp_path / "doctor" / "doctor.png").is_file()
     _camera(tmp_path / "clips")
     outcome = tool("doctor", *arguments, "data.val_share=0.3")
     assert outcome.code == 0, outcome.out
-    assert "train with data.manifest=doctor/manifest.json" in outcome.out
+    assert "frames to leave out (judged: all)\ntrain with data.manifest=doctor/manifest.json" in outcome.out
+    assert "(judged: 5 of 14; frames=0 judges all)" in tool("doctor", *arguments, "data.val_share=0.3", "frames=5").out
     tool("doctor", *arguments, "splits=[tset]").says("splits is 'tset'; did you mean 'test'?")
 
 

@@ -47,6 +47,9 @@ class KittiDrive:
         ConfigError: for an unknown camera or depth kind.
     """
 
+    camera_height = CAMERA_HEIGHT
+    fps = 1 / FRAME_SECONDS
+
     def __init__(
         self,
         folder: Path,
