@@ -170,7 +170,17 @@ def test_data_sets_are_mixed_by_config(tool: Tool, raw_root: Path, tmp_path: Pat
     assert outcome.code == 0, outcome.err
     outcome = tool("evaluate", "checkpoint=run/checkpoints/last.ckpt", *mixture, "output_dir=results")
     assert outcome.code == 0, outcome.err
-    assert "town alone:" in outcome.out
+    all_of, _, alone = outcome.out.partition("town alone:")
+    town, _, campus = alone.partition("campus alone:")
+    for words in ("eigen_camera_z: the same points", "campus: no ground truth"):
+        assert words in all_of
+        assert words in town
+    assert "eigen_camera_z" not in campus  # clips have no ground truth
+    assert "campus: no ground truth" in campus
+    assert "nan" not in outcome.out
+    height = ("scale.method=camera_height", "protocols=[eigen_camera_z]", "data.test=[town]", "data.train=[town]")
+    told = tool("evaluate", "checkpoint=run/checkpoints/last.ckpt", *mixture, *height, "output_dir=scaled")
+    assert "needs scale.camera_height" not in told.err
 
 
 def test_a_board_is_printed_and_found(tool: Tool, tmp_path: Path) -> None:

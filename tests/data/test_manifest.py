@@ -97,7 +97,7 @@ def test_a_manifest_of_other_recordings_is_refused_and_of_some_warned_of(tmp_pat
 def test_a_mixture_checks_its_own_manifest_and_those_of_its_sources(tmp_path):
     make_drive(tmp_path / "raw", 1, frames=range(20), sides=(2,))
     (tmp_path / "m.json").write_text(json.dumps({"format": 1, "leave_out": {f"{name(1)} l": {"static": [3]}}}))
-    own, size = {"manifest": str(tmp_path / "m.json")}, {"height": 10, "width": 30, "workers": 0}
+    own, size = {"manifest": str(tmp_path / "m.json")}, {"height": 10, "width": 30, "batch_size": 2, "workers": 0}
     inside = datamodules.build("mixed", sources={"town": module(tmp_path / "raw", **own)}, **size)
     inside.setup("fit")
     assert "1 static (manifest)" in inside.summary("train")

@@ -35,7 +35,7 @@ def evaluate(cfg: DictConfig) -> None:
     """Load what is scored and the data, print the tables, write them to the output folder."""
     from hydra.core.hydra_config import HydraConfig
 
-    from saunet.evaluation import EvaluationResult, evaluate_protocols, print_table, with_statistics, write_results
+    from saunet.evaluation import evaluate_protocols, print_table, with_statistics, write_results
     from saunet.evaluation.breakdown import Buckets
 
     subject = subject_of(cfg)
@@ -53,10 +53,10 @@ def evaluate(cfg: DictConfig) -> None:
     result = replace(result, settings={"data": data, **subject.settings()})
     print_table(result)
     for source in cfg.data.get("sources") or {}:  # of a mixture
-        rows = tuple(row for row in result.rows if row.name.startswith(f"{source}/"))
-        if rows:
+        alone = result.part(f"{source}/")
+        if alone.protocols:
             print(f"{source} alone:")
-            print_table(EvaluationResult(result.protocols, result.predictors, rows))
+            print_table(alone)
     write_results(result, Path(cfg.output_dir))
     print(f"results: {cfg.output_dir}")
 

@@ -102,6 +102,11 @@ class DepthDataModule(LightningDataModule):
         self.usage: dict[str, list[Usage]] = {}
         self.datasets: dict[str, WindowDataset] = {}
 
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """Names of the protocols that fit its parts, its own first."""
+        return (self.protocol,)
+
     def select(self, split: str) -> Sequence[Selection]:
         """Return the frames of ``train``, ``val``, ``test`` or ``predict``; the one thing a data set must say.
 
@@ -119,7 +124,8 @@ class DepthDataModule(LightningDataModule):
         for split in STAGES[str(getattr(stage, "value", stage))] if stage else ("train", "val", "test", "predict"):
             self.setup_split(split)
         if fresh and "train" in self.datasets:
-            self._check_manifests({drive.name for split in STAGES["fit"] for drive in self._drives_of(split)})
+            read = [self.datasets[split] for split in STAGES["fit"] if split in self.datasets]
+            self._check_manifests({drive.name for dataset in read for drive in dataset.drives})
 
     def setup_split(self, split: str) -> None:
         """Find the windows of one split, unless that is done.
@@ -160,9 +166,6 @@ class DepthDataModule(LightningDataModule):
     def fingerprints(self) -> dict[str, str]:
         """Return the SHA-256 of the sample names of each split that is set up."""
         return {split: dataset.fingerprint() for split, dataset in self.datasets.items()}
-
-    def _drives_of(self, split: str) -> Sequence[Drive]:
-        return self.datasets[split].drives if split in self.datasets else ()
 
     def _check_manifests(self, names: Set[str]) -> None:
         if self.manifest is not None:
