@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,12 +47,33 @@ def tools(page: str) -> list[str]:
     return list(dict.fromkeys(re.findall(r"\bsaunet-([a-z]+)", text)))
 
 
-def commands(*kinds: str) -> list[tuple[str, str]]:
-    """Return each command of the project's tools in such blocks, with its page; comments and line breaks removed."""
+def lines(*kinds: str) -> list[tuple[str, str]]:
+    """Return each line of such blocks, with its page; comments and line breaks removed, empty lines left out."""
     found = []
     for block in blocks(*kinds):
         for line in block.text.replace("\\\n", " ").splitlines():
             command = re.sub(r"\s+#.*", "", line).strip()
-            if re.match(r"saunet-[a-z]+(\s|$)", command):
+            if command:
                 found.append((block.page, command))
     return found
+
+
+def commands(*kinds: str) -> list[tuple[str, str]]:
+    """Return each command of the project's tools in such blocks, with its page, whatever starts the tool.
+
+    ``srun saunet-train ...`` and ``torchrun ... -m saunet.cli.train ...`` are ``saunet-train ...``. Lines after a
+    prompt show what goes wrong.
+    """
+    found = []
+    for page, line in lines(*kinds):
+        plain = re.sub(r"-m saunet\.cli\.([a-z]+)", r"saunet-\1", line)
+        tool = re.search(r"(?:^|\s)(saunet-[a-z]+(?:\s.*|$))", re.split(r"\s(?:\|\||&&|;|\|)\s", plain)[0])
+        if tool and not line.startswith("$ "):
+            found.append((page, tool[1]))
+    return found
+
+
+def mistakes(page: str) -> list[tuple[str, str]]:
+    """Return each command that a page shows after a prompt, with the answer that it prints below."""
+    shown = [line for where, line in lines("") if where == page]
+    return [(line[2:], answer) for line, answer in itertools.pairwise(shown) if line.startswith("$ ")]
