@@ -109,6 +109,11 @@ def resize(array: NDArray[Any], height: int, width: int) -> NDArray[Any]:
     """Resize h x w or h x w x c, averaging areas when it shrinks and interpolating linearly when it grows.
 
     Pixel u moves to (u + 0.5) * s - 0.5. An array that has the size already is returned itself.
+
+    Args:
+        array: h x w or h x w x c, of a type that OpenCV resizes.
+        height: New height.
+        width: New width.
     """
     if array.shape[:2] == (height, width):
         return array

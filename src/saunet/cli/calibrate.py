@@ -13,7 +13,12 @@ from saunet.cli._app import run
 
 
 def calibrate(cfg: DictConfig) -> None:
-    """Print a board, or find one, solve for the camera, say how good that is, and write ``camera.yaml``."""
+    """Print a board, or find one, solve for the camera, say how good that is, and write ``camera.yaml``.
+
+    Raises:
+        ConfigError: if there is nothing to read, or the output exists.
+        DataError: if the calibration cannot be trusted.
+    """
     from saunet.data.boards import Board
     from saunet.data.calibrate import calibrate, check_picture
     from saunet.data.camera_file import MODELS, write_camera

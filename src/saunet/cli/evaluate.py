@@ -16,6 +16,12 @@ from saunet.cli._subjects import subject_of, trivial
 def evaluate_model(network: Any, data: Any, protocols: Sequence[str], *, split: str = "test") -> Any:
     """Score a depth network, on its device, beside the trivial predictors on one split of a data module.
 
+    Args:
+        network: Takes images, b x 3 x h x w, and returns a `saunet.types.DepthPyramid`.
+        data: A data module, not necessarily set up, at the network's size.
+        protocols: Names of protocols; none for the data set's own.
+        split: ``test`` or ``val``.
+
     Raises:
         ConfigError: if a protocol does not fit the data set's ground truth.
         DataError: if the split has no frame with ground truth.

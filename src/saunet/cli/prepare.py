@@ -22,7 +22,12 @@ KEYS = {
 
 
 def prepare(cfg: DictConfig) -> None:
-    """Do one job and say what was done."""
+    """Do one job and say what was done.
+
+    Raises:
+        ConfigError: if the job is unknown, or a key is not one of its own.
+        DataError: if a recording cannot be read.
+    """
     from saunet.data.workers import available_cores
     from saunet.prepare.recordings import kitti_recordings
 

@@ -73,7 +73,12 @@ class CameraFile:
     """Root mean square in pixels, where the file comes from a calibration."""
 
     def intrinsics(self, height: int, width: int, what: str = "the frames") -> NDArray[np.float64]:
-        """Return K in pixels of frames of a size, which must have the shape of the calibrated ones.
+        """Return K, 3 x 3, in pixels of frames of a size, which must have the shape of the calibrated ones.
+
+        Args:
+            height: Of the frames, in pixels.
+            width: Of the frames, in pixels.
+            what: What the frames are, for the message.
 
         Raises:
             DataError: if they have another shape, or K cannot be that of such an image.
@@ -96,6 +101,12 @@ class CameraFile:
 
 def check_intrinsics(K: NDArray[np.float64], height: int, width: int, where: str) -> None:
     """Check that K can belong to an image: positive focal lengths, a possible field of view, the centre inside.
+
+    Args:
+        K: 3 x 3, in pixels of that image.
+        height: Of the image, in pixels.
+        width: Of the image, in pixels.
+        where: Where K was read, for the message.
 
     Raises:
         DataError: naming what cannot be.

@@ -89,6 +89,11 @@ def flip_blend(
 def open_session(path: Path, device: str = "cpu", threads: int = 0) -> Any:
     """Open an ONNX file with onnxruntime.
 
+    Args:
+        path: The file.
+        device: ``cpu`` or ``cuda``, with or without a number.
+        threads: Of the CPU; 0 lets onnxruntime choose.
+
     Raises:
         CheckpointError: if the file is missing or broken.
         ConfigError: if onnxruntime is missing or does not support the device.

@@ -60,7 +60,7 @@ class SelfSupervisedDepth(TrainedModule):
         return pyramid
 
     def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
-        """Return the loss of one batch, eq. (14)."""
+        """Return the loss of one batch, a scalar, eq. (14)."""
         pyramid, poses, _, terms = self.predict_and_compare(batch)
         self.log_dict(terms.named("train"), prog_bar=False, batch_size=len(batch["name"]))
         figures = health(pyramid, poses, terms, float(getattr(self.depth, "max_depth", torch.inf)))

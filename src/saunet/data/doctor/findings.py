@@ -221,7 +221,7 @@ def _static(survey: Survey) -> Iterator[Finding]:
 
 
 def band_profile(survey: Survey) -> np.ndarray | None:
-    """Return the motion of each band of the image over that of the whole, from top to bottom; None with few frames."""
+    """Return the motion of each band over the whole image's, one number a band, top to bottom; None with few frames."""
     rows = [f.bands / f.flow for f in survey.compared() if f.bands is not None and f.flow is not None and f.flow > 1]
     return np.median(rows, axis=0) if len(rows) >= 5 else None
 
