@@ -151,6 +151,17 @@ def test_every_page_is_on_the_site() -> None:
     assert not missing
 
 
+def test_every_public_module_is_in_the_reference_once() -> None:
+    """Packages gather what their modules hold; tools are run, not imported, and have pages of their own."""
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md"))
+    listed = re.findall(r"^::: (\S+)$", pages, re.MULTILINE)
+    modules = [path.relative_to(ROOT / "src").with_suffix("").parts for path in (ROOT / "src" / "saunet").rglob("*.py")]
+    public = {".".join(parts) for parts in modules if "cli" not in parts and not re.search(r"\b_", " ".join(parts))}
+    assert not public - set(listed)
+    assert not set(listed) - public - {"saunet"}
+    assert len(listed) == len(set(listed))
+
+
 def test_links_to_code_lead_to_names_that_exist() -> None:
     """The strict build of the site checks this too, but is not part of every test run."""
     links = [
