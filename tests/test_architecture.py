@@ -78,6 +78,7 @@ ALLOWED: dict[str, set[str]] = {
         "infer",
         "images",
         "data.module",
+        "data.workers",
         "losses.base",
     },
     "published": set(),

@@ -19,6 +19,10 @@ class DataError(SaunetError, ValueError):
     """A file or data set that is missing, broken or does not fit."""
 
 
+class UnreadableError(DataError):
+    """A file that is there and cannot be read: empty, truncated, or not what its name says."""
+
+
 class CheckpointError(SaunetError, ValueError):
     """A checkpoint that cannot be read or does not belong to the model at hand."""
 
@@ -31,6 +35,11 @@ def suggest(name: str, allowed: Iterable[str]) -> str:
 
 def one_of(name: str, value: str, allowed: Iterable[str]) -> str:
     """Return ``value`` if it is one of the allowed words.
+
+    Args:
+        name: Of the parameter, for the message.
+        value: What was given.
+        allowed: The words, in the order in which the message lists them.
 
     Raises:
         ConfigError: if it is not; the message names the nearest word and lists all.
@@ -45,6 +54,11 @@ def one_of(name: str, value: str, allowed: Iterable[str]) -> str:
 def positive(name: str, value: float | int, *, allow_zero: bool = False) -> float | int:
     """Return ``value`` if it is a finite number above zero (or zero, with ``allow_zero``).
 
+    Args:
+        name: Of the parameter, for the message.
+        value: What was given.
+        allow_zero: Let zero pass too.
+
     Raises:
         ConfigError: otherwise.
     """
@@ -55,6 +69,12 @@ def positive(name: str, value: float | int, *, allow_zero: bool = False) -> floa
 
 def in_range(name: str, value: float | int, low: float | int, high: float | int) -> float | int:
     """Return ``value`` if ``low <= value <= high``.
+
+    Args:
+        name: Of the parameter, for the message.
+        value: What was given; NaN is refused.
+        low: Smallest value allowed.
+        high: Largest value allowed.
 
     Raises:
         ConfigError: otherwise.

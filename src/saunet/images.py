@@ -16,7 +16,7 @@ from jaxtyping import Float32, Shaped, UInt8
 from numpy.typing import NDArray
 
 from saunet.atomic import write_bytes
-from saunet.checks import DataError, one_of
+from saunet.checks import DataError, UnreadableError, one_of
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 """File name endings that are taken for images when a folder is read."""
@@ -43,9 +43,9 @@ def read_bytes(path: str | Path) -> UInt8[np.ndarray, " n"]:
     except IsADirectoryError as reason:
         raise DataError(f"{path} is a folder where a file is needed") from reason
     except OSError as reason:
-        raise DataError(f"cannot read {path}: {reason.strerror or reason}") from reason
+        raise UnreadableError(f"cannot read {path}: {reason.strerror or reason}") from reason
     if data.size == 0:
-        raise DataError(f"{path} is empty (0 bytes); copy the file again")
+        raise UnreadableError(f"{path} is empty (0 bytes); copy the file again")
     return data
 
 
@@ -114,6 +114,11 @@ def resize(array: NDArray[Any], height: int, width: int) -> NDArray[Any]:
     """Resize h x w or h x w x c, averaging areas when it shrinks and interpolating linearly when it grows.
 
     Pixel u moves to (u + 0.5) * s - 0.5. An array that has the size already is returned itself.
+
+    Args:
+        array: h x w or h x w x c, of a type that OpenCV resizes.
+        height: New height.
+        width: New width.
     """
     if array.shape[:2] == (height, width):
         return array
@@ -159,13 +164,15 @@ def _decode(path: str | Path, flags: int) -> NDArray[Any]:
     """Read and decode an image file with OpenCV's flags, refusing what is not whole."""
     data = read_bytes(path)
     if not _complete(data.tobytes()):
-        raise DataError(f"{path} is truncated ({data.size} bytes, the end of the image is missing); copy it again")
+        raise UnreadableError(
+            f"{path} is truncated ({data.size} bytes, the end of the image is missing); copy it again"
+        )
     try:
         image = cv2.imdecode(data, flags)
     except cv2.error as reason:
-        raise DataError(f"{path} cannot be decoded: {str(reason).strip().splitlines()[-1]}") from reason
+        raise UnreadableError(f"{path} cannot be decoded: {str(reason).strip().splitlines()[-1]}") from reason
     if image is None:
-        raise DataError(
+        raise UnreadableError(
             f"{path} is not an image that OpenCV can read, or is damaged ({data.size} bytes); "
             "copy it again or convert it to PNG or JPEG"
         )

@@ -169,7 +169,10 @@ class DoctorConfig:
 
 @dataclass
 class CalibrateConfig:
-    """Root of ``saunet-calibrate``; ``columns`` and ``rows`` count the board's squares."""
+    """Root of ``saunet-calibrate``; ``columns`` and ``rows`` count the board's squares.
+
+    ``lens`` is what camera.yaml calls ``model``: on the command line that word chooses networks.
+    """
 
     input: str | None = None
     output: str = "camera.yaml"
@@ -179,7 +182,7 @@ class CalibrateConfig:
     square: float = 0.025
     marker: float = 0.75
     dictionary: str = "DICT_4X4_100"
-    model: str = "pinhole"
+    lens: str = "pinhole"
     views: int = 40
     max_error: float = 1.0
     camera_height: float | None = None

@@ -105,12 +105,13 @@ def test_the_doctor_ends_with_an_error_where_training_would(tool: Tool, tmp_path
     arguments = ("data=campus", "data.root=clips", "data.frames_cache=cache", "output_dir=doctor")
     outcome = tool("doctor", *arguments)
     assert outcome.code == 1
-    assert "error: the train split cannot be used: no camera.yaml" in outcome.out
+    assert "error: the train, val and test splits cannot be used: no camera.yaml" in outcome.out
     assert (tmp_path / "doctor" / "doctor.png").is_file()
     _camera(tmp_path / "clips")
     outcome = tool("doctor", *arguments, "data.val_share=0.3")
     assert outcome.code == 0, outcome.out
-    assert "train with data.manifest=doctor/manifest.json" in outcome.out
+    assert "frames to leave out (judged: all)\ntrain with data.manifest=doctor/manifest.json" in outcome.out
+    assert "(judged: 5 of 14; frames=0 judges all)" in tool("doctor", *arguments, "data.val_share=0.3", "frames=5").out
     tool("doctor", *arguments, "splits=[tset]").says("splits is 'tset'; did you mean 'test'?")
 
 
@@ -169,7 +170,17 @@ def test_data_sets_are_mixed_by_config(tool: Tool, raw_root: Path, tmp_path: Pat
     assert outcome.code == 0, outcome.err
     outcome = tool("evaluate", "checkpoint=run/checkpoints/last.ckpt", *mixture, "output_dir=results")
     assert outcome.code == 0, outcome.err
-    assert "town alone:" in outcome.out
+    all_of, _, alone = outcome.out.partition("town alone:")
+    town, _, campus = alone.partition("campus alone:")
+    for words in ("eigen_camera_z: the same points", "campus: no ground truth"):
+        assert words in all_of
+        assert words in town
+    assert "eigen_camera_z" not in campus  # clips have no ground truth
+    assert "campus: no ground truth" in campus
+    assert "nan" not in outcome.out
+    height = ("scale.method=camera_height", "protocols=[eigen_camera_z]", "data.test=[town]", "data.train=[town]")
+    told = tool("evaluate", "checkpoint=run/checkpoints/last.ckpt", *mixture, *height, "output_dir=scaled")
+    assert "needs scale.camera_height" not in told.err
 
 
 def test_a_board_is_printed_and_found(tool: Tool, tmp_path: Path) -> None:

@@ -18,8 +18,11 @@ def poses(count, seed=0, tilt=0.6):
         yield cv2.Rodrigues(turn)[0], place
 
 
-def views(board, count=14, distortion=None, seed=0, per_square=40, tilt=0.6):
-    """Return pictures of the board, RGB, anti-aliased, with its centre at each pose's place."""
+def views(board, count=14, distortion=None, seed=0, per_square=40, tilt=0.6, undistort=cv2.undistortPoints):
+    """Return pictures of the board, RGB, anti-aliased, with its centre at each pose's place.
+
+    ``undistort`` is the lens: `cv2.fisheye.undistortPoints` for a fisheye.
+    """
     texture = board.picture(per_square)
     metres = board.square / per_square
     height, width = texture.shape
@@ -41,7 +44,7 @@ def views(board, count=14, distortion=None, seed=0, per_square=40, tilt=0.6):
         straight = cv2.resize(large, SIZE[::-1], interpolation=cv2.INTER_AREA)
         if distortion is not None:
             v, u = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.float64)
-            seen = cv2.undistortPoints(np.stack([u, v], -1).reshape(-1, 1, 2), K, np.array(distortion), P=K)
+            seen = undistort(np.stack([u, v], -1).reshape(-1, 1, 2), K, np.array(distortion), P=K)
             maps = seen.reshape(*SIZE, 2).astype(np.float32)
             straight = cv2.remap(straight, maps[..., 0], maps[..., 1], cv2.INTER_CUBIC, borderValue=128)
         pictures.append(np.repeat(straight[..., None], 3, axis=2))

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -47,6 +50,28 @@ def test_charuco_in_a_video_and_distortion(tmp_path):
     np.testing.assert_allclose(result.camera.K[[0, 1], [0, 1]], K[[0, 1], [0, 1]], rtol=0.01)
     assert result.camera.distortion[0] == pytest.approx(-0.25, abs=0.05)
     assert result.camera.fps is None  # that of this video; other recordings of the camera have their own
+
+
+def test_a_fisheye_is_calibrated_on_the_command_line(tmp_path):
+    distortion = [-0.25, 0.05, 0.0, 0.0]
+    pictures = views(Board(), 12, distortion, tilt=0.45, undistort=cv2.fisheye.undistortPoints)
+    save(tmp_path / "pictures", pictures)
+
+    def calibrated(*overrides):
+        command = [sys.executable, "-m", "saunet.cli.calibrate", "input=pictures", *overrides]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+
+    done = calibrated("lens=fisheye")
+    assert done.returncode == 0, done.stderr
+    assert "reprojection error 0." in done.stdout
+    assert "nan" not in done.stdout
+    camera = read_camera(tmp_path / "camera.yaml")
+    assert camera.model == "fisheye"
+    np.testing.assert_allclose(camera.K[[0, 1], [0, 1]], K[[0, 1], [0, 1]], rtol=0.01)
+    angle = np.array([0.2, 0.4, 0.5])  # radians off the axis; the coefficients alone are only known together
+    powers = 1 + np.stack([angle**2, angle**4, angle**6, angle**8], 1) @ np.stack([camera.distortion, distortion], 1)
+    np.testing.assert_allclose(powers[:, 0], powers[:, 1], atol=0.01)
+    assert "lens is 'fishye'; did you mean 'fisheye'?" in calibrated("lens=fishye", "output=b.yaml").stderr
 
 
 def test_what_cannot_be_trusted_is_refused(tmp_path):

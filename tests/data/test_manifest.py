@@ -72,6 +72,44 @@ def test_training_leaves_out_what_the_manifest_names_and_tests_do_not(tmp_path):
         module(tmp_path / "raw", manifest=str(tmp_path / "m.json"), offsets=[-1]).setup("validate")
 
 
+def test_a_manifest_of_other_recordings_is_refused_and_of_some_warned_of(tmp_path):
+    for number in (1, 2):
+        make_drive(tmp_path / "raw", number, frames=range(20), sides=(2,))
+
+    def setup(drives, stage="fit", **more):
+        entry = {drive: {"static": [3]} for drive in drives}
+        (tmp_path / "m.json").write_text(json.dumps({"format": 1, "leave_out": entry, **more}))
+        data = module(tmp_path / "raw", manifest=str(tmp_path / "m.json"), val_drives=[name(2).partition("/")[2]])
+        data.setup(stage)
+
+    with pytest.raises(DataError, match=r"m.json names 2 recordings and none of them is trained on \(such as 'a'"):
+        setup(["b", "a"])
+    with pytest.warns(UserWarning, match=r"names 2 recordings, and 1 of them are not trained on \(such as 'b'; here"):
+        setup(["b", f"{name(1)} l"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        setup([f"{name(1)} l", f"{name(2)} l"])
+        setup([])
+        setup(["b"], test_only=["b"])  # what only tests read tells nothing of the others
+        setup([f"{name(1)} l"], "validate")  # as validation alone does not
+
+
+def test_a_mixture_checks_its_own_manifest_and_those_of_its_sources(tmp_path):
+    make_drive(tmp_path / "raw", 1, frames=range(20), sides=(2,))
+    (tmp_path / "m.json").write_text(json.dumps({"format": 1, "leave_out": {f"{name(1)} l": {"static": [3]}}}))
+    own, size = {"manifest": str(tmp_path / "m.json")}, {"height": 10, "width": 30, "batch_size": 2, "workers": 0}
+    inside = datamodules.build("mixed", sources={"town": module(tmp_path / "raw", **own)}, **size)
+    inside.setup("fit")
+    assert "1 static (manifest)" in inside.summary("train")
+    outside = datamodules.build("mixed", sources={"town": module(tmp_path / "raw")}, **own, **size)
+    with pytest.raises(DataError, match=r"none of them is trained on .* here they are called 'town/"):
+        outside.setup("fit")
+    strange = {"format": 1, "leave_out": {"town/x": {"static": [3]}}}
+    (tmp_path / "m.json").write_text(json.dumps(strange))
+    with pytest.raises(DataError, match=r"none of them is trained on \(such as 'town/x'; here they are called '2011"):
+        datamodules.build("mixed", sources={"town": module(tmp_path / "raw", **own)}, **size).setup("fit")
+
+
 def test_broken_files_are_skipped_and_counted(tmp_path):
     make_drive(tmp_path, 1, frames=range(20), sides=(2,))
     images = tmp_path / name(1) / "image_02" / "data"

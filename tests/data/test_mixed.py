@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 import torch
-from campus_tree import frames, make_clip
+from campus_tree import CAMERA, frames, make_clip
 from kitti_tree import make_drive, name
 
 from saunet.checks import ConfigError, DataError
@@ -92,6 +92,41 @@ def test_what_does_not_go_together_is_refused(tmp_path):
     other = datamodules.build("kitti", root=str(tmp_path / "raw"), split="all", depth="lidar_x")
     with pytest.raises(ConfigError, match=r"ground truth of different kinds \(camera_z, lidar_x\)"):
         datamodules.build("mixed", sources={**made, "x": other}, **SIZE)
-    small = datamodules.build("kitti", root=str(tmp_path / "raw"), split="all", height=96)
-    with pytest.raises(ConfigError, match=r"data.sources.x.height is 96 and the mixture's is 20; set data.height only"):
-        datamodules.build("mixed", sources={"x": small}, **SIZE)
+    dense = datamodules.build("kitti_dense", root=str(tmp_path / "raw"), split="all")
+    with pytest.raises(ConfigError, match=r"data.sources.x reads stored maps or a cache of small images, which a mix"):
+        datamodules.build("mixed", sources={"x": dense}, **SIZE)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "ours"),
+    [
+        *(("height", 96, "20"), ("offsets", [-2, 2], r"\(-1, 1\)"), ("batch_size", 99, "4"), ("workers", 2, "0")),
+        *(("translate", 0.2, "0.05"), ("flip", 0.0, "0.5"), ("colour", 0.0, "0.5"), ("seed", 3, "0")),
+        *(("target_depth", True, "False"), ("on_error", "skip", "raise")),
+    ],
+)
+def test_what_a_source_is_told_and_the_mixture_decides_is_refused(tmp_path, key, value, ours):
+    town = datamodules.build("kitti", root=str(tmp_path), split="all", **{key: value})
+    told = rf"data.sources.x.{key} is .* and the mixture's is {ours}; set data.{key} only, which holds for all sources"
+    with pytest.raises(ConfigError, match=told):
+        datamodules.build("mixed", sources={"x": town}, **SIZE)
+    assert datamodules.build("mixed", sources={"x": town}, **{**SIZE, key: value})
+    pair = datamodules.build("kitti", root=str(tmp_path), split="all", stereo=True)
+    with pytest.raises(ConfigError, match=r"data.sources.x.stereo is True and the mixture's is False; leave it out"):
+        datamodules.build("mixed", sources={"x": pair}, **SIZE)
+
+
+def test_the_camera_height_is_known_where_the_sources_agree(tmp_path):
+    made = sources(tmp_path)
+    assert datamodules.build("mixed", sources=made, **SIZE).camera_height is None  # 1.65 m and 1.4 m
+    assert datamodules.build("mixed", sources=made, train=["town"], test=["town"], **SIZE).camera_height == 1.65
+    again = sources(tmp_path / "b")
+    (tmp_path / "b" / "clips" / "camera.yaml").write_text(CAMERA.replace("1.4", "1.65"))
+    assert datamodules.build("mixed", sources=again, **SIZE).camera_height == 1.65
+
+
+def test_each_source_brings_its_protocol(tmp_path):
+    made = sources(tmp_path)
+    assert datamodules.build("mixed", sources=made, **SIZE).protocols == ("eigen_camera_z", "campus")
+    assert datamodules.build("mixed", sources=made, test=["town"], **SIZE).protocols == ("eigen_camera_z",)
+    assert datamodules.build("mixed", sources=made, test=["campus"], **SIZE).protocols == ("campus",)

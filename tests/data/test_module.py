@@ -5,8 +5,9 @@ import torch
 from drives import NumberDrive
 
 from saunet.checks import ConfigError, DataError
-from saunet.data.module import DepthDataModule, available_cores
+from saunet.data.module import DepthDataModule
 from saunet.data.windows import Selection
+from saunet.data.workers import available_cores
 
 
 class Drives(DepthDataModule):

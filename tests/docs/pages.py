@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,12 +31,49 @@ def blocks(*kinds: str) -> list[Block]:
     ]
 
 
-def commands(*kinds: str) -> list[tuple[str, str]]:
-    """Return each command of the project's tools in such blocks, with its page; comments and line breaks removed."""
+def inline() -> list[tuple[str, str]]:
+    """Return each page's code in the running text that sets a key of a tool, once a page."""
+    found = dict.fromkeys(
+        (page.name, code.replace("\\|", "|"))
+        for page in PAGES
+        for code in re.findall(r"`([^`\n]+)`", _FENCE.sub("", page.read_text(encoding="utf-8")))
+    )
+    return [(page, code) for page, code in found if re.match(r"(saunet-[a-z]+ (\.\.\. )?)?[+~]?[a-z_@./]+=", code)]
+
+
+def tools(page: str) -> list[str]:
+    """Return the tools that a page names."""
+    text = next(path for path in PAGES if path.name == page).read_text(encoding="utf-8")
+    return list(dict.fromkeys(re.findall(r"\bsaunet-([a-z]+)", text)))
+
+
+def lines(*kinds: str) -> list[tuple[str, str]]:
+    """Return each line of such blocks, with its page; comments and line breaks removed, empty lines left out."""
     found = []
     for block in blocks(*kinds):
         for line in block.text.replace("\\\n", " ").splitlines():
             command = re.sub(r"\s+#.*", "", line).strip()
-            if re.match(r"saunet-[a-z]+(\s|$)", command):
+            if command:
                 found.append((block.page, command))
     return found
+
+
+def commands(*kinds: str) -> list[tuple[str, str]]:
+    """Return each command of the project's tools in such blocks, with its page, whatever starts the tool.
+
+    ``srun saunet-train ...`` and ``torchrun ... -m saunet.cli.train ...`` are ``saunet-train ...``. Lines after a
+    prompt show what goes wrong.
+    """
+    found = []
+    for page, line in lines(*kinds):
+        plain = re.sub(r"-m saunet\.cli\.([a-z]+)", r"saunet-\1", line)
+        tool = re.search(r"(?:^|\s)(saunet-[a-z]+(?:\s.*|$))", re.split(r"\s(?:\|\||&&|;|\|)\s", plain)[0])
+        if tool and not line.startswith("$ "):
+            found.append((page, tool[1]))
+    return found
+
+
+def mistakes(page: str) -> list[tuple[str, str]]:
+    """Return each command that a page shows after a prompt, with the answer that it prints below."""
+    shown = [line for where, line in lines("") if where == page]
+    return [(line[2:], answer) for line, answer in itertools.pairwise(shown) if line.startswith("$ ")]

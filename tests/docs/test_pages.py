@@ -18,7 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from saunet.cli._globs import expand_globs
 from saunet.config import config_dir, register_configs, register_training_configs
 
-from .pages import PAGES, ROOT, blocks, commands
+from .pages import PAGES, ROOT, blocks, commands, lines, mistakes
 
 NOT_CONFIGURED = {"saunet-components"}  # takes names, no configuration
 NOT_INSTALLED = ("hydra/launcher", "hydra/sweeper", "hydra.launcher", "hydra.sweeper")  # plugins of the sweep extra
@@ -41,8 +41,8 @@ def _overrides(command: str) -> list[str]:
 @pytest.mark.parametrize(("page", "command"), commands("", "bash"), ids=lambda value: str(value)[:60])
 def test_every_printed_command_composes(page: str, command: str) -> None:
     """A key that was renamed, or never was, fails here."""
-    tool = shlex.split(command)[0].removesuffix(":")
-    if tool in NOT_CONFIGURED or command.split()[0].endswith(":"):  # the second is a tool's own answer
+    tool = shlex.split(command)[0]
+    if tool in NOT_CONFIGURED:
         return
     register_configs()
     register_training_configs()
@@ -67,33 +67,99 @@ SCRIPTS = _scripts()
 QUICK = sorted(page for page in SCRIPTS if not any(block.page == page for block in blocks("bash")))
 
 
-def _run(page: str, folder: Path) -> None:
+def _bash(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    return subprocess.run(
+        ["bash", "-c", f"set -eu\n{script}"],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
+    )
+
+
+def _run(script: str, folder: Path) -> None:
     # The pages speak from a clone's root; the copy keeps the clone clean.
     (folder / "docs").symlink_to(ROOT / "docs")
-    # A README reader has a model by then; the other pages make theirs.
-    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
-    script = "set -eu\n" + "\n".join(SCRIPTS[page])
-    done = subprocess.run(
-        ["bash", "-c", script], cwd=folder, env=environment, capture_output=True, text=True, timeout=900, check=False
-    )
-    assert done.returncode == 0, f"{page}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+    done = _bash(script, folder)
+    assert done.returncode == 0, f"{script}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
 
 
 @pytest.mark.parametrize("page", [page for page in QUICK if page != "README.md"])
 def test_the_python_of_a_page_runs(page: str, tmp_path: Path) -> None:
-    _run(page, tmp_path)
+    _run("\n".join(SCRIPTS[page]), tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in SCRIPTS if page not in QUICK])
 def test_the_commands_of_a_page_run(page: str, tmp_path: Path) -> None:
-    _run(page, tmp_path)
+    _run("\n".join(SCRIPTS[page]), tmp_path)
+
+
+@pytest.mark.slow
+def test_the_python_of_the_readme_runs(tmp_path: Path) -> None:
+    """Its reader has a model and a picture by then, under the names that it says."""
+    beforehand = (
+        "saunet-train experiment=smoke output_dir=smoke\n"
+        "cp smoke/checkpoints/best.ckpt best.ckpt\n"
+        "cp docs/images/demo.png road.png"
+    )
+    _run("\n".join([beforehand, *SCRIPTS["README.md"]]), tmp_path)
+
+
+@pytest.mark.parametrize(("command", "answer"), mistakes("README.md"))
+def test_the_mistakes_that_the_readme_shows_end_as_it_says(command: str, answer: str, tmp_path: Path) -> None:
+    done = _bash(command, tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].startswith(answer.removesuffix("..."))
+
+
+OWN_DATA = re.compile(r"/data/|\$[A-Z]|\.\.\.|RUN|=campus|hydra/launcher")
+"""What plain blocks say of data, runs and clusters that only a reader has."""
+QUICKLY = "model=sau_net_nano data=synthetic_tiny data.workers=0 logger=none trainer=smoke trainer.max_epochs=1"
+TRAININGS = [
+    (page, command)
+    for page, command in commands("")
+    if command.startswith("saunet-train") and not OWN_DATA.search(command)
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "command"), TRAININGS, ids=lambda value: str(value)[:60])
+def test_the_trainings_that_need_no_data_train(page: str, command: str, tmp_path: Path) -> None:
+    """Two steps of a small model each, with the settings that the page prints."""
+    done = _bash(f"{command} {QUICKLY} trainer.limit_train_batches=2", tmp_path)
+    assert done.returncode == 0, f"{page}: {command}\n{done.stderr[-4000:]}"
+
+
+@pytest.mark.parametrize(
+    ("page", "command"), [(page, line) for page, line in lines("", "bash") if line.startswith("python benchmarks/")]
+)
+def test_the_benchmarks_have_the_options_that_pages_name(page: str, command: str, tmp_path: Path) -> None:
+    _, script, *options = shlex.split(command)
+    done = _bash(f"{shlex.quote(sys.executable)} {shlex.quote(str(ROOT / script))} --help", tmp_path)
+    assert done.returncode == 0, done.stderr
+    missing = [option for option in options if option.startswith("--") and option not in done.stdout]
+    assert not missing, f"{page}: {script} has no {missing}"
 
 
 def test_every_page_is_on_the_site() -> None:
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     missing = [page.name for page in PAGES if page.parent.name == "docs" and page.name not in navigation]
     assert not missing
+
+
+def test_every_public_module_is_in_the_reference_once() -> None:
+    """Packages gather what their modules hold; tools are run, not imported, and have pages of their own."""
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md"))
+    listed = re.findall(r"^::: (\S+)$", pages, re.MULTILINE)
+    modules = [path.relative_to(ROOT / "src").with_suffix("").parts for path in (ROOT / "src" / "saunet").rglob("*.py")]
+    public = {".".join(parts) for parts in modules if "cli" not in parts and not re.search(r"\b_", " ".join(parts))}
+    assert not public - set(listed)
+    assert not set(listed) - public - {"saunet"}
+    assert len(listed) == len(set(listed))
 
 
 def test_links_to_code_lead_to_names_that_exist() -> None:

@@ -17,7 +17,7 @@ from saunet.metrics.protocols import protocol
 class Data:
     """Six images of three conditions with constant depth; remembers what was asked of it."""
 
-    protocol = "eigen_camera_z"
+    protocols = ("eigen_camera_z",)
     neighbours = ("train",)
 
     def __init__(self, kind="camera_z"):

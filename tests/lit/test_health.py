@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import tiny
 import torch
+from lightning import Callback
 
 from saunet.checks import ConfigError
 from saunet.geometry.pose import pose_matrix
@@ -107,9 +108,14 @@ def test_copies_are_advised_where_the_data_can_be_read_from_them(
     assert ("use a faster disk or more cores" in said) == (not cacheable or cached)
 
 
-@pytest.mark.parametrize("slow", [True, False])
+@pytest.mark.parametrize(("slow", "epochs", "every"), [(True, 1, 2), (False, 1, 2), (True, 2, 4), (True, 3, 5)])
 def test_a_slow_loader_is_named_with_its_figures_and_a_fast_one_is_not(
-    slow: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    slow: bool,
+    epochs: int,
+    every: int,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = [0.0]  # a clock of our own: a busy machine must not decide this test
     monkeypatch.setattr("saunet.data.sampling.time.perf_counter", lambda: clock[0])
@@ -125,11 +131,16 @@ def test_a_slow_loader_is_named_with_its_figures_and_a_fast_one_is_not(
             clock[0] += 0.04
             return super().forward(image)
 
+    class Pause(Callback):
+        def on_train_epoch_end(self, *_: Any) -> None:
+            clock[0] += 100.0  # validation and checkpoints, which the loader cannot help
+
     monkeypatch.setattr(tiny.Wall, "image", read)
     model = tiny.tiny_model()
     model.depth = Clocked()
+    callbacks = [LoaderMonitor(every_n_steps=every), Pause()]
     trainer = tiny.tiny_trainer(
-        tmp_path, max_epochs=1, limit_val_batches=0, callbacks=[LoaderMonitor(every_n_steps=2)], log_every_n_steps=1
+        tmp_path, max_epochs=epochs, limit_val_batches=0, callbacks=callbacks, log_every_n_steps=1
     )
     with caplog.at_level("INFO"):
         trainer.fit(model, tiny.tiny_walls())

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+import tiny
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
@@ -18,6 +20,7 @@ import saunet
 from saunet.checkpoint import read_checkpoint
 from saunet.checks import ConfigError
 from saunet.data.module import DepthDataModule
+from saunet.data.windows import Selection
 from saunet.images import read_image
 from saunet.lit.assemble import assemble
 from saunet.lit.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
@@ -134,6 +137,24 @@ def test_best_falls_back_to_the_loss_where_nothing_has_ground_truth(
     trainer.fit(assemble(config, walls), walls)
     assert best.monitor == "val/loss"
     assert (tmp_path / "best.ckpt").is_file()
+
+
+def test_validation_without_ground_truth_says_nothing_of_metrics(tmp_path: Path) -> None:
+    class Plain(tiny.Wall):
+        def depth(self, index: int) -> None:  # type: ignore[override]
+            return None
+
+    class PlainWalls(tiny.TinyWalls):
+        def select(self, split: str) -> list[Selection]:
+            return [Selection(Plain(f"{split} 1"), range(8))]
+
+    model, data = tiny.tiny_model(), PlainWalls(height=32, width=48, batch_size=4, workers=0)
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=1)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=r".*was called before the ``update``.*")
+        trainer.fit(model, data)
+    assert "val/loss" in trainer.callback_metrics
+    assert "val/abs_rel" not in trainer.callback_metrics
 
 
 def test_a_picture_is_written_after_every_epoch(

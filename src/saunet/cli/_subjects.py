@@ -78,7 +78,11 @@ class Subject:
 
 
 class CheckpointSubject(Subject):
-    """A trained model."""
+    """A trained model.
+
+    Args:
+        cfg: Root of ``saunet-evaluate``.
+    """
 
     def __init__(self, cfg: DictConfig) -> None:
         from saunet.checkpoint import read_checkpoint
@@ -112,7 +116,14 @@ class CheckpointSubject(Subject):
 
 
 class ForeignSubject(Subject):
-    """Predictions in files."""
+    """Predictions in files.
+
+    Args:
+        cfg: Root of ``saunet-evaluate``.
+
+    Raises:
+        ConfigError: if it asks for what only a model can give.
+    """
 
     def __init__(self, cfg: DictConfig) -> None:
         # One image at a time: files of a folder may differ in size.

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 from omegaconf import DictConfig
 
-from saunet.checks import ConfigError, positive
+from saunet.checks import ConfigError, one_of, positive
 from saunet.cli._app import run
 
 
 def calibrate(cfg: DictConfig) -> None:
-    """Print a board, or find one, solve for the camera, say how good that is, and write ``camera.yaml``."""
+    """Print a board, or find one, solve for the camera, say how good that is, and write ``camera.yaml``.
+
+    Raises:
+        ConfigError: if there is nothing to read, or the output exists.
+        DataError: if the calibration cannot be trusted.
+    """
     from saunet.data.boards import Board
     from saunet.data.calibrate import calibrate, check_picture
-    from saunet.data.camera_file import write_camera
+    from saunet.data.camera_file import MODELS, write_camera
     from saunet.images import write_image
     from saunet.progress import bar
 
@@ -35,7 +41,7 @@ def calibrate(cfg: DictConfig) -> None:
         result = calibrate(
             cfg.input,
             board,
-            model=cfg.model,
+            model=one_of("lens", cfg.lens, MODELS),
             views=cfg.views,
             max_error=cfg.max_error,
             advance=lambda done, total: shown.update(task, completed=done, total=total),
@@ -47,7 +53,8 @@ def calibrate(cfg: DictConfig) -> None:
     write_image(picture, check_picture(result))
     K = camera.K
     print(f"{note} ({result.looked_at} looked at, {result.dropped} left out as misfits)")
-    print(f"reprojection error {result.error:.3f} px; focal length known to {result.uncertainty:.2%}")
+    known = "" if math.isnan(result.uncertainty) else f"; focal length known to {result.uncertainty:.2%}"
+    print(f"reprojection error {result.error:.3f} px{known}")
     print(f"fx {K[0, 0]:.2f}, fy {K[1, 1]:.2f}, cx {K[0, 2]:.2f}, cy {K[1, 2]:.2f}")
     if result.coverage < 0.6:
         print(f"the board was seen in {result.coverage:.0%} of the image only: hold it into the corners too")

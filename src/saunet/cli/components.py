@@ -56,7 +56,11 @@ def count(owner: Registry, entry: Entry) -> str:
 
 
 def main() -> None:
-    """Entry point of ``saunet-components``."""
+    """Entry point of ``saunet-components``.
+
+    Raises:
+        SystemExit: with one sentence, for an unknown kind or name.
+    """
     parser = argparse.ArgumentParser(prog="saunet-components", description=__doc__.partition("``: ")[2])
     parser.add_argument("kind", nargs="?", help=f"one of: {', '.join(REGISTRIES)}; all by default")
     parser.add_argument("name", nargs="?", help="one component of that kind")

@@ -39,7 +39,13 @@ def demo(cfg: DictConfig) -> None:
 
 
 def draw(predictor: Any, drive: Any, folder: Path) -> None:
-    """Write ``depth.png`` (a few frames with truth and error) and ``depth.mp4`` (the whole drive)."""
+    """Write ``depth.png`` (a few frames with truth and error) and ``depth.mp4`` (the whole drive).
+
+    Args:
+        predictor: A `saunet.infer.predictor.Predictor`.
+        drive: A `saunet.data.sequences.Drive` with true depth.
+        folder: Where the files go.
+    """
     from saunet.images import write_image
     from saunet.infer.panel import depth_panel
     from saunet.infer.video import render_video

@@ -16,6 +16,12 @@ from saunet.cli._subjects import subject_of, trivial
 def evaluate_model(network: Any, data: Any, protocols: Sequence[str], *, split: str = "test") -> Any:
     """Score a depth network, on its device, beside the trivial predictors on one split of a data module.
 
+    Args:
+        network: Takes images, b x 3 x h x w, and returns a `saunet.types.DepthPyramid`.
+        data: A data module, not necessarily set up, at the network's size.
+        protocols: Names of protocols; none for the data set's own.
+        split: ``test`` or ``val``.
+
     Raises:
         ConfigError: if a protocol does not fit the data set's ground truth.
         DataError: if the split has no frame with ground truth.
@@ -35,7 +41,7 @@ def evaluate(cfg: DictConfig) -> None:
     """Load what is scored and the data, print the tables, write them to the output folder."""
     from hydra.core.hydra_config import HydraConfig
 
-    from saunet.evaluation import EvaluationResult, evaluate_protocols, print_table, with_statistics, write_results
+    from saunet.evaluation import evaluate_protocols, print_table, with_statistics, write_results
     from saunet.evaluation.breakdown import Buckets
 
     subject = subject_of(cfg)
@@ -53,10 +59,10 @@ def evaluate(cfg: DictConfig) -> None:
     result = replace(result, settings={"data": data, **subject.settings()})
     print_table(result)
     for source in cfg.data.get("sources") or {}:  # of a mixture
-        rows = tuple(row for row in result.rows if row.name.startswith(f"{source}/"))
-        if rows:
+        alone = result.part(f"{source}/")
+        if alone.protocols:
             print(f"{source} alone:")
-            print_table(EvaluationResult(result.protocols, result.predictors, rows))
+            print_table(alone)
     write_results(result, Path(cfg.output_dir))
     print(f"results: {cfg.output_dir}")
 

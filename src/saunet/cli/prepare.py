@@ -24,8 +24,13 @@ KEYS = {
 
 
 def prepare(cfg: DictConfig) -> None:
-    """Do one job and say what was done."""
-    from saunet.data.module import available_cores
+    """Do one job and say what was done.
+
+    Raises:
+        ConfigError: if the job is unknown, or a key is not one of its own.
+        DataError: if a recording cannot be read.
+    """
+    from saunet.data.workers import available_cores
 
     one_of("job", cfg.job, KEYS)
     plain = config.plain(cfg)

@@ -190,7 +190,7 @@ def _fisheye(views: Sequence[BoardView], size: tuple[int, int]) -> Solution:
     except cv2.error as reason:
         raise DataError(
             f"the views do not fit a fisheye lens ({str(reason).strip().splitlines()[-1]}); "
-            "hold the board nearer to the middle and tilt it less, or use model=pinhole"
+            "hold the board nearer to the middle and tilt it less, or use lens=pinhole"
         ) from reason
     errors = []
     for each, seen, rotation, shift in zip(points, pixels, rotations, shifts, strict=True):

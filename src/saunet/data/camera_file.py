@@ -79,7 +79,12 @@ class CameraFile:
     """Root mean square in pixels, where the file comes from a calibration."""
 
     def intrinsics(self, height: int, width: int, what: str = "the frames") -> NDArray[np.float64]:
-        """Return K in pixels of frames of a size, which must have the shape of the calibrated ones.
+        """Return K, 3 x 3, in pixels of frames of a size, which must have the shape of the calibrated ones.
+
+        Args:
+            height: Of the frames, in pixels.
+            width: Of the frames, in pixels.
+            what: What the frames are, for the message.
 
         Raises:
             DataError: if they have another shape, or K cannot be that of such an image.

@@ -219,13 +219,17 @@ class CachedDrive:
         """Return the metres travelled between two frames as the recording does; None where it does not know."""
         return self._drive.distance(first, second) if isinstance(self._drive, MeasuredDrive) else None
 
+    def path(self, index: int) -> Path:
+        """Return the file of a smaller frame."""
+        return self._cache.path(self._drive, index)
+
     def image(self, index: int) -> NDArray[np.uint8]:
         """Return the smaller frame, h x w x 3, RGB.
 
         Raises:
             DataError: if it is missing or broken.
         """
-        return read_image(self._cache.path(self._drive, index))
+        return read_image(self.path(index))
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
         """Return K in pixels of the smaller frame."""

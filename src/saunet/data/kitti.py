@@ -49,6 +49,9 @@ class KittiDrive:
         ConfigError: for an unknown camera or depth kind.
     """
 
+    camera_height = CAMERA_HEIGHT
+    fps = 1 / FRAME_SECONDS
+
     def __init__(
         self,
         folder: Path,
@@ -210,6 +213,11 @@ class KittiRaw:
 
     def drive(self, name: str, camera: str = "left", depth_kind: DepthKind = "camera_z") -> KittiDrive:
         """Return a drive by its name ``<date>/<drive>``; one that is not on disk has no frames.
+
+        Args:
+            name: Such as ``2011_09_26/2011_09_26_drive_0001_sync``.
+            camera: ``left`` or ``right``.
+            depth_kind: What ground truth it gives, as in `KittiDrive`.
 
         Raises:
             DataError: if the calibration of its date is broken.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from lightning.pytorch.utilities import rank_zero_warn
 
 from saunet.atomic import write_json
 from saunet.checks import DataError
@@ -31,12 +33,38 @@ class Manifest:
         numbering: Drive -> how its frames were numbered; see `numbering`.
         facts: Whatever else was found, free-form.
         path: The file it was read from, for messages.
+        test_only: Those of its drives that neither training nor validation read when it was made.
     """
 
     leave_out: LeaveOut
     numbering: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
     path: Path = Path("manifest.json")
+    test_only: Set[str] = frozenset()
+
+    def check(self, names: Set[str]) -> None:
+        """Check that the manifest is of these drives; warn where some of its drives are not among them.
+
+        Args:
+            names: Of the drives that training and validation read.
+
+        Raises:
+            DataError: if it names drives and none of them is among these.
+        """
+        mine = self.leave_out.keys() - self.test_only
+        strange = sorted(mine - names)
+        if not strange:
+            return
+        listed = f"such as '{strange[0]}'; here they are called '{min(names)}'" if names else f"such as '{strange[0]}'"
+        if len(strange) == len(mine):
+            raise DataError(
+                f"{self.path} names {len(mine)} recordings and none of them is trained on ({listed}...); make it with "
+                "saunet-doctor and the data settings of this run, or set data.manifest=null"
+            )
+        rank_zero_warn(
+            f"{self.path} names {len(mine)} recordings, and {len(strange)} of them are not trained on ({listed}...); "
+            "if they should be, run saunet-doctor again with the data settings of this run"
+        )
 
     def apply(self, selection: Selection, offsets: Sequence[int]) -> Selection:
         """Return a selection without the frames to leave out, counted by reason.
@@ -77,6 +105,7 @@ def write_manifest(path: str | Path, manifest: Manifest) -> None:
         "format": FORMAT,
         **manifest.facts,
         "numbering": dict(manifest.numbering),
+        "test_only": sorted(manifest.test_only),
         "leave_out": {
             drive: {reason: sorted(numbers) for reason, numbers in reasons.items()}
             for drive, reasons in manifest.leave_out.items()
@@ -107,7 +136,8 @@ def read_manifest(path: str | Path) -> Manifest:
             f"{path}: 'leave_out' must map each drive to reasons and these to lists of frame numbers, such as "
             '{"clip l": {"static": [4, 5]}}'
         )
-    return Manifest(leave_out, {str(key): str(value) for key, value in numbered.items()}, {}, path)
+    test_only = frozenset(map(str, plain.get("test_only") or ()))
+    return Manifest(leave_out, {str(key): str(value) for key, value in numbered.items()}, {}, path, test_only)
 
 
 def _is_entry(reasons: Any) -> bool:

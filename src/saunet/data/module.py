@@ -5,11 +5,9 @@ A data set subclasses `DepthDataModule`, names its own parameters beside the sha
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -27,6 +25,7 @@ from saunet.data.sequences import Drive
 from saunet.data.transforms import Augment, Prepare
 from saunet.data.unreadable import SkippingWindows, readable
 from saunet.data.windows import Selection, Usage, WindowDataset, check_offsets, collate, find_windows
+from saunet.data.workers import available_cores, single_threaded
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
 
 AHEAD = 4
@@ -107,6 +106,11 @@ class DepthDataModule(LightningDataModule):
         self.usage: dict[str, list[Usage]] = {}
         self.datasets: dict[str, WindowDataset] = {}
 
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """Names of the protocols that fit its parts, its own first."""
+        return (self.protocol,)
+
     def select(self, split: str) -> Sequence[Selection]:
         """Return the frames of ``train``, ``val``, ``test`` or ``predict``; the one thing a data set must say.
 
@@ -118,13 +122,25 @@ class DepthDataModule(LightningDataModule):
         """Find the windows of the splits that a stage needs, and report what is used and what is left out.
 
         Raises:
-            DataError: if a split has no usable frame.
+            DataError: if a split has no usable frame, or the manifest is of other recordings.
         """
+        fresh = "train" not in self.datasets
         for split in STAGES[str(getattr(stage, "value", stage))] if stage else ("train", "val", "test", "predict"):
-            selections = [] if split in self.datasets else [Selection(*each) for each in self.select(split)]
-            if selections or (split != "val" and split not in self.datasets):
-                self.datasets[split] = self._dataset(split, [self._usable(split, each) for each in selections])
-                rank_zero_info(self.summary(split))
+            self.setup_split(split)
+        if fresh and "train" in self.datasets:
+            read = [self.datasets[split] for split in STAGES["fit"] if split in self.datasets]
+            self._check_manifests({drive.name for dataset in read for drive in dataset.drives})
+
+    def setup_split(self, split: str) -> None:
+        """Find the windows of one split, unless that is done.
+
+        Raises:
+            DataError: if it has no usable frame.
+        """
+        selections = [] if split in self.datasets else [Selection(*each) for each in self.select(split)]
+        if selections or (split != "val" and split not in self.datasets):
+            self.datasets[split] = self._dataset(split, [self._usable(split, each) for each in selections])
+            rank_zero_info(self.summary(split))
 
     def teardown(self, stage: str | None = None) -> None:
         """Say what ``on_error=skip`` passed over."""
@@ -155,6 +171,10 @@ class DepthDataModule(LightningDataModule):
         """Return the SHA-256 of the sample names of each split that is set up."""
         return {split: dataset.fingerprint() for split, dataset in self.datasets.items()}
 
+    def _check_manifests(self, names: Set[str]) -> None:
+        if self.manifest is not None:
+            self.manifest.check(names)
+
     def _usable(self, split: str, selection: Selection) -> Selection:
         """Leave out what the manifest names, and what cannot be read where that is to be skipped."""
         offsets = self.offsets if split in self.neighbours else ()
@@ -170,11 +190,12 @@ class DepthDataModule(LightningDataModule):
         windows, usage = find_windows(selections, offsets, stereo)
         if not windows:
             found = "; ".join(str(drive) for drive in usage[:3]) or "no drives"
-            partner = " and a stereo partner" if stereo else ""
-            raise DataError(
-                f"split '{split}' has no usable frame ({found}); "
-                f"frames need neighbours at {list(offsets)}{partner}: check the data root, the split and the offsets"
-            )
+            needed = [f"neighbours at {list(offsets)}"] * bool(offsets) + ["a stereo partner"] * stereo
+            if needed:
+                advice = f"frames need {' and '.join(needed)}: check the data root, the split and the offsets"
+            else:
+                advice = "check the data root and the split"
+            raise DataError(f"split '{split}' has no usable frame ({found}); {advice}")
         self.usage[split] = usage
         kind = SkippingWindows if self.on_error == "skip" and split == "train" else WindowDataset
         return kind(
@@ -285,15 +306,3 @@ class DepthDataModule(LightningDataModule):
             "persistent_workers": workers > 0,
             "worker_init_fn": single_threaded,
         }
-
-
-def single_threaded(worker: int) -> None:
-    """Keep a loader process to one thread: the processes are the parallelism."""
-    cv2.setNumThreads(0)
-    torch.set_num_threads(1)
-
-
-def available_cores() -> int:
-    """Return how many cores this process may use: fewer than the machine has, under a scheduler or in a container."""
-    allowed = getattr(os, "sched_getaffinity", None)  # Linux only
-    return len(allowed(0)) if allowed else os.cpu_count() or 1

@@ -33,11 +33,11 @@ class Motion:
     """Frames that cannot be decoded."""
 
     def doubled(self) -> NDArray[np.bool_]:
-        """Tell which frames are the same picture as the one before: a video whose frame rate was raised."""
+        """Tell which frames are the same picture as the one before, one value a frame: the frame rate was raised."""
         return np.nan_to_num(self.change, nan=1.0) < SAME_PICTURE
 
     def static(self, min_flow: float = MIN_FLOW) -> NDArray[np.bool_]:
-        """Tell which frames show no motion against the one before; the first is judged by the second."""
+        """Tell which frames show no motion against the one before, one value a frame; the second judges the first."""
         flow = self.flow.copy()
         known = np.flatnonzero(np.isfinite(flow))
         if known.size and known[0] > 0:
@@ -46,17 +46,17 @@ class Motion:
 
 
 def compare(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> tuple[float, float]:
-    """Return the median flow between two RGB images in pixels at 320 width, and their relative difference."""
+    """Return the median flow between two images, h x w x 3, in pixels at 320 width, and their relative difference."""
     return median_flow(before, after), relative_change(before, after)
 
 
 def relative_change(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
-    """Return the mean difference of two images over the second's standard deviation."""
+    """Return the mean difference of two images, h x w x 3, over the second's standard deviation."""
     return float(np.abs(before.astype(np.float32) - after).mean() / max(1.0, float(after.std())))
 
 
 def shrink(image: NDArray[np.uint8], crop: Sequence[float | int] = (0, 0, 0, 0)) -> NDArray[np.uint8]:
-    """Return an image cut by shares of its top, bottom, left and right, and made 320 pixels wide."""
+    """Return an image, h x w x 3, cut by shares of its top, bottom, left and right, and made 320 pixels wide."""
     height, width = image.shape[:2]
     top, bottom, left, right = crop
     cut = image[
@@ -115,7 +115,7 @@ def even_steps(flow: NDArray[np.float64], parallax: float) -> NDArray[np.bool_]:
     """Choose frames so that the picture moves by about ``parallax`` from each to the next; the first is one.
 
     Args:
-        flow: Motion against the frame before, pixels at 320 width; NaN counts as none.
+        flow: Motion against the frame before, one number a frame, pixels at 320 width; NaN counts as none.
         parallax: Motion to gather before the next frame is chosen.
     """
     chosen, gathered = np.zeros(len(flow), dtype=bool), 0.0

@@ -13,7 +13,7 @@ from saunet.checks import DataError, one_of
 from saunet.data.calibration import read_matrices, zero_based
 from saunet.data.frame_size import common_size
 from saunet.data.intrinsics import check_intrinsics
-from saunet.data.kitti import frame_files
+from saunet.data.kitti import CAMERA_HEIGHT, frame_files
 from saunet.data.partners import distance_between
 from saunet.images import read_image
 from saunet.trajectories import read_kitti
@@ -35,6 +35,8 @@ class OdometrySequence:
         DataError: if the sequence or its calibration is missing or broken or does not belong to the images, or its
             file of poses is broken or empty.
     """
+
+    camera_height = CAMERA_HEIGHT
 
     def __init__(self, root: Path, sequence: str, camera: str = "colour_left") -> None:
         number, side = CAMERAS[one_of("camera", camera, CAMERAS)]
@@ -89,6 +91,12 @@ class OdometrySequence:
     def time(self, index: int) -> float | None:
         """Return the seconds at which a frame was taken, by ``times.txt``; None where that is missing or shorter."""
         return float(self._times[index]) if 0 <= index < len(self._times) else None
+
+    @property
+    def fps(self) -> float | None:
+        """Frames a second, by the median step of ``times.txt``; None where that is missing."""
+        step = float(np.median(np.diff(self._times))) if len(self._times) > 1 else 0.0
+        return 1 / step if step > 0 else None
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """Return T_world_cam of this camera, 4 x 4, metres; None where the file of poses is missing or shorter."""

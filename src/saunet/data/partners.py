@@ -65,7 +65,7 @@ def measured_distance(drive: Drive, first: int, second: int) -> float:
 
 
 def distance_between(T_world_first: NDArray[np.float64], T_world_second: NDArray[np.float64]) -> float:
-    """Return the straight way between two poses, metres."""
+    """Return the straight way between two poses, 4 x 4, metres."""
     return float(np.linalg.norm(T_world_second[:3, 3] - T_world_first[:3, 3]))
 
 

@@ -34,7 +34,14 @@ def resize_depth(depth: NDArray[np.float32], height: int, width: int) -> NDArray
 def nearest_map(
     rows: NDArray[np.int64], columns: NDArray[np.int64], values: NDArray[Any], size: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Scatter values into a map of zeros; where several fall on one pixel the smallest stays."""
+    """Scatter values into a map of zeros, height x width; where several fall on one pixel the smallest stays.
+
+    Args:
+        rows: Of each value, n.
+        columns: Of each value, n.
+        values: n positive numbers, such as depths in metres.
+        size: (height, width) of the map.
+    """
     order = np.argsort(-values, kind="stable")
     out = np.zeros(size, np.float32)
     out[rows[order], columns[order]] = values[order]

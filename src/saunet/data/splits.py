@@ -166,6 +166,12 @@ def hold_out(frames: Sequence[Frame], share: float, gap: int, seed: int) -> Part
     """Hold out whole drives, drawn by seed, where there are ten or more; the tails of all drives where there are fewer.
 
     Drives are added until they hold the share; a drive that would exceed twice the share is passed over.
+
+    Args:
+        frames: All frames there are.
+        share: Of the frames to hold out, 0 to 1.
+        gap: Frames to leave between a training part and a held-out tail.
+        seed: Decides which drives are held out.
     """
     counts: dict[str, int] = {}
     for frame in frames:

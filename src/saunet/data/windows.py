@@ -272,7 +272,7 @@ def reach(offsets: Sequence[int]) -> int:
 
 
 def draw(seed: int) -> torch.Tensor:
-    """Return the `DRAWS` uniform random numbers in [0, 1) that belong to a seed."""
+    """Return the random numbers that belong to a seed: one row of `DRAWS`, uniform in [0, 1)."""
     return torch.from_numpy(np.random.default_rng(seed).random(DRAWS, dtype=np.float32))
 
 

@@ -158,6 +158,24 @@ class EvaluationResult:
         rows = [row.errors for row in self.select(predictor, protocol) if row.pixels]
         return np.array(rows, dtype=np.float64).reshape(-1, 7)
 
+    def part(self, start: str) -> EvaluationResult:
+        """Return the rows of the images whose names begin with ``start``, such as those of one source of a mixture.
+
+        Without the protocols under which none of them has ground truth, and without intervals and comparisons, which
+        are of all images.
+        """
+        mine = [row for row in self.rows if row.name.startswith(start)]
+        scored = {row.protocol for row in mine if row.pixels}
+        views = tuple(row for row in self.views if row.name.startswith(start))
+        known = scored | {row.protocol for row in views}
+        return EvaluationResult(
+            tuple(rules for rules in self.protocols if rules.name in known),
+            self.predictors,
+            tuple(row for row in mine if row.protocol in scored),
+            views=views,
+            settings=self.settings,
+        )
+
     def summaries(self) -> tuple[Summary, ...]:
         """Return one summary for each protocol and predictor that has rows, in the order they were asked for."""
         groups: dict[tuple[str, str], list[ImageRow]] = {

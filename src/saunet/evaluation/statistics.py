@@ -46,6 +46,12 @@ def groups_of(names: Sequence[str]) -> tuple[str, int, list[str] | None]:
 def spreads(result: EvaluationResult, level: float = 0.95, resamples: int = 2000, seed: int = 0) -> tuple[Spread, ...]:
     """Compute bootstrap intervals of all means of a result that rest on at least one image.
 
+    Args:
+        result: The evaluation.
+        level: Share of resampled means inside each interval.
+        resamples: How often to resample.
+        seed: Of the resampling.
+
     Raises:
         ConfigError: as `bootstrap_mean`.
     """

@@ -25,10 +25,13 @@ from saunet.types import EvalBatch
 class EvaluationData(Protocol):
     """What an evaluation needs of a data module."""
 
-    protocol: str
     ground_truth: str
     neighbours: Sequence[str]
     datasets: Mapping[str, Any]
+
+    @property
+    def protocols(self) -> Sequence[str]:
+        """Names of the protocols that fit it, its own first."""
 
     def setup(self, stage: str | None = None) -> None:
         """Find the images of a stage's splits."""
@@ -55,7 +58,8 @@ def evaluate_protocols(
     """Score predictors under protocols, with one pass over the images for each ground truth that they need.
 
     Args:
-        names: Names of protocols; none for the data set's own.
+        names: Names of protocols; none for the data set's own, of which those that need motion are left out where there
+            is none.
         data_with: Makes the data, not set up, with the ground truth of a name; None for the data set's own.
         predictors_for: Makes the predictors for one pass over those data; they are set up.
         motion: Of the first predictor, for protocols without ground truth.
@@ -72,7 +76,9 @@ def evaluate_protocols(
     first: EvaluationData | None = data_with(None)
     assert first is not None
     own = first.ground_truth
-    names = names or [first.protocol]
+    if not names:
+        fitting = [name for name in first.protocols if motion or protocol(name).ground_truth != "none"]
+        names = fitting or first.protocols
     results = []
     for kind, rules in passes([protocol(name) for name in names], own).items():
         # The data that were asked for their own ground truth serve the pass that wants it; others start anew.

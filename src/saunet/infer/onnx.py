@@ -91,8 +91,8 @@ def open_session(path: Path, device: str = "cpu", threads: int = 0, spinning: bo
 
     Args:
         path: The file.
-        device: ``"cpu"`` or ``"cuda"``.
-        threads: Threads to use; 0 lets onnxruntime choose.
+        device: ``cpu`` or ``cuda``, with or without a number.
+        threads: Of the CPU; 0 lets onnxruntime choose.
         spinning: Let threads that wait for work keep their cores busy, for a while also after a run.
 
     Raises:

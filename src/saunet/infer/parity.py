@@ -87,7 +87,13 @@ def timed(
 
 
 def milliseconds(runs: Sequence[Run], image: NDArray[np.float32], repeats: int = 11) -> list[float]:
-    """Return the median time of ``repeats`` calls of each, taken in turn, after two that do not count."""
+    """Return the median milliseconds of calls of each, taken in turn, after two that do not count.
+
+    Args:
+        runs: What is called.
+        image: What it is called with, 1 x 3 x h x w.
+        repeats: Calls that count.
+    """
     times = np.zeros((repeats + 2, len(runs)))
     for row in times:
         for index, run in enumerate(runs):

@@ -56,6 +56,11 @@ class Camera:
     def from_numbers(cls, numbers: Sequence[float | int], height: int, width: int) -> Camera:
         """Read ``fx, fy, cx, cy``, the nine numbers of K, row by row, or one: the horizontal field of view in degrees.
 
+        Args:
+            numbers: Four, nine or one of them.
+            height: Of the image that they belong to, in pixels.
+            width: Of that image, in pixels.
+
         Raises:
             ConfigError: for another count, or if K cannot be a camera's.
         """
@@ -74,7 +79,13 @@ class Camera:
 
     @classmethod
     def from_field_of_view(cls, degrees: float, height: int, width: int) -> Camera:
-        """Assume square pixels, a centred axis and this horizontal field of view: a guess, for want of calibration."""
+        """Assume square pixels, a centred axis and this horizontal field of view: a guess, for want of calibration.
+
+        Args:
+            degrees: From the left to the right border of the image.
+            height: Of the image, in pixels.
+            width: Of the image, in pixels.
+        """
         in_range("field of view", degrees, 1.0, 179.0)
         focal = width / (2 * np.tan(np.radians(degrees) / 2))
         return cls.from_numbers((focal, focal, (width - 1) / 2, (height - 1) / 2), height, width)

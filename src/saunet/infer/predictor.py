@@ -52,6 +52,12 @@ class Predictor(ImagePredictor):
     ) -> Predictor:
         """Load a trained model, a checkpoint or an exported folder; nothing in the file is run.
 
+        Args:
+            path: A checkpoint file, or a folder that ``saunet-export`` wrote.
+            device: Where the network runs.
+            flip: Also predict the mirrored image and blend: slower and a little better.
+            keep_aspect: Keep the shape of images instead of stretching them to the size of the training.
+
         Raises:
             CheckpointError: if the file is missing, broken, or not a saunet checkpoint.
             ConfigError: if the device does not exist.

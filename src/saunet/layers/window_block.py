@@ -129,7 +129,7 @@ class SwinStage(nn.Module):
         self.downsample = PatchMerging(dim) if merge else None
 
     def forward(self, x: Float[Tensor, "b h w c"]) -> tuple[Tensor, Tensor]:
-        """Return the map after the last block and what the next stage starts from."""
+        """Return the map after the last block, b h w c, and what the next stage starts from, b h/2 w/2 2c."""
         for block in self.blocks:
             if self.checkpointing and torch.is_grad_enabled():
                 x = checkpoint(block, x, use_reentrant=False)

@@ -40,6 +40,11 @@ def axis_windows(size: int, window: int, shift: int) -> list[tuple[int, int]]:
 
     A shifted axis starts with a window of ``shift`` tokens; the last window ends at the border. An axis that fits in
     one window is not shifted: the shift would only cut it in two.
+
+    Args:
+        size: Tokens of the axis.
+        window: Tokens of a full window.
+        shift: Tokens of the first window; 0 for the unshifted partition.
     """
     first = shift if size > window else 0
     starts = [0, *range(first, size, window)] if first else list(range(0, size, window))
@@ -47,7 +52,14 @@ def axis_windows(size: int, window: int, shift: int) -> list[tuple[int, int]]:
 
 
 def window_groups(height: int, width: int, window: int, shift: int) -> list[WindowGroup]:
-    """Return the window sizes of a map and how many there are of each, in the order in which they first appear."""
+    """Return the window sizes of a map and how many there are of each, in the order in which they first appear.
+
+    Args:
+        height: Rows of the map, in tokens.
+        width: Columns of the map, in tokens.
+        window: Side of a full window.
+        shift: Rows and columns in the first window; 0 for the unshifted partition.
+    """
     counts: dict[tuple[int, int], int] = {}
     for _, tall in axis_windows(height, window, shift):
         for _, wide in axis_windows(width, window, shift):
@@ -78,7 +90,14 @@ def window_order(
 
 
 def relative_position_index(height: int, width: int, window: int, device: torch.device) -> Int[Tensor, " n2"]:
-    """Return the row of the ``(2 window - 1)**2`` bias table for each (query, key) of a ``height x width`` window."""
+    """Return the row of the ``(2 window - 1)**2`` bias table for each (query, key) of a ``height x width`` window.
+
+    Args:
+        height: Rows of the window.
+        width: Columns of the window.
+        window: Side of a full window, which the table is made for.
+        device: Where the index is wanted.
+    """
     index: Tensor = _relative_index(height, width, window, str(device))
     return index
 

@@ -26,6 +26,10 @@ def streams(tokens: Tensor, block: nn.Module) -> bool:
 
     Gradients, autocast, a compiler, exporter or tracer, a dispatch mode (which counts FLOPs by the operators it knows),
     hooks and layers that somebody replaced (quantised, adapted) get the plain way through the layers' own ``forward``.
+
+    Args:
+        tokens: n x c, whatever the axes before c are.
+        block: The block whose layers it is about.
     """
     return (
         tokens.device.type == "cpu"
@@ -70,7 +74,14 @@ def add_attention(
 
 
 def add_mlp_(x: Float[Tensor, "*n c"], norm: nn.LayerNorm, fc1: nn.Linear, fc2: nn.Linear) -> Float[Tensor, "*n c"]:
-    """Add ``fc2(gelu(fc1(norm(x))))`` to ``x``, in place."""
+    """Add ``fc2(gelu(fc1(norm(x))))`` to ``x``, in place.
+
+    Args:
+        x: Tokens; changed.
+        norm: Over the channels.
+        fc1: From c channels to the hidden ones.
+        fc2: Back to c channels.
+    """
     rows = x.view(-1, x.shape[-1])
     size = rows_per_piece(fc1.out_features)
     buffer = rows.new_empty(min(size, len(rows)), fc1.out_features)

@@ -11,7 +11,7 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_info
 
 from saunet.checks import in_range, positive
-from saunet.data.module import available_cores
+from saunet.data.workers import available_cores
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +41,11 @@ class Loading:
 class LoaderMonitor(Callback):
     """Log the loader's images a second and its share of the time, and say once when it is the bottleneck.
 
-    The first steps, in which worker processes start, are left out. Time that the loader needs beside a busy device
-    costs nothing and is not counted: only what the training step waits for is.
+    The first step of an epoch, before which worker processes start and validation runs, is left out. Time that the
+    loader needs beside a busy device costs nothing and is not counted: only what the training step waits for is.
 
     Args:
-        every_n_steps: Steps over which is measured.
+        every_n_steps: Steps over which is measured, of several epochs where these are shorter.
         share: Part of the time from where the loader is called a bottleneck.
     """
 
@@ -53,11 +53,13 @@ class LoaderMonitor(Callback):
         self.every_n_steps = int(positive("every_n_steps", every_n_steps))
         self.share = in_range("share", share, 0, 1)
         self._since: tuple[float, float] | None = None
-        self._images = self._steps = 0
+        """When the step before ended, and what had been waited by then; None before the first step of an epoch."""
+        self._measured = Loading(0, 0.0, 0.0)
+        self._steps = 0
         self._said = False
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Measure no pauses between epochs."""
+        """Measure no pause between epochs; what was measured before it counts on."""
         self._since = None
 
     def on_train_batch_end(
@@ -67,16 +69,19 @@ class LoaderMonitor(Callback):
         waited = getattr(trainer.train_dataloader, "waited", None)
         if waited is None:
             return
-        now = time.monotonic()
-        if self._since is None:
-            self._since, self._images, self._steps = (now, waited), 0, 0
+        since, self._since = self._since, (time.monotonic(), waited)
+        if since is None:
             return
-        self._images += _images(batch)
+        before = self._measured
+        self._measured = Loading(
+            before.images + _images(batch),
+            before.seconds + self._since[0] - since[0],
+            before.waited + waited - since[1],
+        )
         self._steps += 1
         if self._steps < self.every_n_steps:
             return
-        loading = Loading(self._images, now - self._since[0], waited - self._since[1])
-        self._since = None
+        loading, self._measured, self._steps = self._measured, Loading(0, 0.0, 0.0), 0
         figures = {"loader/images_per_second": loading.reached, "loader/share": loading.share}
         pl_module.log_dict(figures, batch_size=1)
         if loading.share > self.share and not self._said:

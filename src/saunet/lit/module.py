@@ -60,7 +60,7 @@ class SelfSupervisedDepth(TrainedModule):
         return pyramid
 
     def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
-        """Return the loss of one batch, eq. (14)."""
+        """Return the loss of one batch, a scalar, eq. (14)."""
         pyramid, poses, _, terms = self.predict_and_compare(batch)
         self.log_dict(terms.named("train"), prog_bar=False, batch_size=len(batch["name"]))
         figures = health(pyramid, poses, terms, float(getattr(self.depth, "max_depth", torch.inf)))
@@ -136,8 +136,12 @@ class SelfSupervisedDepth(TrainedModule):
             self.log_dict(terms.named("val"), sync_dist=True, batch_size=count)
         else:
             pyramid = self(batch["target"])
+        disparity = pyramid.disparity[0]
         if "depth" in batch:
-            self.metrics.update(pyramid.disparity[0], batch["depth"], batch["depth_size"])
+            self.metrics.update(disparity, batch["depth"], batch["depth_size"])
+        else:  # counted all the same: every process then has something to sum, and torchmetrics nothing to warn of
+            nothing = torch.zeros(count, 2, dtype=torch.int64, device=disparity.device)
+            self.metrics.update(disparity, disparity.new_zeros(count, 1, 1, 1), nothing)
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics over the whole validation set, exact over any number of processes."""

@@ -65,7 +65,7 @@ class NonFinite(Callback):
             self._kept = [(buffer, buffer.clone()) for buffer in buffers]
 
     def on_before_backward(self, trainer: Trainer, pl_module: LightningModule, loss: Tensor) -> None:
-        """Note whether the loss is finite."""
+        """Note whether the loss, a scalar, is finite."""
         self._bad = ~torch.isfinite(loss.detach())
 
     def on_before_optimizer_step(

@@ -107,7 +107,7 @@ class Objective(nn.Module):
         )
 
 
-def require(batch: TrainBatch, key: str, term: str, fix: str) -> Tensor:
+def require(batch: TrainBatch, key: str, term: str, fix: str) -> Float[Tensor, "..."]:
     """Return ``batch[key]``.
 
     Args:

@@ -105,7 +105,7 @@ class WindowEncoder(nn.Module):
         raise NotImplementedError(f"{type(self).__name__} has no stem")
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
-        """Return one feature map per stage, finest first, channels first (in channels-last memory).
+        """Return one feature map per stage, b c h/s w/s, finest first (in channels-last memory).
 
         Args:
             image: RGB in [0, 1].

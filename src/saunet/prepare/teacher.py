@@ -179,6 +179,12 @@ def _writer(recordings: Sequence[Recording], source: DepthSource, maps: DepthMap
 def source_of(checkpoint: str | None, files: str | None, values: Values, device: str) -> DepthSource:
     """Return the teacher that is asked for: a checkpoint or a folder of files.
 
+    Args:
+        checkpoint: Of a trained model.
+        files: Folder of the depth or disparity that another system wrote.
+        values: What those files hold, ``depth`` or ``disparity``.
+        device: Where the model runs.
+
     Raises:
         ConfigError: if it is neither, or both.
         CheckpointError: if the checkpoint cannot be read.

@@ -10,7 +10,8 @@ from typing import Literal
 
 import numpy as np
 
-from saunet.data.doctor.survey import BANDS, Survey
+from saunet.checks import UnreadableError
+from saunet.data.doctor.survey import ABSENT, BANDS, Survey
 from saunet.data.motion import SAME_PICTURE
 from saunet.data.static import MIN_FLOW
 
@@ -48,11 +49,14 @@ def diagnose(survey: Survey) -> list[Finding]:
 
 
 def _splits(survey: Survey) -> Iterator[Finding]:
-    for split, problem in survey.problems.items():
+    for problem in dict.fromkeys(map(str, survey.problems.values())):
+        splits = [split for split, error in survey.problems.items() if str(error) == problem]
+        named = " and ".join([", ".join(splits[:-1]), splits[-1]] if len(splits) > 1 else splits)
+        broken = isinstance(survey.problems[splits[0]], UnreadableError)
         yield Finding(
             "error",
-            f"the {split} split cannot be used: {problem}",
-            "where a file is broken, data.on_error=skip counts all that are",
+            f"the {named} split{'s' if len(splits) > 1 else ''} cannot be used: {problem}",
+            "data.on_error=skip counts all files that are broken" if broken else "",
         )
     count = survey.windows.get("train")
     if count is not None and count < 1000:
@@ -69,6 +73,13 @@ def _unreadable(survey: Survey) -> Iterator[Finding]:
     passed_over = max((reasons.get("unreadable", 0) for reasons in survey.left_out.values()), default=0)
     if passed_over:
         yield Finding("warning", f"{passed_over} frames cannot be read and are left out", "copy them again")
+    lost = max((reasons.get("not decodable", 0) for reasons in survey.left_out.values()), default=0)
+    if lost:
+        yield Finding(
+            "warning",
+            f"{lost} frames that videos claim to hold cannot be decoded and are left out",
+            "the end of a video is cut off or damaged: copy it again",
+        )
     broken = [frame for frame in survey.frames if frame.problem]
     if broken:
         yield Finding(
@@ -99,9 +110,12 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
     for camera in survey.cameras:
         (height, width), K = camera.size, camera.K
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-        view = math.degrees(2 * math.atan(width / 2 / fx)) if fx > 0 else math.nan
-        views.append(view)
         told = f"'{camera.drive}': fx {fx:.1f}, fy {fy:.1f}, centre {cx:.1f}, {cy:.1f} in {width}x{height}"
+        if not (fx > 0 and fy > 0 and np.isfinite(K).all()):
+            yield Finding("error", f"{told} cannot be: focal lengths are positive numbers", "mend the calibration")
+            continue
+        view = math.degrees(2 * math.atan(width / 2 / fx))
+        views.append(view)
         if not 20 <= view <= 150:
             yield Finding(
                 "error",
@@ -127,7 +141,16 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
 
 def _neighbours(survey: Survey) -> Iterator[Finding]:
     for split, reasons in survey.left_out.items():
+        absent, listed = survey.absent[split]
         total = survey.windows[split] + sum(reasons.values())
+        if absent:
+            yield Finding(
+                "warning",
+                f"{absent} of {listed} recordings of the {split} split are not there, with {reasons.get(ABSENT, 0)} of "
+                f"its {total} frames",
+                "add them, or choose a split of those that are there, such as data.split=all for KITTI",
+            )
+        total -= reasons.get(ABSENT, 0)
         for reason, count in reasons.items():
             if reason in ("without neighbour", "missing") and count > max(10, 0.2 * total):
                 yield Finding(
@@ -198,7 +221,7 @@ def _static(survey: Survey) -> Iterator[Finding]:
 
 
 def band_profile(survey: Survey) -> np.ndarray | None:
-    """Return the motion of each band of the image over that of the whole, from top to bottom; None with few frames."""
+    """Return the motion of each band over the whole image's, one number a band, top to bottom; None with few frames."""
     rows = [f.bands / f.flow for f in survey.compared() if f.bands is not None and f.flow is not None and f.flow > 1]
     return np.median(rows, axis=0) if len(rows) >= 5 else None
 
@@ -270,5 +293,6 @@ def _speed(survey: Survey) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"a core reads {1 / seconds:.0f} images a second; a training step of 12 samples needs 36",
-            "make a cache of small images once (saunet-prepare), use more data.workers or a faster disk",
+            f"{'make a cache of small images once (saunet-prepare cache), ' if survey.cacheable else ''}"
+            "use more data.workers or a faster disk",
         )

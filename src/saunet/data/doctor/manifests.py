@@ -21,14 +21,15 @@ def manifest_of(survey: Survey, findings: Sequence[Finding], path: str | Path) -
         if reason:
             leave_out.setdefault(frame.drive, {}).setdefault(reason, []).append(frame.index)
     facts: dict[str, Any] = {
-        "read": f"{len(survey.frames)} frames read; only these are judged",
+        "read": f"{survey.judged} of {survey.known} frames read; only these are judged",
         "splits": {
             split: {"samples": count, "left_out": survey.left_out[split], "sha256": survey.fingerprints[split]}
             for split, count in survey.windows.items()
         },
         "findings": [{"level": each.level, "text": each.text, "fix": each.fix} for each in findings],
     }
-    return Manifest(leave_out, {drive: survey.numbering[drive] for drive in leave_out}, facts, Path(path))
+    numbering = {drive: survey.numbering[drive] for drive in leave_out}
+    return Manifest(leave_out, numbering, facts, Path(path), survey.test_only & leave_out.keys())
 
 
 def _reason(frame: FrameFacts) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,6 +22,8 @@ from saunet.data.static import optical_flow
 from saunet.data.windows import WindowDataset
 
 SPLITS = ("train", "val", "test")
+ABSENT = "in absent recordings"
+"""The reason under which the frames of recordings without any frame are counted, apart from gaps in others."""
 BANDS = 32
 """Horizontal bands of the image for which motion is told apart."""
 _TRUTHS = 16
@@ -83,14 +86,22 @@ class TruthFacts:
 class Survey:
     """Everything that was measured."""
 
-    problems: dict[str, str] = field(default_factory=dict)
+    problems: dict[str, SaunetError] = field(default_factory=dict)
     """Split -> why it cannot be used."""
     windows: dict[str, int] = field(default_factory=dict)
     left_out: dict[str, dict[str, int]] = field(default_factory=dict)
     """Split -> reason -> frames."""
+    absent: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Split -> recordings that it lists and that have no frame at all, and all that it lists."""
+    test_only: frozenset[str] = frozenset()
+    """Recordings that neither training nor validation read."""
     fingerprints: dict[str, str] = field(default_factory=dict)
     shared_frames: int = 0
     """Frames that training and validation windows both read."""
+    known: int = 0
+    """Frames that any split reads."""
+    judged: int = 0
+    """Of them, those that were asked for."""
     frames: list[FrameFacts] = field(default_factory=list)
     cameras: list[CameraFacts] = field(default_factory=list)
     camera_problems: list[str] = field(default_factory=list)
@@ -102,6 +113,8 @@ class Survey:
     numbering: dict[str, str] = field(default_factory=dict)
     step: int = 1
     """Offset of the neighbour that motion is measured against."""
+    cacheable: bool = False
+    """Whether the data module could read a cache of smaller images and does not."""
 
     def readable(self) -> list[FrameFacts]:
         """Return the frames that could be read."""
@@ -126,7 +139,8 @@ def survey(
         frames: Frames to read at most; 0 reads all.
         advance: Called with the number of frames read and to read.
     """
-    found = Survey(step=min((abs(offset) for offset in data.offsets), default=1))
+    cacheable = "cache" in inspect.signature(type(data)).parameters and data.copies is None
+    found = Survey(step=min((abs(offset) for offset in data.offsets), default=1), cacheable=cacheable)
     datasets = dict(_set_up(data, splits, found))
     if "train" in datasets and "val" in datasets:
         found.shared_frames = len(_read_by(datasets["train"]) & _read_by(datasets["val"]))
@@ -139,7 +153,11 @@ def survey(
             wanted.setdefault(drive.name, set()).update(frame + offset for offset in (0, *dataset.offsets))
     for name in wanted:
         found.numbering[name] = numbering(drives[name])
-    plan = _spread([(name, frame) for name, numbers in wanted.items() for frame in sorted(numbers)], frames)
+    trained = {drive.name for split in ("train", "val") if split in datasets for drive in datasets[split].drives}
+    found.test_only = frozenset(wanted.keys() - trained) if trained else frozenset()
+    everything = [(name, frame) for name, numbers in wanted.items() for frame in sorted(numbers)]
+    plan = _spread(everything, frames)
+    found.known, found.judged = len(everything), len(plan)
     _read_frames(found, drives, plan, advance)
     for name in wanted:
         _look_at_camera(found, drives[name], min(wanted[name]))
@@ -152,19 +170,22 @@ def survey(
 def _set_up(data: DepthDataModule, splits: Sequence[str], found: Survey) -> Iterator[tuple[str, WindowDataset]]:
     for split in splits:
         try:
-            data.setup({"train": "fit", "val": "validate"}.get(split, split))
+            data.setup_split(split)
         except SaunetError as error:
-            if str(error) not in found.problems.values():
-                found.problems[split] = str(error)
-        if split in data.datasets:
-            dataset = data.datasets[split]
-            found.windows[split] = len(dataset)
-            found.fingerprints[split] = dataset.fingerprint()
-            found.left_out[split] = {}
-            for usage in data.usage[split]:
-                for reason, count in usage.left_out.items():
-                    found.left_out[split][reason] = found.left_out[split].get(reason, 0) + count
-            yield split, dataset
+            found.problems[split] = error
+        if split not in data.datasets:
+            continue
+        dataset = data.datasets[split]
+        found.windows[split] = len(dataset)
+        found.fingerprints[split] = dataset.fingerprint()
+        found.left_out[split] = {}
+        absent = [not drive.indices for drive in dataset.drives]
+        found.absent[split] = (sum(absent), len(absent))
+        for usage, gone in zip(data.usage[split], absent, strict=True):
+            for reason, count in usage.left_out.items():
+                reason = ABSENT if gone and reason == "missing" else reason
+                found.left_out[split][reason] = found.left_out[split].get(reason, 0) + count
+        yield split, dataset
 
 
 def _read_by(dataset: WindowDataset) -> set[tuple[str, int]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from functools import partial
 from typing import Any, Literal
 
@@ -27,8 +27,11 @@ SHARED = (
     "target_depth",
     "with_pose",
     "stereo",
+    "on_error",
 )
 """Settings that belong to the mixture; its sources take them over."""
+AUGMENTATION = ("flip", "colour")
+"""Settings that only the mixture's own augmentation reads."""
 
 
 @datamodules.register("mixed")
@@ -114,6 +117,20 @@ class MixedDataModule(DepthDataModule):
         self.odometer = partial(_distance, with_speed) if with_speed else None
         self.ground_truth, self.protocol = _truth([self.sources[name] for name in self._names["test"]])
 
+    @property
+    def camera_height(self) -> float | None:
+        """Metres from the road to the camera, where all sources in use agree; else None."""
+        names = {*self._names["train"], *self._names["test"]}
+        heights = {getattr(self.sources[name], "camera_height", None) for name in names}
+        return heights.pop() if len(heights) == 1 else None
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """Names of the protocols of its sources to test: for their ground truth, and for those without any."""
+        tested = [self.sources[name] for name in self._names["test"]]
+        without = [source.protocol for source in tested if source.ground_truth == "none"]
+        return tuple(dict.fromkeys((self.protocol, *without)))
+
     def prepare_data(self) -> None:
         """Let every source prepare on one process."""
         for source in self.sources.values():
@@ -133,27 +150,38 @@ class MixedDataModule(DepthDataModule):
                 selections.append(selection._replace(drive=drive))
         return selections
 
+    def _check_manifests(self, names: Set[str]) -> None:
+        super()._check_manifests(names)
+        for name in self._names["train"]:
+            start = f"{name}/"
+            own = {each.removeprefix(start) for each in names if each.startswith(start)}
+            self.sources[name]._check_manifests(own)
+
     def _fitted(self, name: str, source: DepthDataModule) -> DepthDataModule:
         """Give a source the mixture's settings; refuse those it was given that contradict."""
-        plain = inspect.signature(type(source)).parameters
-        presets = [entry.preset for entry in datamodules if entry.target is type(source)]
-        for key in ("height", "width", "offsets"):
-            given, ours = getattr(source, key), getattr(self, key)
-            defaults = [plain[key].default, *(preset[key] for preset in presets if key in preset)]
-            if given not in (ours, *(tuple(each) if key == "offsets" else each for each in defaults)):
-                raise ConfigError(
-                    f"data.sources.{name}.{key} is {given} and the mixture's is {ours}; set data.{key} only, "
-                    "which holds for all sources"
-                )
         if source.maps or source.copies:
             raise ConfigError(
                 f"data.sources.{name} reads stored maps or a cache of small images, which a mixture does not; "
                 "leave dense, teacher and cache out"
             )
+        parameters = inspect.signature(type(source)).parameters
+        presets = [entry.preset for entry in datamodules if entry.target is type(source)]
+        for key in (*SHARED, *AUGMENTATION):
+            defaults = [parameters[key].default] if key in parameters else []
+            defaults += [preset[key] for preset in presets if key in preset]
+            holders = (source.augment, self.augment) if key in AUGMENTATION else (source, self)
+            given, ours = (getattr(holder, key) for holder in holders)
+            if key in parameters and given not in (ours, *(_as_kept(each) for each in defaults)):
+                has = key in inspect.signature(type(self)).parameters
+                advice = f"set data.{key} only, which holds for all sources" if has else "leave it out"
+                raise ConfigError(f"data.sources.{name}.{key} is {given} and the mixture's is {ours}; {advice}")
         for key in SHARED:
             setattr(source, key, getattr(self, key))
-        source.on_error = self.on_error
         return source
+
+
+def _as_kept(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _distance(with_speed: frozenset[str], drive: Drive, first: int, second: int) -> float:

@@ -28,7 +28,15 @@ def _dashed(position: F32, dash: float, gap: float, pixel: F32) -> F32:
 
 
 def markings(world: World, along: F32, across: F32, step_along: F32, step_across: F32) -> F32:
-    """How much of each pixel is paint: centre line, edge lines and zebra crossings, exactly box-filtered."""
+    """How much of each pixel is paint: centre line, edge lines and zebra crossings, exactly box-filtered.
+
+    Args:
+        world: The street and what is painted on it.
+        along: Way along the road of each pixel, metres.
+        across: Distance of each pixel from the road's middle, metres, to the right.
+        step_along: What a pixel covers along the road, metres.
+        step_across: What a pixel covers across the road, metres.
+    """
     step_along, step_across = np.maximum(step_along, 1e-3), np.maximum(step_across, 1e-3)
     section = world.section
     dash, gap = world.dashes

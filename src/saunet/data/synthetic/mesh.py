@@ -172,18 +172,44 @@ class Mesh:
         period: tuple[float, float],
         fit: bool = False,
     ) -> None:
-        """Add an upright rectangle between two ground points, seen from the side on which ``left`` is left."""
+        """Add an upright rectangle between two ground points, seen from the side on which ``left`` is left.
+
+        Args:
+            left: Ground point (x, z), metres.
+            right: Ground point (x, z), metres.
+            bottom: Height of the lower edge above the ground, metres.
+            top: Height of the upper edge, metres.
+            surface: What it is made of.
+            period: Width and height in metres after which the material repeats.
+            fit: Stretch the material so that whole periods fit, in place of starting it anywhere.
+        """
         ends = [(left, top), (right, top), (right, bottom), (left, bottom)]
         phase = float(self._rng.integers(0, 4)) / 4
         self.polygon([(p[0], -y, p[1]) for p, y in ends], surface, period, fit, None if fit else phase)
 
     def ellipsoid(self, centre: tuple[float, float, float], radius: float, height: float, surface: Surface) -> None:
-        """Add an ellipsoid of horizontal and vertical radius; ``centre`` is world (x, y, z), y down."""
+        """Add an ellipsoid of horizontal and vertical radius; y points down.
+
+        Args:
+            centre: World (x, y, z), metres.
+            radius: Horizontal half axis, metres.
+            height: Vertical half axis, metres.
+            surface: What it is made of.
+        """
         self._quadrics.append([*centre, radius, height, centre[1] - height, centre[1] + height])
         self._quadric_look.append(look(surface, (3.0, 3.0), float(self._rng.uniform())))
 
     def cylinder(self, x: float, z: float, radius: float, bottom: float, top: float, surface: Surface) -> None:
-        """Add an upright cylinder without caps; heights in metres up."""
+        """Add an upright cylinder without caps.
+
+        Args:
+            x: Of its axis, metres.
+            z: Of its axis, metres.
+            radius: Metres.
+            bottom: Height of the lower end above the ground, metres.
+            top: Height of the upper end, metres.
+            surface: What it is made of.
+        """
         self._quadrics.append([x, 0.0, z, radius, 0.0, -top, -bottom])
         self._quadric_look.append(look(surface, (1.5, 2.5), float(self._rng.uniform())))
 
@@ -204,6 +230,11 @@ def footprint(centre: tuple[float, float], size: tuple[float, float], heading: f
     """Return the four ground corners (x, z) of a box; wall i has corner i on its left and corner i + 1 on its right.
 
     Order of the walls: rear, right, front, left.
+
+    Args:
+        centre: Ground point (x, z) of its middle, metres.
+        size: Width and length, metres.
+        heading: Direction of its length, radians from z towards x.
     """
     right = np.array([np.cos(heading), -np.sin(heading)]) * size[0] / 2
     ahead = np.array([np.sin(heading), np.cos(heading)]) * size[1] / 2

@@ -23,7 +23,7 @@ def blank(luminance: Number = 1.0, mask: Number = 0.0) -> Canvas:
 
 
 def coloured_noise(rng: np.random.Generator, low: Number, high: Number, slope: Number) -> NDArray[np.float64]:
-    """Return periodic Gaussian noise of mean 0 and deviation 1, band-limited to ``low``..``high`` cycles a period.
+    """Return periodic noise, n x n, Gaussian of mean 0 and deviation 1, within ``low``..``high`` cycles a period.
 
     Args:
         rng: Source of randomness.
@@ -39,14 +39,24 @@ def coloured_noise(rng: np.random.Generator, low: Number, high: Number, slope: N
 
 
 def coverage(start: Number, end: Number) -> NDArray[np.float64]:
-    """Return how much of each pixel of one row an interval covers; fractions of a period, wrapping around."""
+    """Return how much of each of the n pixels of a row an interval covers; fractions of a period, wrapping around."""
     pixel = np.arange(-SIZE, 2 * SIZE, dtype=np.float64)
     covered = np.clip(np.minimum(pixel + 1, end * SIZE) - np.maximum(pixel, start * SIZE), 0, 1)
     return np.asarray(covered.reshape(3, SIZE).sum(axis=0).clip(0, 1))
 
 
 def rectangle(canvas: Canvas, x0: Number, x1: Number, y0: Number, y1: Number, luminance: Number, mask: Number) -> None:
-    """Paint an anti-aliased rectangle in place; positions are fractions of a period, y downwards."""
+    """Paint an anti-aliased rectangle in place; positions are fractions of a period, y downwards.
+
+    Args:
+        canvas: 2 x n x n: luminance and mask.
+        x0: Left edge.
+        x1: Right edge.
+        y0: Upper edge.
+        y1: Lower edge.
+        luminance: Painted into the first channel.
+        mask: Painted into the second channel.
+    """
     alpha = coverage(y0, y1)[:, None] * coverage(x0, x1)[None]
     rows, columns = np.flatnonzero(alpha.any(axis=1)), np.flatnonzero(alpha.any(axis=0))
     if rows.size == 0 or columns.size == 0:
@@ -58,7 +68,16 @@ def rectangle(canvas: Canvas, x0: Number, x1: Number, y0: Number, y1: Number, lu
 
 
 def disc(canvas: Canvas, x: Number, y: Number, radius: Number, luminance: Number, mask: Number) -> None:
-    """Paint an anti-aliased disc in place; fractions of a period."""
+    """Paint an anti-aliased disc in place; fractions of a period.
+
+    Args:
+        canvas: 2 x n x n: luminance and mask.
+        x: Of the centre, rightwards.
+        y: Of the centre, downwards.
+        radius: Of the disc.
+        luminance: Painted into the first channel.
+        mask: Painted into the second channel.
+    """
     centre = (np.arange(SIZE) + 0.5) / SIZE
     distance = np.hypot(centre[None] - x, centre[:, None] - y)
     alpha = np.clip((radius - distance) * SIZE + 0.5, 0, 1)

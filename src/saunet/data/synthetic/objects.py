@@ -142,7 +142,15 @@ def _wheel(mesh: Mesh, x: float, z: float, radius: float, side: float, surface: 
 
 
 def tree(mesh: Mesh, rng: np.random.Generator, x: float, z: float, height: float) -> None:
-    """Add a tree: a trunk and a crown of a few ellipsoids."""
+    """Add a tree: a trunk and a crown of a few ellipsoids.
+
+    Args:
+        mesh: Takes the shapes.
+        rng: Decides what varies.
+        x: Of its foot on the ground, metres.
+        z: Of its foot on the ground, metres.
+        height: To the top of the crown, metres.
+    """
     bark = Surface("bands", _vary(rng, (0.30, 0.23, 0.17), 0.2), (0.42, 0.36, 0.28))
     green = _vary(rng, (0.22, 0.36, 0.12), 0.25)
     if rng.uniform() < 0.15:
@@ -158,14 +166,28 @@ def tree(mesh: Mesh, rng: np.random.Generator, x: float, z: float, height: float
 
 
 def bush(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
-    """Add a low shrub."""
+    """Add a low shrub.
+
+    Args:
+        mesh: Takes the shapes.
+        rng: Decides what varies.
+        x: Of its foot on the ground, metres.
+        z: Of its foot on the ground, metres.
+    """
     leaves = Surface("foliage", _vary(rng, (0.22, 0.36, 0.14), 0.25), _vary(rng, (0.42, 0.46, 0.2), 0.2), grain=0.2)
     radius = float(rng.uniform(0.5, 1.2))
     mesh.ellipsoid((x, -0.5 * radius, z), radius, radius * float(rng.uniform(0.7, 1.1)), leaves)
 
 
 def lamp(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
-    """Add a lamp post, sometimes with a sign board."""
+    """Add a lamp post, sometimes with a sign board.
+
+    Args:
+        mesh: Takes the shapes.
+        rng: Decides what varies.
+        x: Of its foot on the ground, metres.
+        z: Of its foot on the ground, metres.
+    """
     grey = float(rng.uniform(0.25, 0.6))
     metal = Surface("bands", (grey, grey, grey * 1.03), (grey * 0.7, grey * 0.65, grey * 0.6))
     height = float(rng.uniform(4.5, 8.0))
@@ -178,7 +200,15 @@ def lamp(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
 
 
 def barrier(mesh: Mesh, rng: np.random.Generator, start: np.ndarray, end: np.ndarray, kind: str) -> None:
-    """Add a hedge, a wooden fence or a garden wall between two ground points (x, z)."""
+    """Add a hedge, a wooden fence or a garden wall between two ground points (x, z).
+
+    Args:
+        mesh: Takes the shapes.
+        rng: Decides what varies.
+        start: Ground point, two numbers, metres.
+        end: Ground point, two numbers, metres.
+        kind: ``hedge``, ``fence`` or ``wall``.
+    """
     surface, period, height, thickness = {
         "hedge": (
             Surface("foliage", _vary(rng, (0.18, 0.30, 0.11), 0.2), (0.34, 0.42, 0.18), 0.2),
@@ -203,7 +233,15 @@ def barrier(mesh: Mesh, rng: np.random.Generator, start: np.ndarray, end: np.nda
 
 
 def billboard(mesh: Mesh, rng: np.random.Generator, x: float, z: float, heading: float) -> None:
-    """Add a poster on two legs, facing the traffic."""
+    """Add a poster on two legs, facing the traffic.
+
+    Args:
+        mesh: Takes the shapes.
+        rng: Decides what varies.
+        x: Of its foot on the ground, metres.
+        z: Of its foot on the ground, metres.
+        heading: Direction that it faces along, radians from z towards x.
+    """
     legs = Surface("bands", (0.4, 0.4, 0.42), (0.3, 0.28, 0.26))
     for side in (-1.3, 1.3):
         mesh.cylinder(x + side * float(np.cos(heading)), z - side * float(np.sin(heading)), 0.08, 0.0, 1.6, legs)

@@ -57,7 +57,14 @@ def records(T_world_imu: Sequence[F64], seconds: float) -> F64:
 
 
 def write(folder: Path, indices: Sequence[int], T_world_imu: Sequence[F64], seconds: float) -> None:
-    """Write dataformat.txt and one file a frame under ``folder/data``."""
+    """Write dataformat.txt and one file a frame under ``folder/data``.
+
+    Args:
+        folder: The folder ``oxts`` of a drive, with ``data`` in it.
+        indices: Number of each frame.
+        T_world_imu: Pose of each frame, 4 x 4, metres.
+        seconds: Between two frames.
+    """
     (folder / "dataformat.txt").write_text("\n".join(DATAFORMAT) + "\n")
     for index, row in zip(indices, records(T_world_imu, seconds), strict=True):
         words = [f"{value:.13g}" for value in row[:25]] + [str(int(value)) for value in row[25:]]

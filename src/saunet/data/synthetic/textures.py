@@ -27,7 +27,7 @@ _ROW = 512  # the flat list of samples is looked up in rows of this length
 
 @functools.cache
 def atlas() -> NDArray[np.uint8]:
-    """Return the ripmaps of all materials, one square a material, stacked; channels luminance and mask."""
+    """Return the ripmaps of all materials, h x w x 2, their squares below each other; channels luminance and mask."""
     stacked = np.zeros((len(MATERIALS), _SIDE, _SIDE, 2), np.float32)
     for number, (name, make) in enumerate(MAKERS.items()):
         picture = np.moveaxis(make(np.random.default_rng([7, *name.encode()])), 0, -1)

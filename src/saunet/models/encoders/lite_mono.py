@@ -96,7 +96,7 @@ class LiteMonoEncoder(nn.Module):
                     nn.init.zeros_(module.bias)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
-        """Return the three feature maps, finest first.
+        """Return the three feature maps, b c h/s w/s, finest first.
 
         Args:
             image: RGB in [0, 1]; h and w multiples of 16.

@@ -54,7 +54,7 @@ class PackNetEncoder(nn.Module):
         initialise(self)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
-        """Return the six feature maps, finest first.
+        """Return the six feature maps, b c h/s w/s, finest first.
 
         Args:
             image: RGB in [0, 1], which PackNet takes as it is; h and w multiples of 32.

@@ -144,7 +144,7 @@ class ResNet(nn.Module):
             load_pretrained(self, weights)
 
     def forward(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, ...]:
-        """Return the five feature maps, finest first.
+        """Return the five feature maps, b c h/s w/s, finest first.
 
         Args:
             image: RGB in [0, 1], 3 channels a frame; h and w multiples of 32.

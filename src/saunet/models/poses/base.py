@@ -63,7 +63,7 @@ def motions_to_sources(motion: Float[Tensor, "s b 6"], offsets: Sequence[int]) -
 
 
 def check_sources(sources: Tensor, offsets: Sequence[int]) -> None:
-    """Check that there is one source image per offset.
+    """Check that there is one source image, of b s 3 h w, per offset.
 
     Raises:
         ConfigError: if there is not.

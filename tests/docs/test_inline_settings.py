@@ -1,0 +1,106 @@
+"""Settings that stand in the running text, such as ``trainer=ddp``, are settings of a tool that the page names."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import itertools
+import shlex
+from typing import Any
+
+import pytest
+from hydra import compose
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
+
+from saunet.config import config_dir
+from saunet.registry import REGISTRIES
+
+from .pages import inline, tools
+
+pytestmark = pytest.mark.usefixtures("hydra")
+
+CONFIGURED = [path.stem for path in sorted(config_dir().glob("*.yaml"))]
+WITH_DATA = ("train", "evaluate", "doctor")
+PYTHON = {"align_corners=True", "weights_only=True", "features=", "channels="}
+FORMS = {"key=value", "camera=[fx,fy,cx,cy]", "saunet-predict ... outputs=[ply] camera=[fx,fy,cx,cy]"}
+MISTAKES = {"optim.lr=much", "model.encoder.dephts=..."}  # which the page shows as such
+OWN_COMPONENTS = ("model/encoder=plain", "+objective.extra.near_prior")  # registered by the page itself
+SETTINGS = [
+    (page, code)
+    for page, code in inline()
+    if code not in PYTHON | FORMS | MISTAKES and not code.startswith(OWN_COMPONENTS)
+]
+
+
+def _alternatives(code: str) -> list[list[str]]:
+    """Return the overrides of a code, once for each of its alternatives: ``format=jpg|webp`` is two."""
+    words = [word for word in shlex.split(code) if "=" in word and not word.startswith("hydra")]  # plugins' own
+    choices = [[f"{word.partition('=')[0]}={one}" for one in word.partition("=")[2].split("|")] for word in words]
+    return [list(each) for each in itertools.product(*choices)]
+
+
+@functools.cache
+def _composed(tool: str, *choices: str) -> DictConfig:
+    return compose(tool, overrides=list(choices), return_hydra_config=True)
+
+
+def _accepts(tool: str, overrides: list[str], data: str | None) -> bool:
+    """Tell whether a tool composes with settings; of a key without a value, whether it has the key.
+
+    Composing takes its time, so that only the choices of a group are composed, each once; values are set afterwards.
+    """
+    below = "data." if data else ""  # tables name the keys below data. without it
+    parsed = OverridesParser.create().parse_overrides(
+        [each if each.startswith((below, "data=", "+")) else f"{below}{each}" for each in overrides]
+    )
+    try:
+        groups = _composed(tool).hydra.runtime.choices
+        chosen = [each for each in parsed if each.key_or_group in groups and not _is_open(each)]
+        choices = [f"{each.key_or_group}={_first(each)}" for each in chosen]
+        if data:
+            choices.append(f"data={data}")
+        cfg = copy.deepcopy(_composed(tool, *choices))
+        for each in parsed:
+            if each.key_or_group in groups:
+                continue
+            if _is_open(each):
+                _check_key(cfg, each)
+            else:
+                OmegaConf.update(cfg, each.key_or_group, _first(each), force_add=each.is_add())
+    except (HydraException, OmegaConfBaseException):
+        return False
+    return True
+
+
+def _is_open(override: Override) -> bool:
+    value = str(override.value())
+    return value in ("", "...") or (value.isupper() and value.isalpha())
+
+
+def _check_key(cfg: DictConfig, override: Override) -> None:
+    parent, _, name = override.key_or_group.rpartition(".")
+    if override.is_add():
+        parent, name = "", override.key_or_group.partition(".")[0]
+    node = OmegaConf.select(cfg, parent) if parent else cfg
+    if not OmegaConf.is_dict(node) or name not in node:
+        raise ConfigKeyError(f"no key {override.key_or_group}")
+
+
+def _first(override: Override) -> Any:
+    return next(iter(override.sweep_iterator())) if override.is_sweep_override() else override.value()
+
+
+@pytest.mark.parametrize(("page", "code"), SETTINGS, ids=lambda value: str(value)[:60])
+def test_every_setting_in_the_text_is_one_of_a_tool_that_the_page_names(page: str, code: str) -> None:
+    command = code.partition(" ")[0].removeprefix("saunet-")
+    named = [command] if command in CONFIGURED else [*(tool for tool in tools(page) if tool in CONFIGURED), "train"]
+    for overrides in _alternatives(code):
+        alone = ((tool, None) for tool in named)
+        with_data = ((tool, data) for tool in named if tool in WITH_DATA for data in REGISTRIES["data"].names())
+        assert any(_accepts(tool, overrides, data) for tool, data in itertools.chain(alone, with_data)), (
+            f"{page}: no tool takes {' '.join(overrides)}"
+        )
