@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -139,7 +138,7 @@ def survey(
         frames: Frames to read at most; 0 reads all.
         advance: Called with the number of frames read and to read.
     """
-    cacheable = "cache" in inspect.signature(type(data)).parameters and data.copies is None
+    cacheable = data.cacheable and data.copies is None
     found = Survey(step=min((abs(offset) for offset in data.offsets), default=1), cacheable=cacheable)
     datasets = dict(_set_up(data, splits, found))
     if "train" in datasets and "val" in datasets:
