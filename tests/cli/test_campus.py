@@ -106,6 +106,7 @@ def test_the_doctor_ends_with_an_error_where_training_would(tool: Tool, tmp_path
     outcome = tool("doctor", *arguments)
     assert outcome.code == 1
     assert "error: the train, val and test splits cannot be used: no camera.yaml" in outcome.out
+    assert "data.manifest" not in outcome.out  # nothing was judged
     assert (tmp_path / "doctor" / "doctor.png").is_file()
     _camera(tmp_path / "clips")
     outcome = tool("doctor", *arguments, "data.val_share=0.3")

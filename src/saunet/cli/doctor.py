@@ -42,10 +42,10 @@ def doctor(cfg: DictConfig) -> None:
         print(finding)
     left_out = sum(len(numbers) for reasons in manifest.leave_out.values() for numbers in reasons.values())
     print(f"pictures: {folder / 'doctor.png'}")
-    judged = "all" if found.judged == found.known else f"{found.judged} of {found.known}"
-    more = "" if found.judged == found.known else "; frames=0 judges all"
-    print(f"manifest: {manifest.path} names {left_out} frames to leave out (judged: {judged}{more})")
-    print(f"train with data.manifest={manifest.path}")
+    judged = "all" if found.judged == found.known else f"{found.judged} of {found.known}; frames=0 judges all"
+    if found.judged:
+        print(f"manifest: {manifest.path} names {left_out} frames to leave out (judged: {judged})")
+        print(f"train with data.manifest={manifest.path}")
     if any(finding.level == "error" for finding in findings):
         raise SystemExit(1)
 

@@ -50,7 +50,9 @@ class KittiDrive:
     """
 
     camera_height = CAMERA_HEIGHT
+    """Metres from the road to the camera."""
     fps = 1 / FRAME_SECONDS
+    """Frames a second."""
 
     def __init__(
         self,

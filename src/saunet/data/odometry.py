@@ -37,6 +37,7 @@ class OdometrySequence:
     """
 
     camera_height = CAMERA_HEIGHT
+    """Metres from the road to the camera."""
 
     def __init__(self, root: Path, sequence: str, camera: str = "colour_left") -> None:
         number, side = CAMERAS[one_of("camera", camera, CAMERAS)]
