@@ -160,6 +160,12 @@ def test_folder_into_files_and_a_page(tool: Callable[..., Any], checkpoint: Path
     outcome = tool("predict", *arguments)
     assert outcome.code == 0, outcome.err
     assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == [".html", ".json", ".npy"]
+    assert f"1 frames: {Path('out') / tmp_path.name}_points.html" in outcome.out
+    again = tool("predict", *arguments)
+    assert again.code == 0, again.err
+    assert "0 files written, 1 images were finished before: out" in again.out
+    assert f"finished before: {Path('out') / tmp_path.name}_points.html" in again.out
+    tool("predict", *arguments, "fps=3").says("_points.html exists", "set overwrite=true")
     assert "outputs is 'color'; did you mean 'colour'" in tool("predict", *arguments[:3], "outputs=[color]").err
 
 

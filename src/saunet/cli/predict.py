@@ -17,7 +17,7 @@ def predict(cfg: DictConfig) -> None:
     from saunet.cli._rectify import rectify
     from saunet.cli._scale import scale_predictor
     from saunet.infer.files import OUTPUTS
-    from saunet.infer.load import load
+    from saunet.infer.load import load, locate
     from saunet.infer.video import CLIP_OUTPUTS
     from saunet.videos import VIDEO_SUFFIXES
 
@@ -39,11 +39,17 @@ def predict(cfg: DictConfig) -> None:
         "max_frames": cfg.max_frames,
         "overwrite": cfg.overwrite,
     }
-    clip_outputs = [output for output in outputs if is_clip or output in CLIP_OUTPUTS]
-    if not clip_outputs or len(clip_outputs) < len(outputs):
-        _predict_images(cfg, predictor, [output for output in outputs if output not in clip_outputs], shared)
-    if clip_outputs:
-        _predict_clip(cfg, predictor, source, clip_outputs, shared)
+    if not is_clip and not set(outputs) & set(CLIP_OUTPUTS):
+        _predict_images(cfg, predictor, outputs, shared)
+        return
+    shown = {key: cfg[key] for key in ("fps", "layout", "memory", "codec")}
+    odometer = None
+    if "trajectory" in outputs:
+        from saunet.infer.odometer import Odometer
+
+        odometer = Odometer.from_model(locate(cfg.checkpoint), predictor.scale, pick_device(cfg.device), cfg.batch_size)
+    each = _predict_clip if is_clip else _predict_recording
+    each(cfg, predictor, source, outputs, {**shared, **shown, "odometer": odometer})
 
 
 def _predict_images(cfg: DictConfig, predictor: Any, outputs: list[str], shared: dict[str, Any]) -> None:
@@ -57,17 +63,20 @@ def _predict_images(cfg: DictConfig, predictor: Any, outputs: list[str], shared:
         raise SystemExit(1)
 
 
-def _predict_clip(cfg: DictConfig, predictor: Any, source: Any, outputs: list[str], shared: dict[str, Any]) -> None:
-    from saunet.infer.load import locate
+def _predict_recording(cfg: DictConfig, predictor: Any, source: Any, outputs: list[str], how: dict[str, Any]) -> None:
+    from saunet.infer.recording import predict_recording
+
+    done = predict_recording(predictor, source, cfg.output, outputs, **how)
+    print(f"{len(done.images.written)} files written, {done.images.skipped} images were finished before: {cfg.output}")
+    for paths, what in ((done.paths, f"{done.frames} frames"), (done.skipped, "finished before")):
+        if paths:
+            print(f"{what}: {', '.join(map(str, paths))}")
+
+
+def _predict_clip(cfg: DictConfig, predictor: Any, source: Any, outputs: list[str], how: dict[str, Any]) -> None:
     from saunet.infer.video import predict_clip
 
-    odometer = None
-    if "trajectory" in outputs:
-        from saunet.infer.odometer import Odometer
-
-        odometer = Odometer.from_model(locate(cfg.checkpoint), predictor.scale, pick_device(cfg.device), cfg.batch_size)
-    shown = {key: cfg[key] for key in ("fps", "layout", "memory", "codec")}
-    clip = predict_clip(predictor, source, cfg.output, outputs, odometer=odometer, **shown, **shared)
+    clip = predict_clip(predictor, source, cfg.output, outputs, **how)
     print(f"{clip.frames} frames: {', '.join(map(str, clip.paths))}")
     if clip.missing:
         message = f"{source} ends {clip.missing} frames earlier than it declares: it may be truncated"

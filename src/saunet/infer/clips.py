@@ -20,6 +20,9 @@ from saunet.videos import VideoReader
 CODECS: tuple[str, ...] = ("mp4v", "vp09")
 """``mp4v`` (MPEG-4) is quick and plays in players such as VLC; ``vp09`` (VP9) plays in browsers, and is slower."""
 
+IMAGE_FPS = 10.0
+"""Frames a second of images, KITTI's rate; files do not say."""
+
 
 class VideoWriter:
     """Writes RGB frames to an mp4 file that gets its name only when it is complete and plays back every frame.
@@ -106,7 +109,7 @@ class ImageClip:
         output_dir: Where results go, if anywhere; what lies there already is no part of the clip.
 
     Attributes:
-        fps: 10, KITTI's frame rate; files do not say.
+        fps: `IMAGE_FPS`.
         declared: Number of images.
 
     Raises:
@@ -116,7 +119,7 @@ class ImageClip:
 
     def __init__(self, source: str | Path, output_dir: str | Path | None = None) -> None:
         self._paths = image_paths(source) if output_dir is None else [s.path for s in find_sources(source, output_dir)]
-        self.name, self.fps, self.declared = str(source), 10.0, len(self._paths)
+        self.name, self.fps, self.declared = str(source), IMAGE_FPS, len(self._paths)
 
     def __iter__(self) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:
         return map(read_image, self._paths)

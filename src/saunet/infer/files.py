@@ -80,6 +80,7 @@ def predict_files(
     max_frames: int | None = None,
     overwrite: bool = False,
     progress: bool = True,
+    each: Callable[[Prediction], None] | None = None,
 ) -> Summary:
     """Predict images into a folder; finished files are skipped, so an interrupted run goes on where it stopped.
 
@@ -98,6 +99,8 @@ def predict_files(
         max_frames: Take the first so many images; all by default.
         overwrite: Predict again what is already there, and allow a folder that another model wrote.
         progress: Show a progress bar on a terminal.
+        each: Called with every image's prediction, in order, after its files; then all images are predicted, and
+            ``outputs`` may be empty, with which an image that cannot be read ends the run.
 
     Returns:
         What was written and skipped, and which images could not be read.
@@ -113,7 +116,7 @@ def predict_files(
     positive("batch_size", batch_size)
     if max_frames is not None:
         positive("max_frames", max_frames)
-    if not outputs:
+    if not outputs and each is None:
         raise ConfigError(f"outputs is empty; allowed: {', '.join(OUTPUTS)}")
     if "ply" in outputs and camera is None:
         raise ConfigError("outputs has 'ply', which needs the camera's true intrinsics; give camera fx, fy, cx, cy")
@@ -121,16 +124,12 @@ def predict_files(
     sources = find_sources(inputs, folder)[:max_frames]
     _check_folder(folder, sources)
     if camera is not None and not isinstance(camera, Camera):
-        camera = Camera.from_numbers(camera, *_first_size(sources))
+        camera = Camera.from_numbers(camera, *first_size(sources))
     style = Style(palette, limits, camera, max_depth)
-    settings = {
-        "model": predictor.fingerprint,
-        "unit": predictor.unit,
-        "straightened": predictor.straightened_by,
-        **style.plain(),
-    }
-    claimed = _claimed(folder, settings, overwrite)
-    todo = [source for source in sources if overwrite or _missing(source, folder, outputs)]
+    settings = settings_of(predictor, style)
+    claimed = check_claim(folder, settings, overwrite)
+    unfinished = [source for source in sources if overwrite or _missing(source, folder, outputs)]
+    todo = unfinished if each is None else sources
     written: list[Path] = []
     failures: list[str] = []
     with bar(progress) as shown:
@@ -142,6 +141,8 @@ def predict_files(
                     images.append(read_image(source.path))
                     readable.append(source)
                 except DataError as error:
+                    if not outputs:
+                        raise
                     failures.append(str(error))
             for source, result in zip(readable, predictor.predict_batch(images), strict=True):
                 for output in outputs if overwrite else _missing(source, folder, outputs):
@@ -149,11 +150,13 @@ def predict_files(
                     if not claimed:
                         write_json(folder / MANIFEST, settings)
                         claimed = True
+                if each is not None:
+                    each(result)
             shown.advance(task, len(readable))
     if failures and len(failures) == len(sources):
         more = f" (and {len(failures) - 1} more images cannot be read)" if len(failures) > 1 else ""
         raise DataError(failures[0] + more)
-    return Summary(tuple(written), len(sources) - len(todo), tuple(failures))
+    return Summary(tuple(written), len(sources) - len(unfinished), tuple(failures))
 
 
 def write_output(output: str, stem: Path, result: Prediction, style: Style) -> Path:
@@ -180,7 +183,17 @@ def _check_folder(folder: Path, sources: Sequence[Source]) -> None:
             )
 
 
-def _first_size(sources: Sequence[Source]) -> tuple[int, int]:
+def settings_of(predictor: ImagePredictor, style: Style) -> dict[str, object]:
+    """Return what `MANIFEST` holds: the model and the settings that a folder's files come from."""
+    return {
+        "model": predictor.fingerprint,
+        "unit": predictor.unit,
+        "straightened": predictor.straightened_by,
+        **style.plain(),
+    }
+
+
+def first_size(sources: Sequence[Source]) -> tuple[int, int]:
     """Return (height, width) of the first image that can be read."""
     problem: DataError | None = None
     for source in sources:
@@ -192,8 +205,13 @@ def _first_size(sources: Sequence[Source]) -> tuple[int, int]:
     raise problem
 
 
-def _claimed(folder: Path, settings: Mapping[str, object], overwrite: bool) -> bool:
-    """Tell whether it is written down that these settings make the folder's files; refuse to mix others' results."""
+def check_claim(folder: Path, settings: Mapping[str, object], overwrite: bool) -> bool:
+    """Tell whether it is written down that these settings make the folder's files; refuse to mix others' results.
+
+    Raises:
+        ConfigError: if other settings made them.
+        DataError: if what is written down cannot be read.
+    """
     path = folder / MANIFEST
     if overwrite or not path.exists():
         return False

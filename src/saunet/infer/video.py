@@ -151,6 +151,39 @@ def predict_clip(
             are already there.
         DataError: if the source cannot be read or the system refuses to write.
     """
+    check_outputs(outputs, palette, batch_size, max_frames, camera, odometer)
+    title = name or title_of(source)
+    limits = RunningRange(memory)
+    clip = open_clip(source, output_dir)
+    with contextlib.closing(clip):
+        rate = fps if fps is not None else clip.fps
+        folder = Path(output_dir)
+        sinks = clip_sinks(
+            folder, title, outputs, rate, layout=layout, palette=palette, codec=codec, camera=camera,
+            max_depth=max_depth, odometer=odometer,
+        )  # fmt: skip
+        frame_outputs = [output for output in dict.fromkeys(outputs) if output in OUTPUTS]
+        if frame_outputs:
+            sinks.append(FrameSink(folder / title, frame_outputs, Style(palette, max_depth=max_depth), camera))
+        refuse_existing(sinks, overwrite)
+        finish = isinstance(source, int)
+        frames = _run(predictor, clip, sinks, limits, batch_size, max_frames, progress, finish=finish)
+    return ClipSummary(tuple(path for sink in sinks for path in sink.paths), frames, _missing(clip, frames, max_frames))
+
+
+def check_outputs(
+    outputs: Sequence[str],
+    palette: str,
+    batch_size: int,
+    max_frames: int | None,
+    camera: Camera | Sequence[float | int] | None,
+    odometer: Odometer | None,
+) -> None:
+    """Check what can be checked before anything is read; see `predict_clip` for the arguments.
+
+    Raises:
+        ConfigError: for a word or number that is not allowed, or an output that lacks what it needs.
+    """
     for output in outputs:
         one_of("outputs", output, (*OUTPUTS, *CLIP_OUTPUTS))
     if not outputs:
@@ -167,29 +200,41 @@ def predict_clip(
             )
     if "trajectory" in outputs and odometer is None:
         raise ConfigError("outputs has 'trajectory', which needs a model with a pose network")
-    title = name or _name(source)
-    limits = RunningRange(memory)
-    clip = open_clip(source, output_dir)
-    with contextlib.closing(clip):
-        rate = fps if fps is not None else clip.fps
-        folder, sinks = Path(output_dir), list[Sink]()
-        paths = {output: folder / f"{title}{_NAMES[output]}" for output in CLIP_OUTPUTS}
-        frame_outputs = [output for output in dict.fromkeys(outputs) if output in OUTPUTS]
-        if "mp4" in outputs:
-            sinks.append(VideoSink(paths["mp4"], rate, layout, palette, codec=codec))
-        if frame_outputs:
-            sinks.append(FrameSink(folder / title, frame_outputs, Style(palette, max_depth=max_depth), camera))
-        if "html" in outputs and camera is not None:
-            sinks.append(ViewerSink(paths["html"], camera, rate, max_depth, title))
-        if "trajectory" in outputs and odometer is not None:
-            sinks.append(TrajectorySink(paths["trajectory"], odometer))
-        written = tuple(path for sink in sinks for path in sink.paths)
-        for path in written:
-            if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
-                raise ConfigError(f"{path} exists; choose another output folder, or set overwrite=true")
-        finish = isinstance(source, int)
-        frames = _run(predictor, clip, sinks, limits, batch_size, max_frames, progress, finish=finish)
-    return ClipSummary(written, frames, _missing(clip, frames, max_frames))
+
+
+def clip_sinks(
+    folder: Path,
+    title: str,
+    outputs: Sequence[str],
+    fps: float | int,
+    *,
+    layout: str,
+    palette: str,
+    codec: str,
+    camera: Camera | Sequence[float | int] | None,
+    max_depth: float | int | None,
+    odometer: Odometer | None,
+) -> list[Sink]:
+    """Return what those of ``outputs`` go into that are made of a clip as a whole; see `predict_clip`."""
+    sinks, paths = list[Sink](), {output: folder / f"{title}{_NAMES[output]}" for output in CLIP_OUTPUTS}
+    if "mp4" in outputs:
+        sinks.append(VideoSink(paths["mp4"], fps, layout, palette, codec=codec))
+    if "html" in outputs and camera is not None:
+        sinks.append(ViewerSink(paths["html"], camera, fps, max_depth, title))
+    if "trajectory" in outputs and odometer is not None:
+        sinks.append(TrajectorySink(paths["trajectory"], odometer))
+    return sinks
+
+
+def refuse_existing(sinks: Sequence[Sink], overwrite: bool) -> None:
+    """Check that no sink would replace a file, or fill a folder that holds some, unless it is told to.
+
+    Raises:
+        ConfigError: if one would.
+    """
+    for path in (path for sink in sinks for path in sink.paths):
+        if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+            raise ConfigError(f"{path} exists; choose another output folder, or set overwrite=true")
 
 
 def _run(
@@ -233,7 +278,7 @@ def _missing(clip: Clip, frames: int, max_frames: int | None) -> int:
     return max(0, declared - frames)
 
 
-def _name(source: Source) -> str:
+def title_of(source: Source) -> str:
     """Return what to call a source's results."""
     if isinstance(source, int):
         return f"camera{source}"
