@@ -63,22 +63,24 @@ def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Generator[None, 
 
 @contextlib.contextmanager
 def logging_as_it_was() -> Iterator[None]:
-    """Restore logging afterwards: Hydra leaves a handler that writes into its folder."""
-    handlers, level = logging.root.handlers[:], logging.root.level
-    disabled = {name: logger.disabled for name, logger in _loggers()}
+    """Restore logging afterwards: tools leave handlers that write into a run's folder or into a stream that closes."""
+    before = {logger: (logger.handlers[:], logger.level, logger.propagate, logger.disabled) for logger in _loggers()}
     try:
         yield
     finally:
-        for handler in set(logging.root.handlers) - set(handlers):
-            handler.close()
-        logging.root.handlers[:] = handlers
-        logging.root.setLevel(level)
-        for name, logger in _loggers():
-            logger.disabled = disabled.get(name, False)
+        for logger in _loggers():
+            # One that an import has just made keeps its level, and speaks through its parents.
+            handlers, level, propagate, disabled = before.get(logger, ([], logger.level, True, False))
+            for handler in set(logger.handlers) - set(handlers):
+                logger.removeHandler(handler)
+                handler.close()
+            logger.handlers[:], logger.propagate, logger.disabled = handlers, propagate, disabled
+            logger.setLevel(level)
 
 
-def _loggers() -> list[tuple[str, logging.Logger]]:
-    return [(name, each) for name, each in logging.root.manager.loggerDict.items() if isinstance(each, logging.Logger)]
+def _loggers() -> list[logging.Logger]:
+    known = logging.root.manager.loggerDict.values()
+    return [logging.root, *(each for each in known if isinstance(each, logging.Logger))]
 
 
 @pytest.fixture

@@ -100,6 +100,26 @@ def test_a_job_that_vanished_is_marked_failed_in_the_summary(tmp_path: Path) -> 
     assert "killed" in record(tmp_path / "10")["error"]
 
 
+def test_a_sweep_does_not_write_its_jobs_over_each_other(tool: Tool, tmp_path: Path) -> None:
+    jobs = ("train", "--multirun", *QUICK, "trainer.limit_train_batches=1", "seed=1,2")
+    outcome = tool(*jobs, "output_dir=runs/all", "hydra.sweep.dir=sweep")
+    assert outcome.code == 1
+    last = outcome.err.strip().splitlines()[-1]
+    assert last.startswith("saunet-train: output_dir is 'runs/all'")
+    assert "set hydra.sweep.dir=runs/all, below which each job gets its own" in last
+    assert "sweep:" not in outcome.out
+    assert not (tmp_path / "runs").exists()
+    outcome = tool(*jobs, "output_dir=${hydra:runtime.output_dir}/run", "hydra.sweep.dir=sweep")
+    assert outcome.code == 0, outcome.err
+    assert "sweep: 2 of 2 jobs finished" in outcome.out
+
+
+def test_a_sweep_without_a_job_has_not_finished(tmp_path: Path) -> None:
+    text, finished = summary(tmp_path)
+    assert not finished
+    assert text.startswith("sweep: 0 of 0 jobs finished")
+
+
 def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
     last = smoke_run / "checkpoints" / "last.ckpt"
     again = ("experiment=smoke", "logger=none", "callbacks.pictures=null", "trainer.limit_train_batches=1")

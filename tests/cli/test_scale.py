@@ -6,20 +6,25 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 
+import saunet
 from saunet.checkpoint import read_checkpoint, store_scale
 from saunet.checks import CheckpointError, ConfigError
-from saunet.cli._scale import scale_predictor
+from saunet.cli._scale import apply_scale, scale_predictor
+from saunet.data.camera_file import CameraFile, write_camera
 from saunet.data.synthetic import SyntheticDrive
+from saunet.geometry.pose import pose_matrix
 from saunet.infer.pipeline import ImagePredictor
 from saunet.record import Scale
-from saunet.roots import PredictConfig
+from saunet.roots import EvaluateConfig, PredictConfig
 
 Tool = Callable[..., Any]
 UNKNOWN = 0.037
@@ -105,6 +110,7 @@ def test_predict_finds_the_unknown_factor(
         ({"method": "stored"}, r"the checkpoint stores no scale; measure one"),
         ({"method": "auto", "store": True}, r"scale.store=true stores what is measured and scale.method is 'auto'"),
         ({"method": "none", "frames": 0}, r"scale.frames is 0"),
+        ({"method": "speed", "fps": 0.0}, r"scale.fps is 0.0"),
     ],
 )
 def test_what_is_missing_is_one_sentence(
@@ -183,6 +189,58 @@ def test_evaluate_with_a_table_of_speeds_and_with_stereo(tool: Tool, checkpoint:
     outcome = tool("evaluate", *common, "scale.method=stereo", "scale.frames=3")
     assert outcome.code == 0, outcome.err
     assert "from stereo baseline: median of" in outcome.out
+
+
+class StraightOn(torch.nn.Module):
+    """Predicts one unit of way to every source."""
+
+    def forward(self, target: torch.Tensor, sources: torch.Tensor) -> torch.Tensor:
+        ways = torch.tensor([0.0, 0.0, 1.0]).expand(*sources.shape[:2], 3)
+        return pose_matrix(torch.zeros_like(ways), ways)
+
+
+class Flat(torch.nn.Module):
+    """A depth network that nobody asks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(1))
+
+
+@pytest.mark.parametrize(("given", "rate"), [(None, 30), (60.0, 60)], ids=["as recorded", "as set"])
+def test_speeds_of_a_clip_of_which_every_third_frame_is_used(given: float | None, rate: int, tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (30, 200, 3), dtype=np.uint8)
+    world = cv2.resize(noise, (800, 120), interpolation=cv2.INTER_CUBIC)
+    clip = tmp_path / "campus" / "a clip"
+    clip.mkdir(parents=True)
+    for number in range(45):
+        cv2.imwrite(str(clip / f"{number:02}.png"), world[:, 4 * number : 4 * number + 240])
+    K = np.array([[200.0, 0, 120], [0, 200, 60], [0, 0, 1]])
+    write_camera(tmp_path / "campus" / "camera.yaml", CameraFile(tmp_path, K, (120, 240), fps=30.0))
+    data = saunet.build(
+        "data", "campus", root=str(tmp_path / "campus"), fps=10.0, height=32, width=64, workers=0, val_share=0.4
+    )
+    data.setup("test")
+    (tmp_path / "speeds.csv").write_text("frame,speed\n0,0\n44,44\n")  # a metre a second more with each frame
+    cfg = OmegaConf.structured(EvaluateConfig)
+    cfg.output_dir = str(tmp_path / "out")
+    cfg.scale = OmegaConf.merge(cfg.scale, {"method": "speed", "speeds": str(tmp_path / "speeds.csv"), "fps": given})
+    record = SimpleNamespace(scale=None, offsets=(-1, 1))
+    apply_scale(cfg, record, Flat(), StraightOn(), data)
+    found = json.loads((tmp_path / "out" / "scale.json").read_text())["per_frame"]
+    (drive,) = data.datasets["test"].drives
+    assert len(found) >= 3
+    for name, factor in found.items():
+        before, after = (int(drive.path(int(name.split()[-1]) + step).stem) for step in (-1, 1))
+        assert after - before == 6
+        assert factor == pytest.approx((after**2 - before**2) / 2 / rate / 2)  # the way to both, over two units
+
+
+def test_speeds_of_other_drives_are_one_sentence(tool: Tool, checkpoint: Path, tmp_path: Path) -> None:
+    (tmp_path / "speeds.csv").write_text("drive,frame,speed\nelsewhere,0,8\nelsewhere,5,8\n")
+    common = (f"checkpoint={checkpoint}", "data=synthetic_tiny", "baselines=false", "output_dir=results")
+    outcome = tool("evaluate", *common, "scale.method=speed", "scale.speeds=speeds.csv")
+    outcome.says("speeds of the drives elsewhere, which are not asked for; call them synthetic/020000")
 
 
 @pytest.mark.parametrize("offsets", ["[]", "[-1,1]"])

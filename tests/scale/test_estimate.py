@@ -129,19 +129,28 @@ def write(path: Path, text: str) -> Path:
 
 
 def test_speeds_by_frame_and_by_time(tmp_path: Path) -> None:
-    by_frame = read_speeds(write(tmp_path / "a.csv", "frame,speed\n0,10\n1,10\n2,20\n"), fps=10)
-    assert by_frame.distance("any", 0, 1) == pytest.approx(1.0)
-    assert by_frame.distance("any", 2, 1) == pytest.approx(1.5)
-    assert np.isnan(by_frame.distance("any", 2, 3))
-    by_time = read_speeds(write(tmp_path / "b.csv", "time, speed\n1.0, 5\n0.0, 5\n"), fps=4)
-    assert by_time.distance("any", 1, 3) == pytest.approx(2.5)
+    by_frame = read_speeds(write(tmp_path / "a.csv", "frame,speed\n0,10\n1,10\n2,20\n"))
+    assert by_frame.distance("any", 0, 1, fps=10) == pytest.approx(1.0)
+    assert by_frame.distance("any", 0, 1, fps=20) == pytest.approx(0.5)
+    assert by_frame.distance("any", 2, 1, fps=10) == pytest.approx(1.5)
+    assert np.isnan(by_frame.distance("any", 2, 3, fps=10))
+    by_time = read_speeds(write(tmp_path / "b.csv", "time, speed\n1.0, 5\n0.0, 5\n"))
+    between = read_speeds(write(tmp_path / "c.csv", "frame,speed\n0,0\n40,40\n"))  # speed is linear, the way is not
+    assert between.distance("any", 0, 10, fps=10) == pytest.approx(5.0)
+    assert between.distance("any", 30, 40, fps=10) == pytest.approx(35.0)
+    assert by_time.distance("any", 1, 3, fps=4) == pytest.approx(2.5)
 
 
 def test_speeds_of_several_drives(tmp_path: Path) -> None:
-    table = read_speeds(write(tmp_path / "a.csv", "drive,frame,speed\na l,0,1\na l,9,1\nb,0,2\nb,9,2\n"), fps=10)
-    assert table.distance("b", 0, 5) == pytest.approx(1.0)
-    assert table.distance("a l", 0, 5) == pytest.approx(0.5)
-    assert np.isnan(table.distance("c", 0, 5))
+    table = read_speeds(write(tmp_path / "a.csv", "drive,frame,speed\na l,0,1\na l,9,1\nb,0,2\nb,9,2\n"))
+    assert table.distance("b", 0, 5, fps=10) == pytest.approx(1.0)
+    assert table.distance("a l", 0, 5, fps=10) == pytest.approx(0.5)
+    assert np.isnan(table.distance("c", 0, 5, fps=10))
+    table.check_drives(["c", "b"])
+    with pytest.raises(DataError, match=r"of the drives a l, b, which are not asked for; call them c, d, or leave the"):
+        table.check_drives(["c", "d"])
+    with pytest.raises(DataError, match=r"a single recording has no name, so leave the column 'drive' out"):
+        table.check_drives([])
 
 
 @pytest.mark.parametrize(
@@ -153,19 +162,22 @@ def test_speeds_of_several_drives(tmp_path: Path) -> None:
         ("frame,speed\n0,fast\n", r"line 2 is not a time and a speed of at least 0 \(frame=0, speed=fast\)"),
         ("frame,speed\n0,1\n1,-3\n", r"line 3 is not a time"),
         ("frame,speed\n0\n", r"line 2 is not a time"),
+        ("frame,speed\n0,1\n1,1\n1.0,2\n", r"line 4 gives a second speed at frame 1; keep one line of each"),
+        ("drive,time,speed\na,0,1\nb,0,1\na,0,2\n", r"line 4 gives a second speed at time 0 of a;"),
     ],
 )
 def test_bad_tables_are_one_sentence(text: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=message) as raised:
-        read_speeds(write(tmp_path / "bad.csv", text), fps=10)
+        read_speeds(write(tmp_path / "bad.csv", text))
     assert "\n" not in str(raised.value)
 
 
 def test_missing_table_and_bad_rate(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"cannot read .*nowhere\.csv"):
-        read_speeds(tmp_path / "nowhere.csv", fps=10)
-    with pytest.raises(ConfigError, match=r"scale.fps is 0"):
-        read_speeds(tmp_path / "nowhere.csv", fps=0)
+        read_speeds(tmp_path / "nowhere.csv")
+    table = read_speeds(write(tmp_path / "a.csv", "frame,speed\n0,10\n1,10\n"))
+    with pytest.raises(ConfigError, match=r"fps is 0"):
+        table.distance("", 0, 1, fps=0)
 
 
 def test_metric_motion_scales_the_way_and_not_the_turn() -> None:

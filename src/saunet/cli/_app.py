@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from saunet import schema
 from saunet.checks import SaunetError, suggest
 from saunet.cli._globs import expand_globs
-from saunet.cli._sweep import summary, swept_folder
+from saunet.cli._sweep import check_folder, summary, swept_folder
 from saunet.config import config_dir, register_configs
 from saunet.lit.run_record import FILE, Stopped
 from saunet.registry import REGISTRIES
@@ -74,7 +74,7 @@ def run(name: str, task: Callable[[DictConfig], Any], kinds: Collection[str] = t
             raise failed[0]
         _end_sweep(name)
     except KeyboardInterrupt:
-        _end_sweep(name)
+        _end_sweep(name, other="interrupted")
         _fail(name, "interrupted", code=130)
     except Stopped as stop:
         _end_sweep(name)
@@ -84,7 +84,7 @@ def run(name: str, task: Callable[[DictConfig], Any], kinds: Collection[str] = t
         reason = sentence(error)
         if debug or reason is None:
             raise
-        _end_sweep(name)
+        _end_sweep(name, other=reason)
         for folder in folders:
             _remove_if_bare(folder)
         _fail(name, reason)
@@ -96,6 +96,8 @@ def run(name: str, task: Callable[[DictConfig], Any], kinds: Collection[str] = t
 def _job(name: str, task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
     """Run one job of a sweep; what goes wrong is said at once and ends this job only."""
     try:
+        if "output_dir" in cfg:
+            check_folder(cfg.output_dir, HydraConfig.get().runtime.output_dir)
         return task(cfg)
     except Exception as error:
         job = HydraConfig.get().job
@@ -104,10 +106,10 @@ def _job(name: str, task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         raise
 
 
-def _end_sweep(name: str) -> None:
-    """After a sweep, say how its jobs ended; exit with code 1 if one failed."""
+def _end_sweep(name: str, other: str | None = None) -> None:
+    """After a sweep, say how its jobs ended; exit with code 1 if one failed, or none began and nothing else says so."""
     folder = swept_folder()
-    if folder is None:
+    if folder is None or (other and not any(folder.glob(f"**/{FILE}"))):
         return
     text, finished = summary(folder)
     print(text, file=sys.stdout if finished else sys.stderr)

@@ -30,15 +30,11 @@ def apply_scale(cfg: DictConfig, record: Any, network: Any, pose: Any, data: Any
     from saunet.data.partners import measured_distance
     from saunet.data.surroundings import mounting_height, surroundings
     from saunet.scale import METHODS, MetricDepth, MetricMotion, estimate_scale
-    from saunet.scale.speeds import read_speeds
 
     method, scale = _check(cfg), record.scale
     if method in METHODS:
         device = next(network.parameters()).device
-        odometer: Any = measured_distance
-        if cfg.scale.speeds:
-            table = read_speeds(cfg.scale.speeds, cfg.scale.fps or 10.0)
-            odometer = lambda drive, first, second: table.distance(drive.name, first, second)  # noqa: E731
+        odometer = _odometer(cfg, data) if cfg.scale.speeds else measured_distance
         batches = surroundings(
             data,
             cfg.split,
@@ -59,6 +55,28 @@ def apply_scale(cfg: DictConfig, record: Any, network: Any, pose: Any, data: Any
     measured.pop("per_frame", None)  # scale.json has it
     motion = None if pose is None else MetricMotion(pose, scale)
     return MetricDepth(network, scale), motion, {"method": method, **measured}
+
+
+def _odometer(cfg: DictConfig, data: Any) -> Any:
+    """Return the odometer of a table of speeds, which counts frames as they were recorded."""
+    from saunet.data.sequences import ClockedDrive
+    from saunet.scale.speeds import read_speeds
+
+    table = read_speeds(cfg.scale.speeds)
+    table.check_drives([drive.name for drive in data.datasets[cfg.split].drives])
+
+    def distance(drive: Any, first: int, second: int) -> float:
+        fps = None
+        if isinstance(drive, ClockedDrive):
+            first, second, fps = drive.recorded(first), drive.recorded(second), drive.fps
+        return table.distance(drive.name, first, second, _fps(cfg, fps))
+
+    return distance
+
+
+def _fps(cfg: DictConfig, recorded: float | None) -> float:
+    """Return the frame rate as set, as recorded, or KITTI's."""
+    return cfg.scale.fps if cfg.scale.fps is not None else recorded or 10.0
 
 
 def scale_predictor(cfg: DictConfig, predictor: Any) -> None:
@@ -113,8 +131,9 @@ def _clip_batches(cfg: DictConfig, predictor: Any, method: str, offsets: Any) ->
             options["intrinsics"] = lambda height, width: camera.resized(height, width).K
         if method == "speed":
             path = _needed(cfg.scale.speeds, "scale.speeds", method, "a CSV file with the columns frame,speed")
-            table = read_speeds(path, cfg.scale.fps or clip.fps)
-            options["distance"] = lambda first, second: table.distance("", first, second)
+            table, fps = read_speeds(path), _fps(cfg, clip.fps)
+            table.check_drives([])
+            options["distance"] = lambda first, second: table.distance("", first, second, fps)
         if method == "stereo":
             other = open_clip(_needed(cfg.scale.partner, "scale.partner", method, "the other camera's images"))
             stack.callback(other.close)
@@ -136,6 +155,8 @@ def _check(cfg: DictConfig) -> str:
 
     method = one_of("scale.method", cfg.scale.method, SCALE_METHODS)
     positive("scale.frames", cfg.scale.frames)
+    if cfg.scale.fps is not None:
+        positive("scale.fps", cfg.scale.fps)
     if cfg.scale.store and method not in METHODS:
         raise ConfigError(
             f"scale.store=true stores what is measured and scale.method is '{method}'; "

@@ -1,4 +1,4 @@
-"""Sweeps: one failed job costs no other, and at the end every failure is named."""
+"""Sweeps: each job has its folder, one failed job costs no other, and at the end every failure is named."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from saunet.checks import ConfigError
 from saunet.lit.run_record import FILE, mark_lost, read
 
 _folders: list[Path] = []
@@ -26,6 +27,24 @@ def swept_folder() -> Path | None:
     return _folders.pop() if _folders else None
 
 
+def check_folder(output_dir: str, job: str) -> None:
+    """Check that a job of a sweep writes into its own folder: one named for all would hold the last job alone.
+
+    Args:
+        output_dir: Where the job would write.
+        job: The folder that the sweep gave to the job.
+
+    Raises:
+        ConfigError: if it would write anywhere else.
+    """
+    given, own = Path(output_dir).resolve(), Path(job).resolve()
+    if own != given and own not in given.parents:
+        raise ConfigError(
+            f"output_dir is '{output_dir}' and the jobs of a sweep must not share a folder; "
+            f"leave it out and set hydra.sweep.dir={output_dir}, below which each job gets its own"
+        )
+
+
 def summary(folder: Path) -> tuple[str, bool]:
     """Say how the jobs of a sweep ended, one line for each that did not finish; jobs that vanished are marked failed.
 
@@ -33,7 +52,7 @@ def summary(folder: Path) -> tuple[str, bool]:
         folder: The sweep's folder, with one ``run.json`` in each job's.
 
     Returns:
-        The text, and whether all jobs finished.
+        The text, and whether there were jobs and all of them finished.
     """
     jobs = {path.parent: path for path in sorted(folder.glob(f"**/{FILE}"), key=_in_order)}
     lines, finished = [], 0
@@ -46,7 +65,7 @@ def summary(folder: Path) -> tuple[str, bool]:
             reason = content.get("error") or "its record cannot be read"
             lines.append(f"  {job.relative_to(folder)} ({_overrides(job)}) {content.get('status', 'failed')}: {reason}")
     head = f"sweep: {finished} of {len(jobs)} jobs finished; results: {folder}"
-    return "\n".join([head, *lines]), finished == len(jobs)
+    return "\n".join([head, *lines]), 0 < finished == len(jobs)
 
 
 def _in_order(path: Path) -> tuple[int, str]:

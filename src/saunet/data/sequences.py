@@ -54,3 +54,15 @@ class MeasuredDrive(Drive, Protocol):
 
     def distance(self, first: int, second: int) -> float | None:
         """Return the metres travelled between two frames, at least 0; None where unknown."""
+
+
+@runtime_checkable
+class ClockedDrive(Drive, Protocol):
+    """A recording whose frame numbers are ours, and which knows the numbers and the rate of the file behind them."""
+
+    @property
+    def fps(self) -> float | None:
+        """Frames a second as recorded; None where nobody says."""
+
+    def recorded(self, index: int) -> int:
+        """Return the number of a frame as recorded, from 0."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,47 +24,70 @@ class SpeedTable:
     """Speed over time of one or several drives.
 
     Args:
-        times: Seconds since frame 0, ascending, of each drive; the drive ``""`` stands for all.
-        metres: Way travelled until then.
-        fps: Frames a second.
+        path: The file that it was read from, for messages.
+        unit: What ticks count, seconds (``time``) or frames (``frame``); of both, 0 is the first frame.
+        ticks: Ascending, of each drive; the drive ``""`` stands for all.
+        speeds: Metres a second at each tick.
     """
 
-    times: Mapping[str, NDArray[np.float64]]
-    metres: Mapping[str, NDArray[np.float64]]
-    fps: float | int
+    path: Path
+    unit: Literal["time", "frame"]
+    ticks: Mapping[str, NDArray[np.float64]]
+    speeds: Mapping[str, NDArray[np.float64]]
 
-    def distance(self, drive: str, first: int, second: int) -> float:
+    def distance(self, drive: str, first: int, second: int, fps: float | int) -> float:
         """Return the metres travelled between two frames, speed being linear in between; NaN outside the table.
 
         Args:
             drive: Name of the drive.
-            first: Number of a frame.
+            first: Number of a frame as recorded, 0 for the first.
             second: Number of the other frame.
+            fps: Frames a second as recorded, which tie frames to time.
+
+        Raises:
+            ConfigError: if ``fps`` is not positive.
         """
-        key = drive if drive in self.times else ""
-        if key not in self.times:
+        positive("fps", fps)
+        key = drive if drive in self.ticks else ""
+        if key not in self.ticks:
             return math.nan
-        times = np.array([first, second]) / self.fps
-        slack = 1e-6
-        if times.min() < self.times[key][0] - slack or times.max() > self.times[key][-1] + slack:
+        rate = float(fps) if self.unit == "frame" else 1.0  # ticks a second
+        start, end = sorted(number * rate / fps for number in (first, second))
+        slack, ticks = 1e-6, self.ticks[key]
+        if start < ticks[0] - slack or end > ticks[-1] + slack:
             return math.nan
-        start, end = np.interp(times, self.times[key], self.metres[key])
-        return abs(float(end - start))
+        at = np.array([start, *ticks[(ticks > start) & (ticks < end)], end])
+        speeds = np.interp(at, ticks, self.speeds[key])
+        return float(np.sum(np.diff(at) * (speeds[1:] + speeds[:-1]) / 2)) / rate
+
+    def check_drives(self, names: Sequence[str]) -> None:
+        """Check that at least one drive has speeds.
+
+        Args:
+            names: The drives that will be asked for; none stand for one recording without a name.
+
+        Raises:
+            DataError: if the table names others only.
+        """
+        if "" in self.ticks or any(name in self.ticks for name in names):
+            return
+        expected = f"call them {_some(names)}, or leave" if names else "a single recording has no name, so leave"
+        raise DataError(
+            f"{self.path} gives speeds of the drives {_some(list(self.ticks))}, which are not asked for; "
+            f"{expected} the column 'drive' out"
+        )
 
 
-def read_speeds(path: str | Path, fps: float | int) -> SpeedTable:
+def read_speeds(path: str | Path) -> SpeedTable:
     """Read a CSV file of speeds.
 
     Args:
         path: Columns ``time`` (seconds since frame 0) or ``frame`` (its number, 0 for the first of a folder or video),
             and ``speed`` (metres per second); with a column ``drive`` it may hold several drives by their names.
-        fps: Frames a second, which tie frames to time.
 
     Raises:
-        DataError: if the file cannot be read, lacks a column, or holds a line that is not numbers.
-        ConfigError: if ``fps`` is not positive.
+        DataError: if the file cannot be read, lacks a column, holds a line that is not numbers, or one moment twice.
     """
-    positive("scale.fps", fps)
     rows: dict[str, dict[float, float]] = {}
     try:
         with Path(path).open(encoding="utf-8-sig", newline="") as file:
@@ -72,33 +96,39 @@ def read_speeds(path: str | Path, fps: float | int) -> SpeedTable:
             table.fieldnames = columns
             if "speed" not in columns or not {"time", "frame"} & set(columns):
                 raise DataError(f"{path} has the columns {', '.join(columns) or 'none'}; {_FORMAT}")
+            unit: Literal["time", "frame"] = "time" if "time" in columns else "frame"
             for number, row in enumerate(table, 2):
-                time, speed = _numbers(row, f"{path}, line {number}", fps)
-                rows.setdefault((row.get("drive") or "").strip(), {})[time] = speed
+                tick, speed = _numbers(row, f"{path}, line {number}", unit)
+                drive = (row.get("drive") or "").strip()
+                of_drive = rows.setdefault(drive, {})
+                if tick in of_drive:
+                    raise DataError(
+                        f"{path}, line {number} gives a second speed at {unit} {tick:g}"
+                        f"{f' of {drive}' if drive else ''}; keep one line of each"
+                    )
+                of_drive[tick] = speed
     except OSError as reason:
         raise DataError(f"cannot read {path}: {reason.strerror or reason}") from reason
     except (UnicodeDecodeError, csv.Error) as reason:
         raise DataError(f"{path} is not a CSV file of text ({reason}); {_FORMAT}") from reason
     if not rows:
         raise DataError(f"{path} holds no line of numbers; {_FORMAT}")
-    times = {drive: np.array(sorted(speeds)) for drive, speeds in rows.items()}
-    metres = {drive: _travelled(times[drive], rows[drive]) for drive in rows}
-    return SpeedTable(times, metres, fps)
+    ticks = {drive: np.array(sorted(of_drive)) for drive, of_drive in rows.items()}
+    speeds = {drive: np.array([rows[drive][tick] for tick in each.tolist()]) for drive, each in ticks.items()}
+    return SpeedTable(Path(path), unit, ticks, speeds)
 
 
-def _travelled(times: NDArray[np.float64], speeds: Mapping[float, float]) -> NDArray[np.float64]:
-    values = np.array([speeds[time] for time in times.tolist()])
-    steps = np.diff(times) * (values[1:] + values[:-1]) / 2
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def _numbers(row: Mapping[str, str | None], where: str, fps: float | int) -> tuple[float, float]:
+def _numbers(row: Mapping[str, str | None], where: str, unit: str) -> tuple[float, float]:
     try:
-        speed = float(row["speed"] or "")
-        time = float(row["time"] or "") if "time" in row else float(row["frame"] or "") / fps
+        speed, tick = float(row["speed"] or ""), float(row[unit] or "")
     except ValueError:
-        speed = time = math.nan
-    if not (math.isfinite(speed) and math.isfinite(time) and speed >= 0):
+        speed = tick = math.nan
+    if not (math.isfinite(speed) and math.isfinite(tick) and speed >= 0):
         given = ", ".join(f"{key}={value}" for key, value in row.items())
         raise DataError(f"{where} is not a time and a speed of at least 0 ({given}); {_FORMAT}")
-    return time, speed
+    return tick, speed
+
+
+def _some(names: Sequence[str]) -> str:
+    """Name the first three."""
+    return ", ".join([*names[:3], *(["..."] if len(names) > 3 else [])])
