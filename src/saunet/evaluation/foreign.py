@@ -14,7 +14,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from saunet.checks import DataError, one_of
-from saunet.images import read_depth
+from saunet.images import natural_order, read_depth
 from saunet.types import EvalBatch
 
 SUFFIXES: tuple[str, ...] = (".npy", ".png")
@@ -59,7 +59,7 @@ class ForeignFolder:
 
     Args:
         folder: The folder.
-        names: The images in the order of the files sorted by name, for ``match="order"``.
+        names: The images in the order of the files in the order of their numbers, for ``match="order"``.
         values: What ``.npy`` files hold; ``.png`` always holds depth.
         match: ``order``, or ``name``: look for the `file_stem` of each image's name.
 
@@ -79,7 +79,8 @@ class ForeignFolder:
         self.match = one_of("match", match, ("order", "name"))
         if not folder.is_dir():
             raise DataError(f"there is no folder '{folder}'; give the folder that holds the predictions")
-        self._files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+        files = (file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+        self._files = sorted(files, key=natural_order)
         if not self._files:
             raise DataError(f"'{folder}' holds no prediction; its files must end in {' or '.join(SUFFIXES)}")
         self._stems = {file.stem: file for file in self._files}
