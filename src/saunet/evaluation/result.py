@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from saunet.checks import ConfigError, DataError, one_of
 from saunet.evaluation.breakdown import BucketRow
+from saunet.fingerprint import fingerprint
 from saunet.metrics.protocols import Protocol
 
 
@@ -157,6 +158,14 @@ class EvaluationResult:
         """
         rows = [row.errors for row in self.select(predictor, protocol) if row.pixels]
         return np.array(rows, dtype=np.float64).reshape(-1, 7)
+
+    def fingerprint(self, protocol: str) -> str:
+        """Return the SHA-256 of the names of the images under one protocol, those without ground truth included.
+
+        It is that of the data module's split, which ``run.json`` holds for trainings.
+        """
+        rows: tuple[ImageRow | ViewRow, ...] = (*self.rows, *self.views)
+        return fingerprint({row.name for row in rows if row.protocol == protocol})
 
     def summaries(self) -> tuple[Summary, ...]:
         """Return one summary for each protocol and predictor that has rows, in the order they were asked for."""
