@@ -26,6 +26,7 @@ ALLOWED: dict[str, set[str]] = {
         "checks",
         "geometry.camera",
         "atomic",
+        "fingerprint",
         "progress",
         "images",
         "trajectories",
@@ -33,6 +34,7 @@ ALLOWED: dict[str, set[str]] = {
     },
     "atomic": {"checks"},
     "torch_files": {"checks"},
+    "fingerprint": set(),
     "progress": set(),
     "images": {"checks", "atomic"},
     "trajectories": {"checks", "atomic"},
@@ -42,6 +44,7 @@ ALLOWED: dict[str, set[str]] = {
     "evaluation": {
         "types",
         "checks",
+        "fingerprint",
         "metrics",
         "atomic",
         "progress",

@@ -154,14 +154,32 @@ def test_odometry_writes_paths_errors_and_a_picture(tool: Tool, smoke_run: Path,
     pytest.importorskip("matplotlib")
     outcome = tool("odometry", checkpoint(smoke_run), "data=synthetic_tiny", "output_dir=out")
     assert outcome.code == 0, outcome.err
-    (row,) = json.loads((tmp_path / "out" / "odometry.json").read_text())["results"]
+    row, straight = json.loads((tmp_path / "out" / "odometry.json").read_text())["results"]
     assert (row["frames"], row["snippet"]) == (6, 5)
+    assert straight["predictor"] == "constant motion straight ahead"
+    assert (straight["sequence"], straight["frames"]) == (row["sequence"], 6)
     assert row["ate"] > 0
     (folder,) = (path for path in (tmp_path / "out").iterdir() if path.is_dir())
     names = {f"{kind}_{style}.txt" for kind in ("predicted", "aligned", "true") for style in ("kitti", "tum")}
     assert {path.name for path in folder.iterdir()} == names | {"path.png"} | {p.name for p in folder.glob(".hydra")}
     assert len(read_kitti(folder / "predicted_kitti.txt")) == 6
     assert "ATE" in outcome.out
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("snippet=1", "snippet is 1; it counts frames and must be at least 2 (published numbers use 5)"),
+        ("lengths=[-5,0]", "lengths is -5.0; it must be greater than 0"),
+        ("batch_size=0", "batch_size is 0; it must be greater than 0"),
+    ],
+)
+def test_odometry_checks_its_settings_before_the_data(
+    tool: Tool, smoke_run: Path, tmp_path: Path, override: str, words: str
+) -> None:
+    outcome = tool("odometry", checkpoint(smoke_run), "data=kitti_odometry", "data.root=gone", "output_dir=o", override)
+    outcome.says(words)
+    assert not (tmp_path / "o").exists()
 
 
 def test_odometry_of_a_recording_without_poses(tool: Tool, smoke_run: Path, raw_root: Path, tmp_path: Path) -> None:

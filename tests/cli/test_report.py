@@ -6,6 +6,7 @@ import contextlib
 import io
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -14,6 +15,7 @@ from saunet.checks import ConfigError
 from saunet.cli._app import run
 from saunet.cli._runs import arguments, planned_jobs
 from saunet.cli.report import report
+from saunet.report import collect
 
 
 def tool(*given: str) -> tuple[int, str, str]:
@@ -42,6 +44,22 @@ def test_a_trained_run_becomes_a_page(smoke_run: Path, tmp_path: Path, monkeypat
     assert code == 1
     assert err.strip().endswith("name two or more: saunet-report compare A B")
     assert {path.name for path in tmp_path.iterdir()} <= {"page", "outputs"}
+
+
+def test_a_run_with_a_folder_of_its_own_is_one_run_that_knows_itself(tool: Any, tmp_path: Path) -> None:
+    outcome = tool(
+        "train",
+        *("experiment=smoke", "logger=default", "callbacks.pictures=null", "model/encoder=resnet18"),
+        *("model/pose=posecnn", "output_dir=runs/mine"),
+    )
+    assert outcome.code == 0, outcome.err
+    (read,) = collect([tmp_path / "outputs", tmp_path / "runs" / "mine"], jobs=planned_jobs).runs
+    assert (read.path, read.component("model/encoder"), read.overrides["model/pose"]) == (
+        tmp_path / "runs" / "mine", "resnet18", "posecnn",
+    )  # fmt: skip
+    (score,) = read.scores
+    assert (score.data, score.protocol) == ("synthetic_tiny, validation split", "synthetic")
+    assert len(score.fingerprint) == 64
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from saunet.checks import ConfigError, DataError
 from saunet.data import splits
 from saunet.data.splits import Frame
-from saunet.data.windows import fingerprint
+from saunet.fingerprint import fingerprint
 
 # counts and SHA-256 of the published lists
 PUBLISHED = {

@@ -14,10 +14,10 @@ from saunet.data.windows import (
     collate,
     draw,
     find_windows,
-    fingerprint,
     reach,
     sample_name,
 )
+from saunet.fingerprint import fingerprint
 
 
 def dataset(drives, frames=range(8), offsets=(-1, 1), **options):

@@ -13,7 +13,17 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from saunet.evaluation.odometry import Path3d, path_errors, path_of, path_table, write_errors, write_path
+from saunet.checks import ConfigError
+from saunet.evaluation.odometry import (
+    STRAIGHT,
+    Path3d,
+    path_errors,
+    path_of,
+    path_table,
+    straight_ahead,
+    write_errors,
+    write_path,
+)
 from saunet.evaluation.plot import draw_path
 from saunet.trajectories import read_kitti, read_tum
 
@@ -138,3 +148,83 @@ def test_the_picture_shows_a_path(tmp_path, known):
     assert picture.shape[0] > 400
     blue, green, red = (picture[..., k].astype(int) for k in range(3))
     assert ((red - green > 100) & (red - blue > 100)).sum() > 500  # the predicted path is drawn in red
+
+
+def table_text(*errors):
+    stream = Console(width=160, record=True, file=io.StringIO())
+    stream.print(path_table(errors))
+    return " ".join(stream.export_text().split())
+
+
+def straight_road(frames=31, step=2.0):
+    true = np.tile(np.eye(4), (frames, 1, 1))
+    true[:, 2, 3] = np.arange(frames) * step
+    return true
+
+
+def test_sideways_on_a_straight_road_is_found_out():
+    sideways = np.tile(np.eye(4), (31, 1, 1))
+    sideways[:, 0, 3] = np.arange(31.0)
+    path = Path3d("x", sideways, np.arange(31.0), straight_road())
+    model, straight = path_errors(path), path_errors(straight_ahead(path))
+    assert model.ate == pytest.approx(0, abs=1e-9)  # after an alignment
+    assert model.turn == pytest.approx(90)
+    assert model.snippet_ate > 1
+    assert model.t_rel > 100
+    assert (straight.predictor, straight.scale) == (STRAIGHT, pytest.approx(2.0))
+    assert max(straight.snippet_ate, straight.t_rel, straight.turn) < 1e-6
+    text = table_text(model, straight)
+    assert STRAIGHT in text
+    assert " 90 " in text
+
+
+def test_a_world_of_its_own_is_no_turn():
+    """However the first cameras are turned, only what remains once they coincide counts, and a roll does not."""
+    other = np.eye(4)
+    other[:3, :3] = Rotation.from_rotvec([0.3, 2.0, -1.0]).as_matrix()
+    for true in (winding(), straight_road()):
+        assert Path3d("x", other @ true, np.arange(float(len(true))), true).turn == pytest.approx(0, abs=1e-4)
+    bent = winding()
+    bent[:, :3, 3] = bent[:, :3, 3] @ Rotation.from_rotvec([0, np.radians(20), 0]).as_matrix().T
+    assert Path3d("x", bent, np.arange(120.0), winding()).turn == pytest.approx(20, abs=0.1)
+    assert Path3d("x", winding(), np.arange(120.0)).turn == 0
+    standing = np.tile(np.eye(4), (5, 1, 1))
+    assert Path3d("x", standing, np.arange(5.0), straight_road(5)).turn == 0
+
+
+def test_only_snippets_of_five_frames_are_as_published():
+    assert "5-frame ATE: own scale a snippet, as published;" in table_text(path_errors(a_path(31)))
+    text = table_text(path_errors(a_path(31), snippet=100))
+    assert "100-frame ATE: own scale a snippet, published numbers use 5 frames;" in text
+    assert "as published" not in text
+
+
+def test_a_segment_that_does_not_fit_is_said():
+    text = table_text(path_errors(a_path(31), lengths=[1000.0]))
+    assert "no segment of 1000 m or more fits into the 60.0 m of odometry/99 l" in text
+    assert "nan" not in text
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"snippet": 0}, "snippet is 0; it counts frames and must be at least 2"),
+        ({"snippet": 1}, "snippet is 1"),
+        ({"lengths": [10.0, -5.0]}, "lengths is -5.0; it must be greater than 0"),
+        ({"lengths": [math.inf]}, "lengths is inf"),
+    ],
+)
+def test_settings_without_sense_are_refused(options, words):
+    with pytest.raises(ConfigError, match=words):
+        path_errors(a_path(31), **options)
+
+
+def test_the_errors_stand_in_the_picture(tmp_path):
+    pytest.importorskip("matplotlib")
+    path = a_path(40)
+    draw_path(path, tmp_path / "bare.svg")
+    draw_path(path, tmp_path / "path.svg", [path_errors(each) for each in (path, straight_ahead(path))])
+    bare, told = ((tmp_path / name).read_text() for name in ("bare.svg", "path.svg"))
+    for words in ("pose network: 5-frame ATE", "constant motion straight ahead: 5-frame ATE"):
+        assert words in told  # Matplotlib keeps a text beside its outlines
+        assert words not in bare

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -134,3 +135,11 @@ def test_git_state_belongs_to_the_code_and_not_to_the_folder_around_it(
 
 def test_versions_are_strings() -> None:
     assert all(isinstance(value, str) for value in versions().values())
+
+
+def test_what_a_run_is_stands_in_its_record(tmp_path: Path) -> None:
+    with recording(tmp_path, "trial") as record:
+        record.describe({"optim": {"clip": math.inf, "betas": (0.9, -math.inf)}}, {"data": "kitti"}, ["seed=1"])
+    after = content(tmp_path)
+    assert after["config"] == {"optim": {"clip": ".inf", "betas": [0.9, "-.inf"]}}
+    assert (after["choices"], after["overrides"]) == ({"data": "kitti"}, ["seed=1"])

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from saunet.checkpoint import ModelRecord, atomic_save, build_networks
+from saunet.fingerprint import fingerprint
 from saunet.metrics.functional import ERROR_NAMES
 
 ERRORS = (0.2, 1.5, 6.0, 0.3, 0.7, 0.9, 0.95)
@@ -105,11 +106,22 @@ def add_checkpoint(folder: Path) -> Path:
 
 
 def make_evaluation(
-    folder: Path, checkpoint: Path | str, abs_rel: float = 0.25, protocol: str = "synthetic", images: int = 6
+    folder: Path,
+    checkpoint: Path | str | None,
+    abs_rel: float = 0.25,
+    protocol: str = "synthetic",
+    images: int = 6,
+    drive: str = "drive",
+    **settings: Any,
 ) -> Path:
-    """Write what saunet-evaluate writes: a model and constant depth, six images."""
-    hydra_files(folder, {"checkpoint": str(checkpoint), "split": "test"}, {"data": "synthetic"})
-    rows = [("model", abs_rel), ("constant depth", 0.5)]
+    """Write what saunet-evaluate writes: a model and constant depth, six images.
+
+    Without a checkpoint, ``settings`` name the predictions of another system.
+    """
+    config = {"checkpoint": str(checkpoint)} if checkpoint else {"predictions": settings["predictions"]}
+    hydra_files(folder, {**config, "split": "test"}, {"data": "synthetic"})
+    rows = [("model" if checkpoint else "predictions", abs_rel), ("constant depth", 0.5)]
+    names = [f"{drive} {index:06d}" for index in range(images)]
     results = [
         {
             "predictor": who,
@@ -119,11 +131,12 @@ def make_evaluation(
         }
         for who, value in rows
     ]
-    (folder / "metrics.json").write_text(json.dumps({"protocols": [], "results": results}))
+    content = {"settings": settings, "protocols": [], "results": results, "images": {protocol: fingerprint(names)}}
+    (folder / "metrics.json").write_text(json.dumps(content))
     with (folder / "per_image.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["predictor", "protocol", "name", "pixels", "scale", *ERROR_NAMES])
         for who, value in rows:
-            for index in range(images):
-                writer.writerow([who, protocol, f"drive {index:06d}", 100, 1.0, value + 0.01 * index, *ERRORS[1:]])
+            for index, name in enumerate(names):
+                writer.writerow([who, protocol, name, 100, 1.0, value + 0.01 * index, *ERRORS[1:]])
     return folder

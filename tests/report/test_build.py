@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from made_runs import add_checkpoint, make_evaluation, make_run
+from made_runs import ERRORS, add_checkpoint, make_evaluation, make_run
 from rich.console import Console
 
 from saunet.checks import ConfigError, DataError
@@ -20,7 +20,9 @@ from saunet.report import Options, build, collect, write
 from saunet.report.compare import print_comparison
 from saunet.report.document import Column, Document, Row, Section, Table
 from saunet.report.markdown import as_markdown, table_csv
+from saunet.report.models import Seen, look
 from saunet.report.page import as_html
+from saunet.report.speed import speed
 
 
 @pytest.fixture
@@ -189,3 +191,65 @@ def test_what_cannot_be_paired_is_said(tmp_path: Path) -> None:
     assert "were not both evaluated under one protocol" in text
     with pytest.raises(DataError, match="not enough to compare"):
         _compared(runs[0])
+
+
+def _two(tmp_path: Path) -> list[Path]:
+    return [make_run(tmp_path / name, beta=beta, status="finished") for name, beta in (("a", 0.1), ("b", 0.2))]
+
+
+def test_among_all_evaluations_those_of_the_same_images_are_paired(tmp_path: Path) -> None:
+    one, two = _two(tmp_path)
+    make_evaluation(one / "test", "x", 0.25)
+    make_evaluation(one / "zzz_other", "x", 0.9, drive="another drive")
+    make_evaluation(two / "test", "x", 0.3)
+    text = _compared(one, two)
+    assert text.count("Paired on 6 images under synthetic") == 1
+    assert re.search(r"Abs Rel\s+0\.2750\s+0\.3250\s+0\.0500", text)
+    assert "left out" not in text
+
+
+def test_a_flipped_evaluation_is_not_paired_with_a_plain_one(tmp_path: Path) -> None:
+    one, two = _two(tmp_path)
+    make_evaluation(one / "flipped", "x", 0.25, post_processing="monodepth blend of two flips")
+    make_evaluation(two / "test", "x", 0.3)
+    text = " ".join(_compared(one, two).split())
+    assert "Paired on" not in text
+    assert "the first was evaluated with flip=true and the second with no flip or scale" in text
+    make_evaluation(two / "flipped", "x", 0.26, post_processing="monodepth blend of two flips")
+    text = _compared(one, two)
+    assert text.count("Paired on 6 images") == 1
+    assert re.search(r"Abs Rel\s+0\.2750\s+0\.2850", text)
+    assert "synthetic, test split, flip=true; resampled" in text
+
+
+def test_other_systems_are_compared_under_their_names(tmp_path: Path) -> None:
+    ours = make_run(tmp_path / "ours", status="finished")
+    make_evaluation(ours / "test", "x", 0.25)
+    theirs = [make_evaluation(tmp_path / f"foreign_{key}", None, 0.3, predictions=f"{key}.npy") for key in "ab"]
+    text = _compared(ours, *theirs)
+    assert "Paired on 6 images under synthetic: foreign_a minus ours" in text
+    assert "Paired on 6 images under synthetic: foreign_b minus ours" in text
+    assert "?" not in text
+    assert "predictions" not in text
+
+
+def test_figure_10_has_a_point_where_a_run_was_timed_at_its_own_size(everything: list[Path], tmp_path: Path) -> None:
+    place = tmp_path / "bench" / "benchmark.json"
+    row = {**json.loads(place.read_text())["results"][0], "batch_size": 1, "median": 0.01}
+    rows = [row, {**row, "size": "64x128", "median": 0.04}, {**row, "batch_size": 2}, {**row, "mode": "compiled"}]
+    place.write_text(json.dumps({"results": [*rows, {**row, "median": 0.02}]}))
+    inputs = collect(everything)
+    (run,) = inputs.runs
+    seen = look(run, ())
+    assert isinstance(seen, Seen)
+    points, table, missing = speed(inputs.benchmarks, {"run": run}, {"run": seen})
+    accuracy = ERRORS[4]
+    assert points == [("run (cpu, fp32, eager)", accuracy, 0.02), ("run (cpu, fp32, compiled)", accuracy, 0.01)]
+    assert table is not None
+    assert [(row.cells[0], row.cells[2], row.cells[3]) for row in table.rows[1:]] == [
+        *[("run", "32x64", accuracy)] * 4,
+        ("mine", "64x128", None),
+    ]
+    told = {one.what: one.why for one in missing}
+    assert "that runs at 64x128" in told["Fig. 10, accuracy of mine (64x128, cpu, fp32, eager, batch 1)"]
+    assert "several images at once" in told["Fig. 10, point of run (cpu, fp32, eager, batch 2)"]

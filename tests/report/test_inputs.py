@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 from made_runs import add_checkpoint, make_evaluation, make_run
 
 from saunet.checks import ConfigError, DataError
@@ -145,3 +146,47 @@ def test_an_evaluation_led_elsewhere_by_output_dir_belongs_to_the_run_of_its_che
     (run,) = collect([tmp_path / "a", evaluation]).runs
     assert run.evaluations == (evaluation,)
     assert {score.data for score in run.scores if not score.validation} == {"kitti, val split"}
+
+
+@pytest.mark.parametrize("given", ["runs/smoke", "runs/${name}"])
+def test_a_run_led_elsewhere_by_output_dir_is_one_run(tmp_path: Path, given: str) -> None:
+    record = {"choices": {"data": "kitti", "model/encoder": "resnet18"}, "protocol": "eigen_camera_z"}
+    record |= {"config": {"name": "smoke"}, "overrides": ["experiment=smoke"], "splits": {"val": "abc"}}
+    place = make_run(tmp_path / "runs" / "smoke")
+    (place / "run.json").write_text(json.dumps({"status": "finished", **record}))
+    left = tmp_path / "outputs" / "smoke" / "today"
+    shutil.move(place / ".hydra", left / ".hydra")
+    config = yaml.safe_load((left / ".hydra" / "config.yaml").read_text()) | {"output_dir": given}
+    (left / ".hydra" / "config.yaml").write_text(yaml.safe_dump(config))
+    hydra = {"hydra": {"runtime": {"cwd": str(tmp_path)}}}
+    (left / ".hydra" / "hydra.yaml").write_text(yaml.safe_dump(hydra))
+    file = add_checkpoint(place)
+    for paths in ([tmp_path / "outputs"], [tmp_path / "outputs", place], [tmp_path], [file]):
+        (run,) = collect(paths).runs
+        assert (run.path, run.status, run.component("model/encoder")) == (place, "finished", "resnet18")
+        assert run.overrides == {"experiment": "smoke"}
+        (score,) = run.scores
+        assert (score.data, score.protocol) == ("kitti, validation split", "eigen_camera_z")
+        assert score.fingerprint == "abc"
+    shutil.rmtree(place)
+    with pytest.raises(DataError, match="no run"):
+        collect([tmp_path / "outputs"])
+
+
+def test_an_evaluation_of_another_system_in_a_runs_folder_is_not_the_runs(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "a")
+    make_evaluation(run / "theirs", None, predictions="x.npy")
+    mine, theirs = collect([run]).runs
+    assert [score.validation for score in mine.scores] == [True]
+    assert (theirs.name, len(theirs.scores)) == ("theirs", 2)
+
+
+def test_jobs_led_elsewhere_by_output_dir_are_read_there(tmp_path: Path, sweep: Path) -> None:
+    place = make_run(tmp_path / "runs" / "0.001", job=3, status="finished")
+    left = sweep / "3" / ".hydra"
+    shutil.move(place / ".hydra", left)
+    config = yaml.safe_load((left / "config.yaml").read_text())
+    config["objective"]["beta"] = 0.001
+    (left / "config.yaml").write_text(yaml.safe_dump(config | {"output_dir": str(tmp_path / "runs/${objective.beta}")}))
+    (found,) = collect([sweep]).sweeps
+    assert (found.runs[3].path, found.runs[3].status) == (place, "finished")

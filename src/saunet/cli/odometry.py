@@ -7,7 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from saunet import config
-from saunet.checks import require_matplotlib
+from saunet.checks import positive, require_matplotlib
 from saunet.cli._app import pick_device, run
 
 
@@ -16,13 +16,25 @@ def odometry(cfg: DictConfig) -> None:
     from rich.console import Console
 
     from saunet.evaluation.foreign import file_stem
-    from saunet.evaluation.odometry import path_errors, path_of, path_table, write_errors, write_path
+    from saunet.evaluation.odometry import (
+        path_errors,
+        path_of,
+        path_table,
+        straight_ahead,
+        write_errors,
+        write_path,
+    )
     from saunet.evaluation.plot import draw_path
     from saunet.infer.folder import read_model
     from saunet.infer.load import locate
     from saunet.infer.odometer import Odometer, follow
+    from saunet.metrics.odometry import check_lengths, check_snippet
     from saunet.registry import instantiate
 
+    lengths = list(cfg.lengths) if cfg.lengths else None
+    check_snippet(cfg.snippet)
+    check_lengths(lengths or ())
+    positive("batch_size", cfg.batch_size)
     if cfg.figure:
         require_matplotlib("figure=true needs", "figure=false")
     source, output = locate(cfg.checkpoint), Path(cfg.output_dir)
@@ -37,12 +49,12 @@ def odometry(cfg: DictConfig) -> None:
         path = path_of(drive, predicted)
         folder = output / file_stem(drive.name)
         write_path(path, folder)
-        if cfg.figure:
-            draw_path(path, folder / "path.png")
         if path.true is None:
             print(f"{drive.name}: no true poses, so the path is written and not compared")
         else:
-            errors.append(path_errors(path, cfg.snippet, list(cfg.lengths) if cfg.lengths else None))
+            errors += [path_errors(each, cfg.snippet, lengths) for each in (path, straight_ahead(path))]
+        if cfg.figure:
+            draw_path(path, folder / "path.png", errors[-2:] if path.true is not None else ())
     scale = None if record.scale is None else {"factor": record.scale.factor, "source": record.scale.source}
     write_errors(errors, output, {"checkpoint": str(cfg.checkpoint), "scale": scale})
     if errors:

@@ -25,6 +25,7 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
     Returns:
         The data module, and the best monitored value.
     """
+    from hydra.core.hydra_config import HydraConfig
     from lightning import seed_everything
 
     from saunet.lit.assemble import assemble
@@ -36,10 +37,13 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
     from saunet.registry import instantiate
 
     with recording(cfg.output_dir, cfg.name, sentence) as record:
+        hydra = HydraConfig.get()
+        record.describe(config.plain(cfg), config.plain(hydra.runtime.choices), list(hydra.overrides.task))
         config.check(cfg)
         seed_everything(cfg.seed, workers=True, verbose=False)
         resume = resume_path(cfg.resume, cfg.output_dir, cfg.init_from)
         data = instantiate(config.plain(cfg.data))
+        record.write(protocol=cfg.protocol or data.protocol)
         model = assemble(config.plain(cfg), data, pretrained=resume is None and cfg.init_from is None)
         loggers = [hydra_instantiate(logger) for logger in cfg.logger.values() if logger]
         if resume:

@@ -5,7 +5,6 @@ A window is usable when the frames at all offsets exist. What is left out is cou
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from saunet.data.frame_size import check_frame
 from saunet.data.partners import Odometer, partner_frames, partner_image
 from saunet.data.resize import resize_depth
 from saunet.data.sequences import Drive
+from saunet.fingerprint import fingerprint
 from saunet.geometry.camera import scale_intrinsics
 from saunet.images import resize
 from saunet.types import FrameBatch
@@ -280,9 +280,3 @@ def sample_name(drive: str, frame: int) -> str:
     """Return drive and frame as one name; the camera side, if the drive's name ends with one, stays last."""
     folder, _, side = drive.rpartition(" ")
     return f"{folder} {frame:010d} {side}" if folder and side in ("l", "r") else f"{drive} {frame:010d}"
-
-
-def fingerprint(names: Sequence[str]) -> str:
-    """Return the SHA-256 of names sorted bytewise, joined by newlines, with a final one."""
-    lines = sorted(name.encode() for name in names)
-    return hashlib.sha256(b"\n".join([*lines, b""])).hexdigest()

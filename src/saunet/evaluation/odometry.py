@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,25 +30,34 @@ from saunet.metrics.odometry import (
 )
 from saunet.trajectories import write_kitti, write_tum
 
+PUBLISHED_SNIPPET = 5
+"""Frames in a snippet of the published numbers."""
+MODEL = "pose network"
+STRAIGHT = "constant motion straight ahead"
+
 
 @dataclass(frozen=True, slots=True)
 class PathErrors:
     """One predicted path against the true one."""
 
     sequence: str
+    predictor: str
+    """`MODEL`, or `STRAIGHT`, which looks at no image."""
     frames: int
     metres: float
     """Length of the true path."""
     snippet: int
     """Frames in a snippet."""
     snippet_ate: float
-    """Mean error of snippets in metres, each with its own scale, as published (Zhou et al., Monodepth2)."""
+    """Mean error of snippets in metres, each with its own scale; of five frames as published (Zhou et al.)."""
     snippet_std: float
     """Its standard deviation over snippets."""
     ate: float
     """Root mean square distance of positions in metres after 7-DoF alignment of the whole path."""
     scale: float
     """Metres a unit of the prediction: the scale of that alignment."""
+    turn: float
+    """Degrees by which that alignment turned the path; see `Path3d.turn`."""
     t_rel: float
     """KITTI's translation error after that alignment, percent; NaN if no segment fits into the path."""
     r_rel: float
@@ -69,6 +79,7 @@ class Path3d:
     """Seconds of each frame."""
     true: Float64[ndarray, "n 4 4"] | None = None
     """``T_world_cam`` in metres."""
+    predictor: str = MODEL
 
     @property
     def alignment(self) -> Similarity:
@@ -76,6 +87,22 @@ class Path3d:
         if self.true is None:
             return Similarity(1.0, np.eye(3), np.zeros(3))
         return align_trajectory(self.predicted, self.true)
+
+    @property
+    def turn(self) -> float:
+        """Degrees by which the alignment turns the path, against one on which the first cameras coincide.
+
+        A network that takes sideways for ahead on a straight road has a small error after alignment, and this says
+        why. Positions weigh by their squared distance from the middle, so that a roll about a straight road, which
+        the alignment may choose freely, does not count. 0 without a truth.
+        """
+        if self.true is None:
+            return 0.0
+        centred = self.predicted[:, :3, 3] - self.predicted[:, :3, 3].mean(0)
+        driven = centred @ (self.true[0, :3, :3] @ self.predicted[0, :3, :3].T).T
+        aligned = centred @ self.alignment.rotation.T
+        energy = float((centred**2).sum())
+        return float(np.degrees(np.arccos(np.clip((driven * aligned).sum() / energy, -1, 1)))) if energy > 0 else 0.0
 
     @property
     def aligned(self) -> Float64[ndarray, "n 4 4"]:
@@ -99,6 +126,16 @@ def path_of(drive: Any, predicted: Float64[ndarray, "n 4 4"]) -> Path3d:
     )
 
 
+def straight_ahead(path: Path3d) -> Path3d:
+    """Return the path of a camera that moves by one unit along its axis from each frame to the next.
+
+    It looks at no image: a network that does not beat it has learnt nothing about motion.
+    """
+    poses = np.tile(np.eye(4), (len(path.predicted), 1, 1))
+    poses[:, 2, 3] = np.arange(len(poses))
+    return replace(path, predicted=poses, predictor=STRAIGHT)
+
+
 def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None = None) -> PathErrors:
     """Compute the errors of a path whose truth is known.
 
@@ -109,6 +146,7 @@ def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None 
             the path where it is shorter than 100 m (such numbers compare with no published ones).
 
     Raises:
+        ConfigError: if a snippet has fewer than two frames, or a length is not above 0.
         DataError: if there are fewer than two poses.
     """
     true = path.true
@@ -121,6 +159,7 @@ def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None 
     relative = segment_errors(path.aligned, true, chosen, step=10 if len(true) > 100 else 1)
     return PathErrors(
         path.sequence,
+        path.predictor,
         len(true),
         metres,
         snippet,
@@ -128,6 +167,7 @@ def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None 
         snippets.std,
         trajectory_ate(path.predicted, true),
         path.alignment.scale,
+        path.turn,
         relative.t_rel,
         relative.r_rel,
         relative.segments,
@@ -136,36 +176,50 @@ def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None 
 
 
 def path_table(errors: Sequence[PathErrors]) -> Table:
-    """Return one line a sequence."""
+    """Return one line a sequence and predictor."""
+    snippet = errors[0].snippet
     table = plain_table("[bold]odometry[/bold]: the path of the camera from the pose network")
     table.add_column("sequence", min_width=9)
     for heading in (
         "frames",
         "path m",
-        f"{errors[0].snippet}-frame\nATE m",
+        f"{snippet}-frame\nATE m",
         "ATE m",
         "scale",
+        "turned\n°",
         "t_rel\n%",
         "r_rel\n°/100m",
     ):
         table.add_column(heading, justify="right", no_wrap=True)
     for row in errors:
+        trivial = row.predictor == STRAIGHT
         table.add_row(
-            escape(row.sequence),
-            str(row.frames),
-            f"{row.metres:.1f}",
+            row.predictor if trivial else escape(row.sequence),
+            *(("", "") if trivial else (str(row.frames), f"{row.metres:.1f}")),
             f"{row.snippet_ate:.4f} ± {row.snippet_std:.4f}",
             f"{row.ate:.3f}",
             f"{row.scale:.3g}",
-            f"{row.t_rel:.2f}",
-            f"{row.r_rel:.2f}",
+            f"{row.turn:.0f}",
+            _number(row.t_rel),
+            _number(row.r_rel),
+            style="dim" if trivial else None,
         )
-    lengths = sorted({f"{row.lengths[0]:g} to {row.lengths[-1]:g} m" for row in errors if row.lengths})
-    table.caption = (
-        f"{errors[0].snippet}-frame ATE: own scale a snippet, as published; the rest after 7-DoF alignment; "
-        f"t_rel and r_rel over segments of {', '.join(lengths)}"
-    )
+    published = "as published" if snippet == PUBLISHED_SNIPPET else f"published numbers use {PUBLISHED_SNIPPET} frames"
+    notes = [f"{snippet}-frame ATE: own scale a snippet, {published}; the rest after 7-DoF alignment"]
+    lengths = [f"{row.lengths[0]:g} to {row.lengths[-1]:g} m" for row in errors if row.segments]
+    if lengths:
+        notes.append(f"t_rel and r_rel over segments of {', '.join(sorted(set(lengths)))}")
+    bare = {row.sequence: row for row in errors if not row.segments}
+    notes += [
+        f"no segment of {min(row.lengths):g} m or more fits into the {row.metres:.1f} m of {escape(name)}"
+        for name, row in bare.items()
+    ]
+    table.caption = "; ".join(notes)
     return table
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if math.isfinite(value) else "–"
 
 
 def write_path(path: Path3d, folder: Path) -> None:
@@ -183,7 +237,7 @@ def write_path(path: Path3d, folder: Path) -> None:
 
 
 def write_errors(errors: Sequence[PathErrors], folder: Path, settings: dict[str, object]) -> None:
-    """Write ``odometry.json`` and ``odometry.csv``, one entry a sequence.
+    """Write ``odometry.json`` and ``odometry.csv``, one entry a sequence and predictor.
 
     Raises:
         DataError: if a file cannot be written.

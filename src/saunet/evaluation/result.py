@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from saunet.checks import ConfigError, DataError, one_of
 from saunet.evaluation.breakdown import BucketRow
+from saunet.fingerprint import fingerprint
 from saunet.metrics.protocols import Protocol
 
 
@@ -175,6 +176,14 @@ class EvaluationResult:
             views=views,
             settings=self.settings,
         )
+
+    def fingerprint(self, protocol: str) -> str:
+        """Return the SHA-256 of the names of the images under one protocol, those without ground truth included.
+
+        It is that of the data module's split, which ``run.json`` holds for trainings.
+        """
+        rows: tuple[ImageRow | ViewRow, ...] = (*self.rows, *self.views)
+        return fingerprint({row.name for row in rows if row.protocol == protocol})
 
     def summaries(self) -> tuple[Summary, ...]:
         """Return one summary for each protocol and predictor that has rows, in the order they were asked for."""

@@ -108,12 +108,16 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
 
 
 def as_json(result: EvaluationResult) -> dict[str, object]:
-    """Return the summaries and the exact rules they were computed under as plain data; NaN becomes None."""
+    """Return the summaries and the exact rules they were computed under as plain data; NaN becomes None.
+
+    ``images`` holds the `fingerprint` of each protocol's images, by which others tell whether numbers compare.
+    """
     spreads = {(s.predictor, s.protocol): s for s in result.spreads}
     content: dict[str, object] = {
         "settings": dict(result.settings),
         "protocols": [dataclasses.asdict(protocol) for protocol in result.protocols],
         "results": [_summary_dict(summary, spreads) for summary in result.summaries()],
+        "images": {protocol.name: result.fingerprint(protocol.name) for protocol in result.protocols},
     }
     if result.spreads:
         spread = result.spreads[0]

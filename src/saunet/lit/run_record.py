@@ -6,11 +6,12 @@ A run that is killed leaves ``running`` behind with its process number; every ot
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import socket
 import subprocess
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
@@ -64,6 +65,10 @@ class RunRecord:
             "versions": versions(),
             "git": git_state(),
             "splits": {},
+            "choices": {},
+            "overrides": [],
+            "protocol": None,
+            "config": {},
             "resumed": None,
             "host": socket.gethostname(),
             "pid": os.getpid(),
@@ -87,6 +92,19 @@ class RunRecord:
         self.content = {**self.content, **(read(self.path.parent) or {}), **changes}
         if first_process():
             _write(self.path.parent, self.content)
+
+    def describe(self, config: Mapping[str, Any], choices: Mapping[str, str | None], overrides: Sequence[str]) -> None:
+        """Write down what the run is, so that its folder says so wherever ``output_dir`` led it.
+
+        Args:
+            config: The whole configuration, resolved.
+            choices: What was chosen for each config group, such as ``{"data": "kitti"}``.
+            overrides: What the command line said.
+
+        Raises:
+            ConfigError: if the folder cannot be written to.
+        """
+        self.write(config=_finite(config), choices=dict(choices), overrides=list(overrides))
 
     def end(self, status: Status, error: str | None = None) -> None:
         """Say how the run ended."""
@@ -187,6 +205,17 @@ def git_state(file: str | Path = __file__) -> Mapping[str, Any] | None:
 
 def _write(folder: Path, content: Mapping[str, Any]) -> None:
     write_json(folder / FILE, content, ConfigError)
+
+
+def _finite(value: Any) -> Any:
+    """Return plain data with numbers that JSON does not know, such as a limit of infinity, as YAML writes them."""
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return ".nan" if math.isnan(value) else f"{'-' if value < 0 else ''}.inf"
+    return value if isinstance(value, str | int | float | None) else str(value)
 
 
 def _now() -> str:

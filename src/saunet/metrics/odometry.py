@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int
 from numpy import ndarray
 
-from saunet.checks import DataError, one_of
+from saunet.checks import ConfigError, DataError, one_of, positive
 
 KITTI_LENGTHS: tuple[float, ...] = (100, 200, 300, 400, 500, 600, 700, 800)
 """Segment lengths in metres that KITTI averages over."""
@@ -69,6 +69,26 @@ class SegmentErrors:
     """How many segments were averaged."""
 
 
+def check_snippet(length: int) -> None:
+    """Check the number of frames in a snippet.
+
+    Raises:
+        ConfigError: if there are fewer than two, between which there is no motion.
+    """
+    if length < 2:
+        raise ConfigError(f"snippet is {length}; it counts frames and must be at least 2 (published numbers use 5)")
+
+
+def check_lengths(lengths: Sequence[float | int]) -> None:
+    """Check the lengths of segments.
+
+    Raises:
+        ConfigError: if one is not a finite number of metres above 0.
+    """
+    for length in lengths:
+        positive("lengths", length)
+
+
 def relative_motions(T_world_cam: Float64[ndarray, "n 4 4"]) -> Float64[ndarray, "n-1 4 4"]:
     """Return the motions from each camera to the next: ``T_next_cam`` maps points of frame i to frame i + 1."""
     motions: ndarray = np.linalg.inv(T_world_cam[1:]) @ T_world_cam[:-1]
@@ -96,8 +116,10 @@ def snippet_ate(predicted: Float[ndarray, "p 4 4"], true: Float[ndarray, "m 4 4"
         length: Positions in a snippet.
 
     Raises:
+        ConfigError: if a snippet has fewer than two positions.
         DataError: if there is no motion, or their numbers differ.
     """
+    check_snippet(length)
     _same_length(predicted, true, "motions", at_least=1)
     errors, points = [], []
     for start in range(len(true)):
@@ -191,8 +213,10 @@ def segment_errors(
         step: A segment of each length starts at every ``step``-th frame.
 
     Raises:
+        ConfigError: if a length is not above 0.
         DataError: if there are fewer than two poses, or their numbers differ.
     """
+    check_lengths(lengths)
     _same_length(predicted, true, "poses", at_least=2)
     driven = np.concatenate(([0.0], np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).cumsum()))
     translations, rotations = [], []

@@ -13,6 +13,7 @@ from saunet.checks import ConfigError, positive, require_matplotlib
 from saunet.published import published
 from saunet.report import figures, tables
 from saunet.report.document import Document, Figure, Gallery, Missing, Picture, Scene, Section, Table
+from saunet.report.groups import Groups, comparable
 from saunet.report.inputs import Inputs
 from saunet.report.models import Seen, look
 from saunet.report.runs import Run
@@ -113,7 +114,7 @@ def build(
     if galleries:
         sections.append(Section("Depth side by side", galleries, _READING))
     missing += _no_pictures(views, galleries)
-    points, table10, no_speed = speed(inputs.benchmarks, shown, {name: sizes[name] for name in shown if name in sizes})
+    points, table10, no_speed = speed(inputs.benchmarks, shown, seen)
     if table10:
         sections.append(Section("Accuracy and time", [*_speed(points, options.figures), table10]))
     missing += [*no_rows, *no_sizes, *no_ablation, *no_speed]
@@ -171,11 +172,11 @@ def _runs(groups: Sequence[_Group], draw: bool, missing: list[Missing]) -> list[
         if sweeps_ratio(list(group.runs.values())) and draw:
             drawing = figures.draw_ratio(group.runs)
             if drawing is None:
-                missing.append(Missing(f"Errors against α/β of {group.title}", "fewer than two jobs have a score"))
+                why = "fewer than two jobs have scores that compare"
+                missing.append(Missing(f"Errors against α/β of {group.title}", why))
                 continue
-            caption = (
-                "Errors at the best epoch, or of the evaluation where there is one, against the ratio of eq. (14)."
-            )
+            shared = list(comparable(group.runs).values())
+            caption = f"Errors against the ratio of eq. (14). {Groups(shared)(shared[0])}."
             picture = Picture(f"{group.name}_ratio.svg", drawing, "errors against the ratio alpha/beta")
             blocks.append(Figure("Choice of α and β", picture, caption))
     return blocks
@@ -257,7 +258,7 @@ def _speed(points: Sequence[tuple[str, float, float]], draw: bool) -> list[Figur
     printed = [(f"{one.method}, published ({one.device})", one.a1, one.seconds) for one in published().figure10]
     picture = Picture("figure10.svg", figures.draw_speed(points, printed), "seconds an image against accuracy")
     caption = (
-        "A measured time belongs to the runs whose depth network has exactly the benchmark's number of parameters. "
+        "Times of single images. One belongs to the runs whose network has the benchmark's parameters and size. "
         "Hollow: the only time that the paper gives in numbers, from another device and data set."
     )
     return [Figure("Fig. 10. Accuracy against time", picture, caption)]

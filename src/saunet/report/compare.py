@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from rich.box import HORIZONTALS
 from rich.console import Console
@@ -14,8 +15,10 @@ from saunet.evaluation.result import Comparison, ImageRow
 from saunet.evaluation.statistics import compare as paired
 from saunet.evaluation.writers import read_rows
 from saunet.report.document import Column, Row, Table
+from saunet.report.evaluations import read_evaluation
+from saunet.report.groups import Groups
 from saunet.report.inputs import Inputs
-from saunet.report.runs import Run
+from saunet.report.runs import SUBJECTS, Run
 from saunet.report.settings import differing, labels, values
 from saunet.report.tables import ERRORS
 
@@ -34,41 +37,74 @@ def settings_table(runs: Mapping[str, Run]) -> Table:
 
 def scores_table(runs: Mapping[str, Run]) -> Table:
     """Return the scores of runs side by side, grouped by what they were measured on."""
-    scored = [(name, score) for name, run in runs.items() for score in run.scores if score.predictor == "model"]
-    rows = [
-        Row((name, *score.errors), "measured", f"{score.data}, protocol {score.protocol}, {score.images} images")
-        for name, score in scored
-    ]
+    scored = dict.fromkeys((name, score) for name, run in runs.items() for score in run.scores if not score.trivial)
+    group = Groups(score for _, score in scored)
+    rows = [Row((name, *score.errors), "measured", group(score)) for name, score in scored]
     rows.sort(key=lambda row: row.group)
     return Table("scores", "Scores", (Column("run"), *ERRORS), tuple(rows))
 
 
-def comparisons(runs: Mapping[str, Run]) -> tuple[list[Comparison], list[str]]:
-    """Compare each run with the first one, image by image, under every protocol that both were evaluated with.
+@dataclass(frozen=True)
+class Scored:
+    """One run's errors on each image under one protocol, from one evaluation."""
+
+    rows: tuple[ImageRow, ...]
+    data: str
+    """What the images are, such as ``kitti, test split``."""
+    how: str
+    """Settings that change the numbers; empty for none."""
+    foreign: bool
+    """Of another system: how it was predicted is not known."""
+
+    @property
+    def images(self) -> frozenset[str]:
+        """The names of the images."""
+        return frozenset(row.name for row in self.rows)
+
+    def pairs(self, other: Scored) -> bool:
+        """Tell whether both are of the same images, predicted with the same settings."""
+        return self.images == other.images and (self.how == other.how or self.foreign or other.foreign)
+
+
+def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
+    """Compare each run with the first one, image by image, wherever both were evaluated alike.
+
+    Among all evaluations of two runs under a protocol, those of the same images and settings are paired.
 
     Returns:
-        The comparisons, and a sentence for each that could not be made.
+        A table for each comparison, and a sentence for each that could not be made.
     """
     names = list(runs)
-    rows = {name: _rows(run) for name, run in runs.items()}
-    found, left_out = [], []
+    found = {name: _scored(run) for name, run in runs.items()}
+    tables, left_out = [], []
     for other in names[1:]:
-        common = [key for key in rows[names[0]] if key in rows[other]]
-        if not common:
+        both = [protocol for protocol in found[names[0]] if protocol in found[other]]
+        if not both:
             left_out.append(
                 f"{names[0]} and {other} were not both evaluated under one protocol, so nothing is paired; "
-                "run saunet-evaluate on both checkpoints with the same data"
+                "run saunet-evaluate on both with the same data"
             )
-        for key in common:
+        for protocol in both:
+            ours, theirs = found[names[0]][protocol], found[other][protocol]
+            pairs = [(one, two) for one in ours for two in theirs if one.pairs(two)]
             try:
-                found.append(paired(rows[names[0]][key], rows[other][key], names=(names[0], other)))
+                for one, two in pairs:
+                    comparison = paired(one.rows, two.rows, names=(names[0], other))
+                    tables.append(comparison_table(comparison, _told(one, two)))
+                if not pairs:
+                    left_out.append(f"{names[0]} and {other} under {protocol}: {_apart(ours, theirs)}")
             except DataError as reason:
-                left_out.append(f"{names[0]} and {other} under {key}: {reason}")
-    return found, left_out
+                left_out.append(f"{names[0]} and {other} under {protocol}: {reason}")
+    return tables, left_out
 
 
-def comparison_table(comparison: Comparison) -> Table:
-    """Return one paired comparison as a table."""
+def comparison_table(comparison: Comparison, what: str) -> Table:
+    """Return one paired comparison as a table.
+
+    Args:
+        comparison: The comparison.
+        what: Which images, and how they were predicted.
+    """
     columns = (
         Column("error"),
         Column(comparison.first, 4),
@@ -87,8 +123,8 @@ def comparison_table(comparison: Comparison) -> Table:
     )
     pair = f"{comparison.second} minus {comparison.first}"
     title = f"Paired on {comparison.images} images under {comparison.protocol}: {pair}"
-    note = f"resampled: {comparison.groups} {comparison.by}s"
-    return Table("paired", title, columns, rows, (note,))
+    notes = (f"{what};", f"resampled: {comparison.groups} {comparison.by}s")
+    return Table("paired", title, columns, rows, notes)
 
 
 def print_table(table: Table, console: Console) -> None:
@@ -113,18 +149,45 @@ def print_table(table: Table, console: Console) -> None:
     console.print(shown, "")
 
 
-def _rows(run: Run) -> dict[str, Sequence[ImageRow]]:
-    """Return the rows of a run's evaluations by protocol; of several under one protocol, the last."""
-    found: dict[str, list[ImageRow]] = {}
+def _scored(run: Run) -> dict[str, list[Scored]]:
+    """Return a run's evaluations by protocol; of several with the same images and settings, the last."""
+    found: dict[str, dict[tuple[frozenset[str], str], Scored]] = {}
     for folder in run.evaluations:
         if not (folder / "per_image.csv").is_file():
             continue
+        evaluation = read_evaluation(folder)
         table: dict[str, list[ImageRow]] = {}
         for row in read_rows(folder / "per_image.csv"):
-            if row.predictor == "model":
+            if row.predictor in SUBJECTS:
                 table.setdefault(row.protocol, []).append(row)
-        found |= table
-    return dict(found)
+        for protocol, rows in table.items():
+            scored = Scored(tuple(rows), evaluation.data, evaluation.how, evaluation.predictions is not None)
+            found.setdefault(protocol, {})[scored.images, scored.how] = scored
+    return {protocol: list(members.values()) for protocol, members in found.items()}
+
+
+def _told(one: Scored, two: Scored) -> str:
+    """Say what two paired evaluations are of: the settings once where they are equal."""
+    if one.how == two.how:
+        return ", ".join(filter(None, (one.data, one.how)))
+    first, second = (each.how or ("as predicted elsewhere" if each.foreign else "plain") for each in (one, two))
+    return f"{one.data}; the first {first}, the second {second}"
+
+
+def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
+    """Say why no evaluation of one run pairs with any of the other."""
+    for one in ours:
+        for two in theirs:
+            if one.images == two.images:
+                return (
+                    f"the first was evaluated with {one.how or 'no flip or scale'} and the second with "
+                    f"{two.how or 'no flip or scale'}; run saunet-evaluate on both with the same settings"
+                )
+    counts = [", ".join(f"{len(one.images)} of {one.data}" for one in each) for each in (ours, theirs)]
+    return (
+        f"the images do not pair up ({counts[0]} against {counts[1]}, by their names not the same); "
+        "run saunet-evaluate on both with the same data"
+    )
 
 
 def print_comparison(inputs: Inputs, wanted: Sequence[str], console: Console) -> None:
@@ -150,7 +213,7 @@ def print_comparison(inputs: Inputs, wanted: Sequence[str], console: Console) ->
     if scores.rows:
         print_table(scores, console)
     found, left_out = comparisons(runs)
-    for comparison in found:
-        print_table(comparison_table(comparison), console)
+    for table in found:
+        print_table(table, console)
     for sentence in left_out:
         console.print(f"left out: {escape(sentence)}")

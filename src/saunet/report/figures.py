@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from saunet.report.curves import curve
+from saunet.report.groups import comparable
 from saunet.report.runs import Run
 from saunet.report.settings import RATIO, ratio
-from saunet.report.tables import best_score
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7b6fd0", "#444444")
 """Okabe and Ito's colours, which colour-blind readers can tell apart, the yellow left out on white paper."""
@@ -70,11 +70,11 @@ def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, o
 
 
 def draw_ratio(runs: Mapping[str, Run]) -> bytes | None:
-    """Draw Abs Rel and accuracy against the ratio alpha/beta of eq. (14); None if fewer than two runs have both."""
+    """Draw Abs Rel and accuracy against the ratio alpha/beta of eq. (14); None if fewer than two runs compare."""
     points = sorted(
         (value, score.errors[0], score.errors[4])
-        for run in runs.values()
-        if (value := ratio(run)) is not None and (score := best_score(run)) is not None
+        for name, score in comparable(runs).items()
+        if (value := ratio(runs[name])) is not None
     )
     if len(points) < 2:
         return None

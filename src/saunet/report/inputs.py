@@ -6,12 +6,11 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from saunet.checks import DataError, one_of
-from saunet.metrics.functional import ERROR_NAMES
-from saunet.report.files import read_json, read_mapping
-from saunet.report.runs import Explained, Run, Score, Status, read_run, split_overrides
+from saunet.report.evaluations import Evaluation, belongs, read_evaluation
+from saunet.report.files import read_mapping
+from saunet.report.runs import Run, Status, began, home, read_run, split_overrides
 
 Jobs = Callable[[Path], "list[list[str]] | None"]
 """Returns the overrides of every job that a sweep folder was to hold; None where that cannot be told."""
@@ -41,14 +40,6 @@ class Inputs:
         return (*self.runs, *(run for sweep in self.sweeps for run in sweep.runs))
 
 
-@dataclass(frozen=True)
-class _Evaluation:
-    folder: Path
-    checkpoint: Path | None
-    scores: tuple[Score, ...]
-    explained: tuple[Explained, ...]
-
-
 def collect(
     paths: Sequence[str | Path], checkpoint: str = "best", jobs: Jobs | None = None, *, strangers: bool = True
 ) -> Inputs:
@@ -59,7 +50,7 @@ def collect(
         checkpoint: Which checkpoint of a run is meant, ``best`` or ``last``.
         jobs: Tells which jobs a sweep should have, so that those without a folder are not forgotten.
         strangers: An evaluation of a run that is not named stands for that run; otherwise it does so only where fewer
-            than two runs are named.
+            than two runs are named. One of another system's predictions always stands for that system.
 
     Raises:
         ConfigError: if the checkpoint is neither.
@@ -70,7 +61,7 @@ def collect(
         raise DataError("no run given; name folders of runs or sweeps, or checkpoints: saunet-report outputs/train/...")
     runs: dict[Path, Run] = {}
     sweeps: dict[Path, Sweep] = {}
-    evaluations: dict[Path, _Evaluation] = {}
+    evaluations: dict[Path, Evaluation] = {}
     benchmarks: dict[Path, None] = {}
     for path in map(Path, paths):
         found = _find(path)
@@ -81,7 +72,7 @@ def collect(
             if kind == "sweep":
                 sweeps[place] = _read_sweep(place, checkpoint, jobs)
             elif kind == "evaluation":
-                evaluations[place] = _read_evaluation(place)
+                evaluations[place] = read_evaluation(place)
             elif kind == "benchmark":
                 benchmarks[place] = None
             elif kind == "checkpoint":
@@ -91,20 +82,21 @@ def collect(
     known = [*runs.values(), *(run for sweep in sweeps.values() for run in sweep.runs)]
     for run in known:  # evaluations written into the run's own folder
         for file in sorted(run.path.rglob("metrics.json")) if run.path.is_dir() else ():
-            evaluations.setdefault(file.parent, _read_evaluation(file.parent))
+            evaluations.setdefault(file.parent, read_evaluation(file.parent))
     take = strangers or len(known) < 2
-    for evaluation in evaluations.values() if take else ():
-        if not any(_belongs(evaluation, run) for run in known):
+    for evaluation in evaluations.values():
+        foreign = evaluation.predictions is not None  # of no run at all, so it was named for its own sake
+        if (take or foreign) and not any(belongs(evaluation, run) for run in known):
             origin = evaluation.checkpoint
-            if origin and origin.is_file():
+            if origin and origin.is_file() and not foreign:
                 orphan = _read_checkpoint(origin)
             else:
-                orphan = Run(evaluation.folder, name=evaluation.folder.name)
+                orphan = Run(evaluation.folder, name=evaluation.name)
             runs[orphan.path] = orphan
             known.append(orphan)
 
     def scored(run: Run) -> Run:
-        mine = [evaluation for evaluation in evaluations.values() if _belongs(evaluation, run)]
+        mine = [evaluation for evaluation in evaluations.values() if belongs(evaluation, run)]
         scores = (*(score for evaluation in mine for score in evaluation.scores), *run.scores)
         explained = tuple(row for evaluation in mine for row in evaluation.explained)
         folders = tuple(evaluation.folder for evaluation in mine)
@@ -127,14 +119,15 @@ def _find(path: Path, depth: int = 3) -> list[tuple[str, Path]]:
         raise DataError(f"there is nothing at {path}; check the path")
     if (path / "multirun.yaml").is_file():
         return [("sweep", path)]
-    if any((path / name).exists() for name in ("run.json", "csv", "checkpoints")):
+    if began(path):
         return [("run", path)]
     if (path / "benchmark.json").is_file():
         return [("benchmark", path)]
     if (path / "metrics.json").is_file():
         return [("evaluation", path)]
-    if (path / ".hydra" / "config.yaml").is_file() and "optim" in read_mapping(path / ".hydra" / "config.yaml"):
-        return [("run", path)]
+    if "optim" in read_mapping(path / ".hydra" / "config.yaml"):
+        place = home(path)
+        return [("run", place)] if began(place) or place == path.resolve() else []
     below = sorted(child for child in path.iterdir() if child.is_dir() and not child.name.startswith("."))
     return [found for child in below for found in _find(child, depth - 1)] if depth else []
 
@@ -147,7 +140,8 @@ def _read_sweep(folder: Path, checkpoint: str, jobs: Jobs | None) -> Sweep:
         hydra = read_mapping(place / ".hydra" / "hydra.yaml").get("hydra") or {}
         number = (hydra.get("job") or {}).get("num")
         number = number if isinstance(number, int) and number not in found else len(found)
-        found[number] = read_run(place, checkpoint, number)
+        led = home(place)
+        found[number] = read_run(led if began(led) else place, checkpoint, number)
     planned = jobs(folder) if jobs else None
     going_on = any(run.status == "running" for run in found.values())
     last = max(found, default=-1)
@@ -167,43 +161,7 @@ def _read_sweep(folder: Path, checkpoint: str, jobs: Jobs | None) -> Sweep:
 def _read_checkpoint(file: Path) -> Run:
     """Return the run that a checkpoint belongs to, with this checkpoint; the checkpoint alone where there is none."""
     folder = file.parents[1] if len(file.parents) > 1 else file.parent
-    if file.parent.name == "checkpoints" and (folder / ".hydra").is_dir():
+    if file.parent.name == "checkpoints" and any((folder / name).exists() for name in (".hydra", "run.json")):
         run = read_run(folder, file.stem)
         return dataclasses.replace(run, checkpoint=file)
     return Run(file, name=file.stem, checkpoint=file)
-
-
-def _read_evaluation(folder: Path) -> _Evaluation:
-    """Read the scores of an evaluation and find out which checkpoint they belong to."""
-    content: Any = read_json(folder / "metrics.json")
-    content = content if isinstance(content, dict) else {}
-    config = read_mapping(folder / ".hydra" / "config.yaml")
-    hydra = read_mapping(folder / ".hydra" / "hydra.yaml").get("hydra") or {}
-    runtime = hydra.get("runtime") or {}
-    settings = content.get("settings")  # all there is where `output_dir` led the results out of the run's folder
-    settings = settings if isinstance(settings, dict) else {}
-    given = config.get("checkpoint") or settings.get("checkpoint")
-    starts = [Path(runtime["cwd"])] if runtime.get("cwd") else [Path.cwd(), *folder.parents]
-    candidates = [Path(start, str(given)).resolve() for start in starts] if given else []
-    checkpoint = next((each for each in candidates if each.is_file()), next(iter(candidates), None))
-    data = (runtime.get("choices") or {}).get("data") or settings.get("data") or "unknown data"
-    place = f"{data}, {config.get('split') or settings.get('split') or 'test'} split"
-    scores = tuple(
-        Score(row["predictor"], row["protocol"], place, row.get("images") or 0, tuple(row[key] for key in ERROR_NAMES))
-        for row in content.get("results", [])
-        if all(isinstance(row.get(key), int | float) for key in ERROR_NAMES)
-    )
-    keys = ("condition", "images", "warped", "unwarped", "explained")
-    explained = tuple(
-        Explained(row["protocol"], place, *(row[key] for key in keys))
-        for row in content.get("views", [])
-        if row.get("predictor") == "model" and all(row.get(key) is not None for key in keys)
-    )
-    return _Evaluation(folder, checkpoint, scores, explained)
-
-
-def _belongs(evaluation: _Evaluation, run: Run) -> bool:
-    if run.path.is_dir() and run.path in (evaluation.folder, *evaluation.folder.parents):
-        return True
-    place = evaluation.checkpoint
-    return place is not None and (place in (run.path, run.checkpoint) or run.path in place.parents)

@@ -22,6 +22,8 @@ class Seen:
 
     parameters: tuple[int, int]
     """Of the depth and the pose network."""
+    size: tuple[int, int]
+    """Height and width of its input in pixels."""
     disparities: tuple[Float32[np.ndarray, "_ _"], ...]
     """One for each view, at the image's size."""
 
@@ -48,4 +50,5 @@ def look(run: Run, views: Sequence[View], device: str = "cpu", flip: bool = Fals
         disparities = tuple(predictor.predict(view.image, view.title).disparity for view in views)
     except SaunetError as error:
         return str(error)
-    return Seen((count_parameters(depth), count_parameters(pose)), disparities)
+    size = (record.height, record.width)
+    return Seen((count_parameters(depth), count_parameters(pose)), size, disparities)

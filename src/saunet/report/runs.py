@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import socket
 import time
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,8 @@ from saunet.report.files import read_json, read_mapping, read_numbers, read_yaml
 Status = Literal["finished", "running", "failed", "interrupted", "unfinished", "unknown"]
 BROKEN: tuple[Status, ...] = ("failed", "interrupted", "unfinished")
 """How a run can end without having trained to its end."""
+SUBJECTS = ("model", "predictions")
+"""What ``saunet-evaluate`` calls what it scores: a checkpoint's network, or another system's files."""
 SIGN_OF_LIFE = 600.0
 """Seconds: a run on another machine that wrote nothing for so long does not run any more."""
 
@@ -34,6 +37,15 @@ class Score:
     """In the order of `saunet.metrics.functional.ERROR_NAMES`."""
     validation: bool = False
     """Taken from the training's own validation, not from an evaluation."""
+    fingerprint: str = ""
+    """SHA-256 of the names of the images; empty where it was not recorded."""
+    how: str = ""
+    """Settings that change the numbers, such as ``flip=true, scale.method=speed``; empty for none."""
+
+    @property
+    def trivial(self) -> bool:
+        """It is of a predictor that looks at no image, which stands beside what was scored."""
+        return self.predictor not in SUBJECTS
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +62,10 @@ class Explained:
     """The same without warping."""
     explained: float
     """Share of pixels that warping brings closer."""
+    fingerprint: str = ""
+    """SHA-256 of the names of the images of all conditions; empty where it was not recorded."""
+    how: str = ""
+    """Settings that change the numbers, as in `Score`."""
 
 
 @dataclass(frozen=True)
@@ -106,14 +122,15 @@ def read_run(folder: Path, checkpoint: str = "best", job: int | None = None) -> 
         checkpoint: Which of its checkpoints is wanted, ``best`` or ``last``; the other one where it is missing.
         job: Its number in a sweep.
     """
-    hydra = read_mapping(folder / ".hydra" / "hydra.yaml").get("hydra") or {}
-    choices = (hydra.get("runtime") or {}).get("choices") or {}
-    config = read_mapping(folder / ".hydra" / "config.yaml")
     record = read_json(folder / "run.json")
     record = record if isinstance(record, dict) else {}
+    hydra = read_mapping(folder / ".hydra" / "hydra.yaml").get("hydra") or {}
+    choices = record.get("choices") or (hydra.get("runtime") or {}).get("choices") or {}
+    config = record.get("config") or read_mapping(folder / ".hydra" / "config.yaml")
+    overrides = record.get("overrides") or read_yaml(folder / ".hydra" / "overrides.yaml") or []
     status, error = _state(folder, record)
     history = read_numbers(folder / "csv" / "metrics.csv")
-    score = _validation(history, config, choices)
+    score = _validation(history, config, choices, record)
     files = [folder / "checkpoints" / f"{name}.ckpt" for name in (checkpoint, "best", "last")]
     return Run(
         path=folder,
@@ -122,13 +139,37 @@ def read_run(folder: Path, checkpoint: str = "best", job: int | None = None) -> 
         name=str(record.get("name") or config.get("name") or folder.name),
         config=config,
         choices={key: str(value) for key, value in choices.items() if value and not key.startswith("hydra/")},
-        overrides=split_overrides(read_yaml(folder / ".hydra" / "overrides.yaml") or []),
+        overrides=split_overrides(overrides),
         record=record,
         history=history,
         checkpoint=next((file for file in files if file.is_file()), None),
         scores=(score,) if score else (),
         job=job,
     )
+
+
+def began(folder: Path) -> bool:
+    """Tell whether a folder holds what a training writes besides its config."""
+    return any((folder / name).exists() for name in ("run.json", "csv", "checkpoints"))
+
+
+def home(folder: Path) -> Path:
+    """Return where the run is whose config Hydra left in a folder: elsewhere where ``output_dir`` led it."""
+    if began(folder):
+        return folder
+    config = read_mapping(folder / ".hydra" / "config.yaml")
+    hydra = read_mapping(folder / ".hydra" / "hydra.yaml").get("hydra") or {}
+
+    def looked_up(reference: re.Match[str]) -> str:
+        if reference[0] == "${hydra:runtime.output_dir}":
+            return str(folder)  # which may have been moved since
+        node: Any = hydra if reference[1] else config
+        for key in reference[2].split("."):
+            node = node.get(key) if isinstance(node, Mapping) else None
+        return reference[0] if node is None else str(node)
+
+    given = re.sub(r"\$\{(hydra:)?([\w.]+)\}", looked_up, str(config.get("output_dir") or folder))
+    return Path((hydra.get("runtime") or {}).get("cwd") or "", given).resolve()
 
 
 def split_overrides(overrides: Sequence[str]) -> dict[str, str]:
@@ -163,7 +204,10 @@ def _alive(folder: Path, record: Mapping[str, Any]) -> bool:
 
 
 def _validation(
-    history: Sequence[Mapping[str, float]], config: Mapping[str, Any], choices: Mapping[str, Any]
+    history: Sequence[Mapping[str, float]],
+    config: Mapping[str, Any],
+    choices: Mapping[str, Any],
+    record: Mapping[str, Any],
 ) -> Score | None:
     """Return the errors of the epoch that the run itself would call its best, if any was measured."""
     rows = [row for row in history if all(f"val/{name}" in row for name in ERROR_NAMES)]
@@ -174,5 +218,6 @@ def _validation(
     best = min(rows, key=lambda row: row[monitor])
     data = f"{choices.get('data') or 'its data'}, validation split"
     errors = tuple(best[f"val/{name}"] for name in ERROR_NAMES)
-    protocol = str(config.get("protocol") or "of the data")
-    return Score("model", protocol, data, int(best.get("val/images", 0)), errors, validation=True)
+    protocol = str(record.get("protocol") or config.get("protocol") or "of the data")
+    images, fingerprint = int(best.get("val/images", 0)), (record.get("splits") or {}).get("val", "")
+    return Score("model", protocol, data, images, errors, validation=True, fingerprint=fingerprint)

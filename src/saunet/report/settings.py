@@ -103,6 +103,8 @@ def _labels(runs: Sequence[Run]) -> list[str]:
 
 
 def _label(run: Run, keys: Sequence[str]) -> str:
+    if not run.config and not run.overrides:  # another system's predictions, or a checkpoint alone
+        return run.name
     networks = [key for key in ("model.encoder", "model.decoder", "model/encoder", "model/decoder") if key in keys]
     parts = []
     if networks:  # always named in full: encoder + decoder

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from saunet.published import published
 from saunet.report.document import Cell, Column, Missing, Row, Table
+from saunet.report.groups import Groups, chosen
 from saunet.report.runs import Run, Score
 from saunet.report.settings import RATIO, differing, ratio, values
 
@@ -30,11 +31,12 @@ def table1(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
     """
     rows = [Row((row.method, row.pattern, *row.errors), "published", PRINTED) for row in published().table1]
     ours, without = _scored(runs)
+    group = Groups(score for _, score in ours)
     rows += [
         Row(
-            (name if score.predictor == "model" else score.predictor, _pattern(runs[name], score), *score.errors),
+            (score.predictor if score.trivial else name, _pattern(runs[name], score), *score.errors),
             "measured",
-            _group(score),
+            group(score),
         )
         for name, score in ours
     ]
@@ -55,15 +57,14 @@ def explained_table(runs: Mapping[str, Run]) -> Table | None:
     Args:
         runs: Runs by their short names.
     """
+    ours = dict.fromkeys((name, one) for name, run in runs.items() for one in run.explained)
+    group = Groups(one for _, one in ours)
     rows = [
-        Row(
-            (name, one.condition, one.images, one.warped, one.unwarped, one.explained),
-            "measured",
-            f"Measured: {one.data}, protocol {one.protocol}",
-        )
-        for name, run in runs.items()
-        for one in run.explained
+        Row((name, one.condition, one.images, one.warped, one.unwarped, one.explained), "measured", group(one))
+        for name, one in ours
     ]
+    order = list(dict.fromkeys(row.group for row in rows))
+    rows.sort(key=lambda row: order.index(row.group))
     columns = (
         Column("Method"),
         Column("Condition"),
@@ -106,14 +107,15 @@ def table3(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
         for row in published().table3
     ]
     ours, _ = _scored({name: run for name, run in runs.items() if run.component("model/encoder")})
-    models = [(name, score) for name, score in ours if score.predictor == "model"]
+    models = [(name, score) for name, score in ours if not score.trivial]
+    group = Groups(score for _, score in models)
     kinds = {_networks(runs[name]) for name, _ in models}
     columns = (Column("Method"), Column("STF-T"), Column("Attention"), *ERRORS)
     notes = ["The paper's first two rows are digit for digit Mono R18 and Mono R50 of its Table 1."]
     missing = []
     if len(kinds) > 1:
         rows += [
-            Row((" + ".join(_networks(runs[name])), *_ticks(runs[name]), *score.errors), "measured", _group(score))
+            Row((" + ".join(_networks(runs[name])), *_ticks(runs[name]), *score.errors), "measured", group(score))
             for name, score in models
         ]
         rest = [key for key in differing([runs[name] for name, _ in models]) if not key.startswith("model.")]
@@ -149,9 +151,12 @@ def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -
         ERRORS[4],
         Column("Minutes", 1),
     )
+    scores = chosen(runs)
+    group = Groups(scores.values())
+    several = len({group(score) for score in scores.values()}) > 1
     rows = []
     for (label, run), number in zip(runs.items(), ratios, strict=True):
-        score = best_score(run)
+        score = scores.get(label)
         rows.append(
             Row(
                 (
@@ -164,16 +169,14 @@ def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -
                     run.seconds / 60 if run.seconds is not None else None,
                 ),
                 "failed" if run.error else "measured",
+                (group(score) if score else "Without a score") if several else "",
                 note=run.error or "",
             )
         )
-    notes = _score_notes(members)
-    return Table(name, title, columns, tuple(rows), notes)
-
-
-def best_score(run: Run) -> Score | None:
-    """Return a run's score under the first protocol it was evaluated with; else its validation; else None."""
-    return next((score for score in run.scores if score.predictor == "model"), None)
+    if several:
+        order = [*dict.fromkeys(map(group, scores.values())), "Without a score"]
+        rows.sort(key=lambda row: order.index(row.group))
+    return Table(name, title, columns, tuple(rows), _score_notes([group(score) for score in scores.values()]))
 
 
 def networks(run: Run) -> str:
@@ -189,37 +192,36 @@ def _progress(run: Run) -> tuple[Cell, Cell]:
     return (int(max(epochs)) + 1 if epochs else None), (sum(last) / len(last) if last else None)
 
 
-def _score_notes(runs: Sequence[Run]) -> tuple[str, ...]:
-    sources = {_group(score) for score in map(best_score, runs) if score}
+def _score_notes(groups: Sequence[str]) -> tuple[str, ...]:
+    sources = list(dict.fromkeys(groups))
     notes = ["Loss: mean over the last tenth of the logged steps; losses of different weights do not compare."]
-    if sources:
-        notes.append(f"Errors — {'; '.join(sorted(sources))}.")
+    if len(sources) == 1:
+        notes.append(f"Errors — {sources[0]}.")
+    elif sources:
+        notes.append("Errors of different groups do not compare.")
     return tuple(notes)
 
 
 def _scored(runs: Mapping[str, Run]) -> tuple[list[tuple[str, Score]], list[str]]:
     """Return every score once, group by group, and the runs without any; validation counts where nothing else is."""
-    found: dict[str, list[tuple[str, Score]]] = {}
-    without, trivial = [], set()
+    without = [name for name, run in runs.items() if not run.scores]
+    pairs = []
     for name, run in runs.items():
         evaluated = [score for score in run.scores if not score.validation]
-        for score in evaluated or run.scores:
-            key = (score.predictor, _group(score), tuple(round(value, 6) for value in score.errors))
-            if score.predictor != "model" and key in trivial:
-                continue  # constant depth beside every evaluation of the same images
-            trivial.add(key)
-            found.setdefault(_group(score), []).append((name, score))
-        if not run.scores:
-            without.append(name)
-    for pairs in found.values():
-        pairs.sort(key=lambda pair: pair[1].predictor != "model")  # trivial predictors last
-    return [pair for pairs in found.values() for pair in pairs], without
-
-
-def _group(score: Score) -> str:
-    kind = "Measured while training, best epoch" if score.validation else "Measured"
-    images = f"{score.images} image{'' if score.images == 1 else 's'}"
-    return f"{kind}: {score.data}, protocol {score.protocol}, {images}"
+        pairs += [(name, score) for score in evaluated or run.scores]
+    group = Groups(score for _, score in pairs)
+    found: dict[str, list[tuple[str, Score]]] = {}
+    told = set()
+    for name, score in pairs:
+        # Constant depth beside every evaluation of the same images; or a model that was evaluated twice alike.
+        who = score.predictor if score.trivial else name
+        key = (score.trivial, who, group(score), tuple(round(value, 6) for value in score.errors))
+        if key not in told:
+            told.add(key)
+            found.setdefault(group(score), []).append((name, score))
+    for members in found.values():
+        members.sort(key=lambda pair: pair[1].trivial)  # trivial predictors last
+    return [pair for members in found.values() for pair in members], without
 
 
 def _no_score(run: Run) -> str:
@@ -229,7 +231,7 @@ def _no_score(run: Run) -> str:
 
 
 def _pattern(run: Run, score: Score) -> str:
-    if score.predictor != "model" or not run.config:
+    if score.trivial or not run.config:
         return ""
     gradient = (run.config.get("objective") or {}).get("gradient") or {}
     data = run.config.get("data") or {}
