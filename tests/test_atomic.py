@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from saunet.atomic import replacing, write_bytes, write_json
+from saunet.atomic import check_folder, replacing, write_bytes, write_json
 from saunet.checks import ConfigError, DataError
 
 
@@ -70,3 +70,16 @@ def test_json_without_finite_numbers_is_refused_and_the_old_file_stays(tmp_path:
         write_json(path, {"a": [value]}, ConfigError)
     assert json.loads(path.read_text()) == [1]
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_is_looked_at_and_not_made(tmp_path: Path) -> None:
+    check_folder(tmp_path / "new" / "folder")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("in the way")
+    for place in ("file", "file/below/it"):
+        with pytest.raises(ConfigError, match=r"cannot write to .*: .*file is not a folder; choose another one"):
+            check_folder(tmp_path / place, ConfigError)
+    if os.geteuid() != 0:  # root may write everywhere
+        (tmp_path / "closed").mkdir(mode=0o500)
+        with pytest.raises(ConfigError, match="no right to write to"):
+            check_folder(tmp_path / "closed" / "x", ConfigError)

@@ -47,6 +47,25 @@ def replacing(path: str | Path, error: type[SaunetError] = DataError) -> Iterato
             temporary.unlink(missing_ok=True)
 
 
+def check_folder(folder: str | Path, error: type[SaunetError] = DataError) -> None:
+    """Check that files can be written to a folder, which need not exist, before anything long is started.
+
+    Args:
+        folder: The folder; nothing is made.
+        error: What to raise otherwise.
+
+    Raises:
+        SaunetError: of class ``error``, if a file is in the way or the rights are missing.
+    """
+    place = Path(folder).absolute()
+    while not os.path.lexists(place):
+        place = place.parent
+    if not place.is_dir():
+        raise error(f"cannot write to {folder}: {place} is not a folder; choose another one")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise error(f"cannot write to {folder}: no right to write to {place}; change the rights, or choose another one")
+
+
 def write_bytes(path: str | Path, data: bytes, error: type[SaunetError] = DataError) -> None:
     """Write ``data`` to ``path``, whole or not at all.
 

@@ -5,6 +5,10 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
 
 
 class SaunetError(Exception):
@@ -120,3 +124,20 @@ def require_matplotlib(what: str, without: str) -> None:
         import matplotlib  # noqa: F401
     except ImportError as reason:
         raise ConfigError(f"{what} matplotlib; run `pip install 'saunet[plot]'` or set {without}") from reason
+
+
+def usable_device(name: str | torch.device) -> torch.device:
+    """Return the device of a name, having tried it.
+
+    Raises:
+        ConfigError: if there is no such device, or it cannot hold a tensor.
+    """
+    import torch
+
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as reason:
+        available = ", ".join(["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))])
+        raise ConfigError(f"device '{name}' cannot be used here; available: {available}") from reason
+    return device

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from saunet.data.kitti import KittiRaw
 from saunet.metrics.functional import ERROR_NAMES
@@ -109,6 +110,20 @@ def test_exported_predictions_score_the_same_and_compare(tool: Tool, smoke_run: 
     assert [row["error"] for row in table(tmp_path / "b" / "comparison.csv")] == list(ERROR_NAMES)
 
 
+def test_exported_depth_is_scaled_by_the_first_protocol(
+    tool: Tool, smoke_run: Path, raw_root: Path, tmp_path: Path
+) -> None:
+    arguments = (checkpoint(smoke_run), *RAW, f"data.root={raw_root}", "data.test_split=all")
+    for folder, more in (("alone", ""), ("first", ",eigen_camera_z")):
+        outcome = tool("evaluate", *arguments, f"protocols=[eigen_lidar_x{more}]", f"export={folder}", "output_dir=out")
+        assert outcome.code == 0, outcome.err
+        assert f"export: 12 images as 'eigen_lidar_x' scales them; in {folder}" in outcome.out
+    alone, first = (
+        {path.name: path.read_bytes() for path in (tmp_path / each).iterdir()} for each in ("alone", "first")
+    )
+    assert alone == first
+
+
 def test_without_ground_truth_by_how_the_neighbours_are_explained(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
     outcome = tool(
         "evaluate", checkpoint(smoke_run), "data=synthetic_tiny", "protocols=[campus,synthetic]", "output_dir=out"
@@ -131,13 +146,40 @@ def test_without_ground_truth_by_how_the_neighbours_are_explained(tool: Tool, sm
         (("predictions=y.npy", "baselines=false"), "no predictions at 'y.npy'"),
         (("predictions=y.npy", "protocols=[eigen_lidar]"), "did you mean 'eigen_lidar_x'?"),
         (("predictions=y.npy", "protocols=[campus]", "baselines=false"), "no predictions at 'y.npy'"),
+        # What is known to be wrong beforehand is said before anything is read.
+        (("predictions=y.npy", "compare=nosuch"), "cannot read 'nosuch'"),
+        (("predictions=y.npy", "intervals=95"), "intervals is 95; it must lie between 0 and 1, such as intervals=0.95"),
+        (("predictions=y.npy", "output_dir=file/x"), "cannot write to file/x: "),
+        (("predictions=y.npy", "predicted=disp"), "predicted is 'disp'"),
+        (("predictions=y.npy", "device=gpu"), "device 'gpu' cannot be used here; available: cpu"),
+        (
+            ("predictions=y.npy", "protocols=synthetic"),
+            "protocols is 'synthetic'; it must be a list: protocols=[synthetic]",
+        ),
     ],
 )
-def test_what_cannot_be_evaluated(tool: Tool, overrides: tuple[str, ...], words: str) -> None:
+def test_what_cannot_be_evaluated(tool: Tool, overrides: tuple[str, ...], words: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
     outcome = tool("evaluate", "data=synthetic_tiny", *overrides)
     assert outcome.code == 1
     assert "Traceback" not in outcome.err
     assert words in outcome.err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("before", ["", "eigen_lidar_x,"], ids=["alone", "after another"])
+def test_truth_that_the_data_cannot_give(tool: Tool, raw_root: Path, before: str) -> None:
+    arguments = ("predictions=y.npy", *RAW, f"data.root={raw_root}", f"protocols=[{before}synthetic]")
+    outcome = tool("evaluate", *arguments)
+    outcome.says("protocols names 'synthetic', which is defined on 'exact' ground truth", "camera_z or lidar_x or impr")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize("name", ["evaluate", "odometry", "predict"])
+def test_a_gpu_that_is_not_there(tool: Tool, smoke_run: Path, tmp_path: Path, name: str) -> None:
+    data = ("input=x.png", "output=out") if name == "predict" else ("data=synthetic_tiny",)
+    tool(name, checkpoint(smoke_run), *data, "device=cuda").says("device 'cuda' cannot be used here; available: cpu")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_evaluation_of_other_images_is_not_compared(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
@@ -148,6 +190,8 @@ def test_an_evaluation_of_other_images_is_not_compared(tool: Tool, smoke_run: Pa
     outcome = tool("evaluate", *arguments)
     assert outcome.code == 1
     assert "has no protocol in common with this evaluation (its protocols: metric)" in outcome.err
+    (scores,) = tmp_path.rglob("metrics.json")  # what was computed is there all the same
+    assert results(scores.parent)["synthetic"]["images"] == 6
 
 
 def test_odometry_writes_paths_errors_and_a_picture(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:

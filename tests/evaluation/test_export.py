@@ -33,6 +33,7 @@ def test_scaled_by_the_median_at_native_size_and_only_where_there_is_truth(tmp_p
     exporting = ExportingPredictor(disparity, tmp_path, rules)
     first = evaluate({"m": exporting}, [batch()], [rules], ground_truth="improved", progress=False)
     assert exporting.written == 2
+    assert str(exporting).startswith("export: 2 images as 'eigen_improved' scales them, 1 left out that have no ground")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["day_a_0_l.png", "day_b_1_l.png"]
     assert read_depth(tmp_path / "day_b_1_l.png").shape == (20, 36)
     for place in range(2):

@@ -184,3 +184,14 @@ def test_unknown_words(tmp_path):
         inspect.unwrap(ForeignArray.__init__)(ForeignArray.__new__(ForeignArray), tmp_path / "a.npy", NAMES, "depths")
     with pytest.raises(ConfigError, match="match is 'names'"):
         inspect.unwrap(ForeignFolder.__init__)(ForeignFolder.__new__(ForeignFolder), tmp_path, NAMES, "depth", "names")
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0])
+def test_disparity_that_is_nowhere_positive_is_no_prediction(tmp_path, value):
+    maps = np.full((2, 3, 4), value, np.float32)
+    maps[0, 1, 1] = 0.5  # some pixels that are infinitely far away are normal
+    np.save(tmp_path / "disps.npy", maps)
+    predict = ForeignArray(tmp_path / "disps.npy", ["a", "b"])
+    assert predict({"name": ["a"]}).max() == 0.5
+    with pytest.raises(DataError, match=r"disps.npy' has disparity that is nowhere above 0 in an image"):
+        predict({"name": ["b"]})

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from saunet.checks import ConfigError, DataError
-from saunet.evaluation import evaluate_protocols, with_statistics, write_results
+from saunet.evaluation import evaluate_protocols, read_earlier, with_statistics, write_results
 from saunet.evaluation.suite import passes
 from saunet.evaluation.views import evaluate_views, summarise_views
 from saunet.metrics.protocols import protocol
@@ -131,11 +131,11 @@ def test_statistics_and_the_earlier_run(tmp_path):
     result = run(["metric"])
     write_results(result, tmp_path)
     for earlier in (tmp_path, tmp_path / "per_image.csv"):
-        found = with_statistics(result, 0.9, earlier)
+        found = with_statistics(result, 0.9, read_earlier(earlier))
         (comparison,) = found.comparisons
         assert (comparison.first, comparison.second, comparison.level) == (f"m of {earlier}", "m", 0.9)
         assert all(row.difference == 0 for row in comparison.differences)
     assert with_statistics(result, None).spreads == ()
     assert found.spreads[0].low[0] == pytest.approx(1.0)
     with pytest.raises(ConfigError, match=r"no protocol in common with this evaluation \(its protocols: metric\)"):
-        with_statistics(run(["eigen_camera_z"]), 0.95, tmp_path)
+        with_statistics(run(["eigen_camera_z"]), 0.95, read_earlier(tmp_path))

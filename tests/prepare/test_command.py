@@ -60,6 +60,8 @@ def test_each_job_runs_and_leaves_only_its_results(command, tree, tmp_path):
         (["densify", "root=/nowhere"], "no data root at /nowhere"),
         (["densify", "root=raw", "depth=lidar_x"], "depth is 'lidar_x', allowed: camera_z, improved"),
         (["densify", "root=raw", "kidns=[linear]"], "did you mean 'kinds'?"),
+        (["densify", "root=raw", "kinds=linear"], "kinds is 'linear'; it must be a list: kinds=[linear]"),
+        (["densify", "root=raw", "drives=9015"], "drives is '9015'; it must be a list: drives=[9015]"),
         (["teacher", "root=raw", "checkpoint=x.ckpt"], "x.ckpt"),
     ],
 )
@@ -68,6 +70,13 @@ def test_what_cannot_work_is_one_sentence(command, tree, words, sentence):
     assert code == 1
     assert sentence in err
     assert "Traceback" not in err
+
+
+def test_what_is_refused_leaves_nothing(command, tree, tmp_path):
+    code, _, err = command("densify", f"root={tree}", "cameras=[left]", "workers=-1", "folder=maps")
+    assert code == 1
+    assert "workers is -1; it must be at least 0" in err
+    assert not (tmp_path / "maps").exists()
 
 
 def test_skipped_frames_are_named(command, tree):

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from saunet.benchmarking.measure import count_flops, count_parameters, matmul_ceiling, measure_latency, peak_memory
-from saunet.checks import ConfigError, divisible, one_of, positive
+from saunet.checks import ConfigError, divisible, one_of, positive, usable_device
 
 _DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 _MODES = ("eager", "compiled")
@@ -59,7 +59,7 @@ class Plan:
         for size in self.sizes:
             _parse(size)
         for device in self.devices:
-            _device(device)
+            usable_device(device)
         for precision in self.precisions:
             one_of("precisions", precision, _DTYPES)
         for mode in self.modes:
@@ -115,7 +115,7 @@ def run_suite(
     cases = list(itertools.product(models, plan.devices, plan.precisions, plan.sizes, plan.modes, plan.batch_sizes))
     steps, done = len(cases) * (plan.runs + plan.warmup), 0
     ceilings = {
-        (device, precision): matmul_ceiling(_device(device), _DTYPES[precision])
+        (device, precision): matmul_ceiling(usable_device(device), _DTYPES[precision])
         for device in plan.devices
         for precision in plan.precisions
     }
@@ -145,7 +145,7 @@ def _measure(
     ceiling: float,
     tick: Callable[[], None],
 ) -> Measurement:
-    device, dtype = _device(device_name), _DTYPES[precision]
+    device, dtype = usable_device(device_name), _DTYPES[precision]
     height, width = _parse(size)
     flops = count_flops(networks.depth, torch.zeros(1, 3, height, width, device=_home(networks.depth)))
     network = copy.deepcopy(networks.depth).eval().to(device, dtype)
@@ -194,13 +194,3 @@ def _parse(size: str) -> tuple[int, int]:
     if len(sides) != 2 or not all(side.isdigit() and int(side) > 0 for side in sides):
         raise ConfigError(f"size is '{size}'; write height and width in pixels, such as 192x640")
     return int(sides[0]), int(sides[1])
-
-
-def _device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as reason:
-        first = (str(reason).splitlines() or ["unknown"])[0]
-        raise ConfigError(f"device '{name}' cannot be used here ({first}); use cpu, or another device") from reason
-    return device

@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from saunet import schema
-from saunet.checks import SaunetError, suggest
+from saunet.checks import SaunetError, suggest, usable_device
 from saunet.cli._globs import expand_globs
 from saunet.cli._sweep import check_folder, summary, swept_folder
 from saunet.config import config_dir, register_configs
@@ -118,10 +118,16 @@ def _end_sweep(name: str, other: str | None = None) -> None:
 
 
 def pick_device(name: str) -> str:
-    """Return the device that ``auto`` stands for: a GPU where there is one; any other name as it is."""
+    """Return the device that ``auto`` stands for: a GPU where there is one; any other name as it is, once tried.
+
+    Raises:
+        ConfigError: if there is no such device.
+    """
     import torch
 
-    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    return str(usable_device(name))
 
 
 class _NoAdvertisement(logging.Filter):
@@ -198,10 +204,18 @@ def sentence(error: Exception) -> str | None:
         key, owner = unknown.groups()
         allowed = _keys(owner)
         return f"unknown key '{full_key[1]}'{suggest(key, allowed) or ';'} allowed: {', '.join(allowed)}"
+    if full_key and "is not a ListConfig" in text:
+        return _not_a_list(full_key[1])
     wrong = re.search(r"Value '.*' of type .*", text)
     if wrong and full_key:
         return f"{full_key[1]}: {wrong[0][0].lower()}{wrong[0][1:]}"
     return " ".join(text.split())
+
+
+def _not_a_list(key: str) -> str:
+    """Say how to write a list of what was given; the command line knows it, Hydra's error does not."""
+    given = [word.partition("=")[2] for word in sys.argv[1:] if word.lstrip("+").startswith(f"{key}=")]
+    return f"{key} is {given[-1]!r}; it must be a list: {key}=[{given[-1]}]" if given else f"{key} must be a list"
 
 
 def _unknown_choice(text: str) -> str:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from omegaconf import DictConfig
 
-from saunet import config
-from saunet.checks import ConfigError, DataError
+from saunet import config, schema
+from saunet.checks import ConfigError, DataError, one_of
 from saunet.cli._app import pick_device
 
 
@@ -40,6 +40,8 @@ class Subject:
 
     motion: Any = None
     """The camera's motion as it predicts it, for protocols without ground truth."""
+    exporter: Any = None
+    """What writes its predictions, once there is one."""
 
     def __init__(self, cfg: DictConfig, fixed: Mapping[str, Any]) -> None:
         self.cfg = cfg
@@ -47,11 +49,31 @@ class Subject:
         self.node = {**node, **{key: value for key, value in fixed.items() if key in node}}
 
     def data(self, kind: str | None) -> Any:
-        """Return the data module, with ground truth of a kind where it has the choice."""
+        """Return the data module, with ground truth of a kind where it has the choice.
+
+        Raises:
+            ConfigError: if a protocol needs ground truth that these data cannot give.
+        """
         from saunet.registry import instantiate
 
         chosen = {"depth": kind} if kind is not None and "depth" in self.node else {}
-        return instantiate({**self.node, **chosen})
+        data = instantiate({**self.node, **chosen})
+        if kind is None:  # the first call: before anything is scored
+            self._check_protocols(data)
+        return data
+
+    def _check_protocols(self, data: Any) -> None:
+        from saunet.metrics.protocols import protocol
+
+        choice = schema.parameters(type(data))["depth"].annotation if "depth" in self.node else None
+        kinds = tuple(dict.fromkeys([data.ground_truth, *get_args(choice)]))
+        for name in self.cfg.protocols or []:
+            rules = protocol(name)
+            if rules.ground_truth not in ("none", *kinds) and not rules.accepts(data.ground_truth):
+                raise ConfigError(
+                    f"protocols names '{name}', which is defined on '{rules.ground_truth}' ground truth, and "
+                    f"these data give {' or '.join(kinds)}; choose other protocols or data"
+                )
 
     def predictors(self, data: Any) -> dict[str, Any]:
         """Return what to score on these data, first the subject, then those that look at no image."""
@@ -62,9 +84,9 @@ class Subject:
         name, predictor = self.predictor(data)
         if self.cfg.truth_cache:
             cache_truths(data.datasets[self.cfg.split].drives, self.cfg.truth_cache)
-        if self.cfg.export:
+        if self.cfg.export and self.exporter is None:  # in the first pass, which is of the first protocol's truth
             rules = protocol((list(self.cfg.protocols or []) or [data.protocol])[0])
-            predictor = ExportingPredictor(predictor, Path(self.cfg.export), rules)
+            predictor = self.exporter = ExportingPredictor(predictor, Path(self.cfg.export), rules)
         baselines = self.cfg.baselines and data.ground_truth != "none"  # else there is no depth to beat them in
         return {name: predictor, **(trivial(data, self.cfg.truth_cache) if baselines else {})}
 
@@ -128,6 +150,8 @@ class ForeignSubject(Subject):
     def __init__(self, cfg: DictConfig) -> None:
         # One image at a time: files of a folder may differ in size.
         super().__init__(cfg, {"batch_size": 1})
+        if cfg.predicted is not None:
+            one_of("predicted", cfg.predicted, ("disparity", "depth"))
         if cfg.flip:
             raise ConfigError("flip=true blends two predictions of a model; leave it out with predictions=...")
         if cfg.scale.method != "auto":

@@ -9,6 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from saunet.checks import ConfigError
 from saunet.cli._app import pick_device, run
 from saunet.cli._subjects import subject_of, trivial
 
@@ -41,9 +42,20 @@ def evaluate(cfg: DictConfig) -> None:
     """Load what is scored and the data, print the tables, write them to the output folder."""
     from hydra.core.hydra_config import HydraConfig
 
-    from saunet.evaluation import evaluate_protocols, print_table, with_statistics, write_results
+    from saunet.atomic import check_folder
+    from saunet.evaluation import (
+        evaluate_protocols,
+        print_table,
+        read_earlier,
+        with_statistics,
+        write_results,
+    )
     from saunet.evaluation.breakdown import Buckets
 
+    if cfg.intervals and not 0 < cfg.intervals < 1:
+        raise ConfigError(f"intervals is {cfg.intervals:g}; it must lie between 0 and 1, such as intervals=0.95")
+    earlier = read_earlier(Path(cfg.compare)) if cfg.compare else None
+    check_folder(cfg.output_dir)
     subject = subject_of(cfg)
     result = evaluate_protocols(
         list(cfg.protocols or []),
@@ -54,9 +66,11 @@ def evaluate(cfg: DictConfig) -> None:
         device=pick_device(cfg.device),
         buckets=Buckets(tuple(cfg.distances)) if cfg.buckets else None,
     )
-    result = with_statistics(result, cfg.intervals, Path(cfg.compare) if cfg.compare else None)
     data = HydraConfig.get().runtime.choices["data"]
     result = replace(result, settings={"data": data, **subject.settings()})
+    if earlier is not None:
+        write_results(result, Path(cfg.output_dir))  # an evaluation that does not compare is not lost
+    result = with_statistics(result, cfg.intervals, earlier)
     print_table(result)
     for source in cfg.data.get("sources") or {}:  # of a mixture
         alone = result.part(f"{source}/")
@@ -64,6 +78,8 @@ def evaluate(cfg: DictConfig) -> None:
             print(f"{source} alone:")
             print_table(alone)
     write_results(result, Path(cfg.output_dir))
+    if subject.exporter is not None:
+        print(subject.exporter)
     print(f"results: {cfg.output_dir}")
 
 

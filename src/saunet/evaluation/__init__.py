@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from saunet.evaluation.result import EvaluationResult, ImageRow, Summary
 from saunet.evaluation.runner import NetworkPredictor, Predictor, evaluate
-from saunet.evaluation.suite import evaluate_protocols, with_statistics
+from saunet.evaluation.suite import evaluate_protocols, read_earlier, with_statistics
 from saunet.evaluation.tables import print_table
 from saunet.evaluation.writers import write_results
 
@@ -17,6 +17,7 @@ __all__ = [
     "evaluate",
     "evaluate_protocols",
     "print_table",
+    "read_earlier",
     "with_statistics",
     "write_results",
 ]

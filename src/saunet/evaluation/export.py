@@ -30,7 +30,7 @@ class ExportingPredictor:
 
     def __init__(self, predict: Predictor, folder: Path, protocol: Protocol) -> None:
         self.predict, self.folder, self.protocol = predict, folder, protocol
-        self.written = 0
+        self.written = self.left_out = 0
 
     def __call__(self, batch: EvalBatch) -> Float[Tensor, "b 1 h w"]:
         """Return the disparity of the batch's images, having written their depth.
@@ -41,10 +41,16 @@ class ExportingPredictor:
         disparity = self.predict(batch)
         for name, image, truth in zip(batch["name"], disparity[:, 0].cpu(), truths_of(batch), strict=True):
             depth = self._depth(image, truth.cpu())
-            if depth is not None:
-                write_image(self.folder / f"{file_stem(name)}.png", depth_to_png16(depth.numpy()))
-                self.written += 1
+            if depth is None:
+                self.left_out += 1
+                continue
+            write_image(self.folder / f"{file_stem(name)}.png", depth_to_png16(depth.numpy()))
+            self.written += 1
         return disparity
+
+    def __str__(self) -> str:
+        rest = f", {self.left_out} left out that have no ground truth to be scaled by" if self.left_out else ""
+        return f"export: {self.written} images as '{self.protocol.name}' scales them{rest}; in {self.folder}"
 
     def _depth(self, disparity: Float[Tensor, "h w"], truth: Float[Tensor, "hg wg"]) -> Float[Tensor, "_ _"] | None:
         rules = self.protocol

@@ -47,7 +47,7 @@ class ForeignArray:
         """Return the disparity of the batch's images.
 
         Raises:
-            DataError: if one is not among the names, or a depth is not positive.
+            DataError: if one is not among the names, a depth is not positive, or a disparity is nowhere.
         """
         places = [_place(self._place, name, self.path) for name in batch["name"]]
         maps = [np.array(self._array[place], dtype=np.float32) for place in places]
@@ -134,6 +134,11 @@ def _load_array(path: Path) -> ndarray:
 
 def _disparity(values: ndarray, kind: str, path: Path) -> Float[Tensor, "1 h w"]:
     if kind == "disparity":
+        if (values <= 0).all():  # it would score like depth that is the same everywhere
+            raise DataError(
+                f"'{path}' has disparity that is nowhere above 0 in an image; disparity is 1/depth, so give positive "
+                "numbers (predicted=depth for depth)"
+            )
         return torch.from_numpy(values)[None]
     if not (values > 0).all():
         raise DataError(f"'{path}' has pixels without depth (0, negative or NaN); predictions must be dense")

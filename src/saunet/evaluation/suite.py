@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -11,7 +11,7 @@ import torch
 
 from saunet.checks import ConfigError, one_of
 from saunet.evaluation.breakdown import Buckets
-from saunet.evaluation.result import EvaluationResult
+from saunet.evaluation.result import EvaluationResult, ImageRow
 from saunet.evaluation.runner import Predictor, evaluate
 from saunet.evaluation.statistics import compare, drive_of, spreads
 from saunet.evaluation.views import Motion, evaluate_views
@@ -120,33 +120,55 @@ def evaluate_protocols(
     return replace(joined, protocols=tuple(by_name[name] for name in names))
 
 
-def with_statistics(result: EvaluationResult, level: float | None, earlier: Path | None = None) -> EvaluationResult:
+@dataclass(frozen=True, slots=True)
+class Earlier:
+    """Another evaluation, to compare with."""
+
+    source: Path
+    """Where it was read from."""
+    rows: tuple[ImageRow, ...]
+    """Its images."""
+
+
+def read_earlier(source: Path) -> Earlier:
+    """Read an evaluation back.
+
+    Args:
+        source: Its folder, or the ``per_image.csv`` in it.
+
+    Raises:
+        DataError: if it cannot be read.
+    """
+    return Earlier(source, read_rows(source / "per_image.csv" if source.is_dir() else source))
+
+
+def with_statistics(result: EvaluationResult, level: float | None, earlier: Earlier | None = None) -> EvaluationResult:
     """Add bootstrap intervals of the means, and what changed since another evaluation of the same images.
 
     Args:
         result: The evaluation.
         level: Of the intervals, such as 0.95; None leaves them out (comparisons then use 0.95).
-        earlier: Folder or ``per_image.csv`` of the other evaluation, whose first predictor is compared with the first
-            one here, under each protocol that both have.
+        earlier: The other evaluation, whose first predictor is compared with the first one here, under each protocol
+            that both have.
 
     Raises:
         ConfigError: if the level is not between 0 and 1, or the evaluations share no protocol.
-        DataError: if the earlier evaluation cannot be read, or is of other images.
+        DataError: if the earlier evaluation is of other images.
     """
     comparisons = []
     if earlier is not None:
-        before = read_rows(earlier / "per_image.csv" if earlier.is_dir() else earlier)
+        before = earlier.rows
         who = before[0].predictor if before else ""
         for rules in result.protocols:
             rows = [row for row in before if (row.predictor, row.protocol) == (who, rules.name)]
             now = result.select(result.predictors[0], rules.name)
             if rows and now:
-                names = (f"{who} of {earlier}", result.predictors[0])
+                names = (f"{who} of {earlier.source}", result.predictors[0])
                 comparisons.append(compare(rows, now, names=names, level=level or 0.95))
         if not comparisons:
             there = ", ".join(dict.fromkeys(row.protocol for row in before)) or "none"
             raise ConfigError(
-                f"'{earlier}' has no protocol in common with this evaluation (its protocols: {there}); "
+                f"'{earlier.source}' has no protocol in common with this evaluation (its protocols: {there}); "
                 "evaluate both under the same one"
             )
     return replace(result, spreads=spreads(result, level) if level else (), comparisons=tuple(comparisons))

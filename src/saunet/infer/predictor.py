@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from saunet.checks import ConfigError
+from saunet.checks import usable_device
 from saunet.infer.folder import read_model
 from saunet.infer.pipeline import ImagePredictor
 from saunet.metrics.functional import flip_blend
@@ -41,7 +41,7 @@ class Predictor(ImagePredictor):
         keep_aspect: bool = False,
     ) -> None:
         super().__init__(height, width, scale, keep_aspect, depth_net.size_divisor)
-        self.device = _device(device)
+        self.device = usable_device(device)
         self.network = depth_net.to(self.device).eval()
         self.flip = flip
         self._fingerprint: str | None = None
@@ -88,13 +88,3 @@ class Predictor(ImagePredictor):
             digest.update(repr((self.height, self.width, self.flip, self.keep_aspect, factor)).encode())
             self._fingerprint = digest.hexdigest()[:16]
         return self._fingerprint
-
-
-def _device(name: str | torch.device) -> torch.device:
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as reason:
-        available = ["cpu"] + [f"cuda:{index}" for index in range(torch.cuda.device_count())]
-        raise ConfigError(f"device '{name}' cannot be used here; available: {', '.join(available)}") from reason
-    return device

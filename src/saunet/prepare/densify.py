@@ -118,6 +118,7 @@ def densify(
     for kind in kinds:
         one_of("kinds", kind, DENSE_KINDS)
     maps = tuple(DepthMaps(kind, folder) for kind in dict.fromkeys(kinds))
+    work: Work[tuple[int, int], None] = Work(_Densify(tuple(drive for drive, _ in recordings), maps), workers, on_error)
     items, total, before = [], 0, 0
     for position, (drive, frames) in enumerate(recordings):
         scanned = [frame for frame in frames if drive.has_depth(frame)]
@@ -135,6 +136,5 @@ def densify(
             f"none of the {total} frames has a scan, such as {recordings[0][0].depth_file(recordings[0][1][0])}; "
             "add the velodyne_points (or proj_depth, for depth=improved)"
         )
-    work: Work[tuple[int, int], None] = Work(_Densify(tuple(drive for drive, _ in recordings), maps), workers, on_error)
     made = sum(1 for _ in work.run(items, "densify"))
     return Done(made, before, total, tuple(work.failures))
