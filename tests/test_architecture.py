@@ -74,6 +74,7 @@ ALLOWED: dict[str, set[str]] = {
         "types",
         "checks",
         "atomic",
+        "progress",
         "record",
         "checkpoint",
         "geometry",

@@ -85,6 +85,11 @@ def check(cfg: DictConfig) -> None:
         raise ConfigError(
             "trainer.max_epochs is -1: a training without end has no schedule; set it, or trainer.max_steps"
         )
+    if cfg.trainer.enable_progress_bar is False and cfg.callbacks.get("progress"):
+        raise ConfigError(
+            "trainer.enable_progress_bar is false, but callbacks.progress draws a bar; "
+            "set callbacks.progress=null instead"
+        )
     if _replays_command_line(cfg) and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise ConfigError(
             "--multirun with several processes per job would replay the whole sweep on every process; "

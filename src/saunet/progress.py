@@ -1,4 +1,4 @@
-"""The one progress bar: on standard error, on a terminal or in a notebook only, gone when the work is done."""
+"""The progress bar: on standard error, on a terminal or in a notebook only, gone when the work is done."""
 
 from __future__ import annotations
 
@@ -31,6 +31,10 @@ def bar(show: bool = True, unit: str = "", taken: bool = False) -> Progress:
     if taken:
         columns.append(TimeElapsedColumn())
     columns.append(TimeRemainingColumn())
+    return Progress(*columns, console=console, disable=not (show and watched(console)), transient=True)
+
+
+def watched(console: Console) -> bool:
+    """Tell whether somebody looks at a bar there: a terminal or a notebook, not a file or a pipe."""
     # In a notebook, rich draws with ipywidgets, and warns at every bar where they are missing.
-    watched = console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
-    return Progress(*columns, console=console, disable=not (show and watched), transient=True)
+    return console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)

@@ -39,6 +39,7 @@ KITTI = (
         ("experiment=smoke data.height=90", ("90x96", "nearest valid size is 96x96")),
         ("experiment=smoke seed=-1", ("seed is -1; it must be at least 0",)),
         ("experiment=smoke trainer.max_epochs=-1", ("trainer.max_epochs is -1",)),
+        ("experiment=smoke trainer.enable_progress_bar=false", ("set callbacks.progress=null instead",)),
         ("experiment=smoke protocol=eigen_lidar_x", ("protocol 'eigen_lidar_x' is defined on 'lidar_x'", "'exact'")),
         ("experiment=smoke optim.lr=-1", ("optim.lr is -1.0; it must be greater than 0",)),
         ("experiment=smoke objective.gradient.target=lidar", ("set data.target_depth=true",)),

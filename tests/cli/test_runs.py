@@ -135,7 +135,7 @@ def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, 
 def test_sigterm_ends_a_run_with_a_message_and_a_record(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "saunet.cli.train", *QUICK, "trainer.max_epochs=500", "resume=auto"]
     command += [f"hydra.run.dir={tmp_path}/r", "trainer.limit_train_batches=1.0", "trainer.limit_val_batches=0"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "FORCE_COLOR": "1", "TERM": "xterm"}  # a bar in a pipe
     for attempt in range(2):
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment

@@ -1,6 +1,6 @@
 """Run the tiny training in one process or two: ``python ddp_curve.py FOLDER PROCESSES EPOCHS [RANK SIGNAL]``.
 
-Writes the losses of its steps and the validation metric to ``FOLDER/curve.json``. With a rank and a signal, that
+Writes the logged losses of its steps and the validation metric to ``FOLDER/curve.json``. With a rank and a signal, that
 process sends itself the signal in its fourth step.
 """
 
@@ -29,11 +29,7 @@ class Curve(Callback):
         self.losses: list[float] = []
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any) -> None:
-        loss = outputs["loss"].detach().clone()
-        if trainer.world_size > 1:
-            torch.distributed.all_reduce(loss)
-            loss = loss / trainer.world_size
-        self.losses.append(float(loss))
+        self.losses.append(float(trainer.callback_metrics["train/loss"]))  # as it is logged
         if trainer.global_rank == self.rank and trainer.global_step == 4:
             os.kill(os.getpid(), self.number)
 
@@ -56,6 +52,7 @@ def main(folder: Path, processes: int, epochs: int, rank: int | None = None, num
             folder,
             max_epochs=epochs,
             devices=processes,
+            log_every_n_steps=1,
             strategy="ddp" if processes > 1 else "auto",
             callbacks=[curve, *watch],
         )

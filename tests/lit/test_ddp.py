@@ -29,11 +29,12 @@ SMOKE = (
 )
 
 
-def _run(tool: str, folder: Path, *overrides: str) -> None:
+def _run(tool: str, folder: Path, *overrides: str) -> str:
     command = [sys.executable, "-m", f"saunet.cli.{tool}", *overrides, f"hydra.run.dir={folder}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, env=environment, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
+    return done.stderr
 
 
 def _logged(folder: Path) -> dict[str, float]:
@@ -47,7 +48,9 @@ def _logged(folder: Path) -> dict[str, float]:
 def test_two_processes_validate_exactly_like_one(tmp_path: Path) -> None:
     # Five validation frames that two processes share unevenly. Batch norm is there on purpose: without a broadcast each
     # process would score its part with its own running statistics.
-    _run("train", tmp_path / "two", *SMOKE, *TWO, "model/encoder=resnet18")
+    said = _run("train", tmp_path / "two", *SMOKE, *TWO, "model/encoder=resnet18")
+    assert "sync_dist" not in said
+    assert "Grad strides" not in said
     two = _logged(tmp_path / "two")
     checkpoint = f"checkpoint={tmp_path / 'two' / 'checkpoints' / 'last.ckpt'}"
     data = ("data=synthetic_tiny", "data.frames_per_drive=7", "data.workers=0", "split=val", "baselines=false")

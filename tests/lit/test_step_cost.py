@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import pytest
+import tiny
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -13,6 +15,7 @@ from saunet.data.module import DepthDataModule
 from saunet.lit.assemble import assemble
 from saunet.lit.health import health
 from saunet.lit.module import SelfSupervisedDepth
+from saunet.lit.nonfinite import NonFinite
 from saunet.losses import functional
 from saunet.losses.terms import photometric
 from saunet.registry import objectives
@@ -66,6 +69,20 @@ def test_nothing_in_a_step_waits_for_the_device(objective: str, config: dict[str
         pyramid, poses, _, terms = model.predict_and_compare(batch)
         health(pyramid, poses, terms, 100.0)
         terms.total.backward()
+    assert +waits.found == Counter()
+
+
+def test_watching_for_nan_does_not_wait_for_the_device(tmp_path: Path) -> None:
+    class Watched(NonFinite):
+        def on_before_optimizer_step(self, *args: Any) -> None:
+            with waits:
+                super().on_before_optimizer_step(*args)
+            looked.append(len(self._pending))
+
+    waits, looked = Waits(), list[int]()
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=1, limit_val_batches=0, callbacks=[Watched(str(tmp_path))])
+    trainer.fit(tiny.tiny_model(), tiny.tiny_walls())
+    assert looked == [1] * 3
     assert +waits.found == Counter()
 
 

@@ -11,6 +11,7 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_info
+from rich.console import Console
 
 from saunet.atomic import replacing
 from saunet.checks import CheckpointError, positive
@@ -18,6 +19,7 @@ from saunet.data.module import DepthDataModule
 from saunet.images import write_image
 from saunet.lit.pictures import training_panel
 from saunet.lit.run_record import RunRecord
+from saunet.progress import watched
 from saunet.types import EvalBatch
 
 
@@ -150,12 +152,20 @@ class PicturePanel(Callback):
 class Progress(TQDMProgressBar):
     """One bar with what matters, after one line that says how large the networks are.
 
+    The bar is on a terminal or in a notebook only; a file or a pipe gets the line alone.
+
     Args:
         refresh_rate: Steps between two updates of the bar.
     """
 
     def __init__(self, refresh_rate: int = 5) -> None:
         super().__init__(refresh_rate=refresh_rate)
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Show the bar where somebody looks."""
+        super().setup(trainer, pl_module, stage)
+        if not watched(Console()):  # standard output, where Lightning's bar is
+            self.disable()
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say how many parameters are trained."""

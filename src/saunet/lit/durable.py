@@ -32,8 +32,9 @@ def way_on(folder: str | Path) -> str:
 class GracefulStop(Callback):
     """On SIGTERM, Ctrl-C, or a batch system's SIGUSR1: finish the step, save ``last.ckpt``, end with a message.
 
-    All processes of a run stop after the same step, whichever of them was asked. A second Ctrl-C ends at once. During
-    validation, that is finished first.
+    All processes of a run stop after the same step, whichever of them was asked. A second Ctrl-C ends at once. A
+    validation that is under way or due is finished first, and so is an epoch after its last step: a training that has
+    none left is complete then, and ends as such.
 
     Args:
         folder: Where ``last.ckpt`` goes.
@@ -44,6 +45,8 @@ class GracefulStop(Callback):
         self.folder = Path(folder)
         self.every_n_steps = int(positive("every_n_steps", every_n_steps))
         self.received: int | None = None
+        self._agreed = 0  # the signal for which all processes stop
+        self._saved = self._went_on = False
         self._before: dict[int, Any] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -58,20 +61,47 @@ class GracefulStop(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Stop if anybody was asked to, where no accumulated gradient is lost."""
+        """Save if anybody was asked to stop, where no accumulated gradient is lost."""
         if (batch_idx + 1) % trainer.accumulate_grad_batches and not trainer.is_last_batch:
             return
-        number = self.received or 0
-        if trainer.world_size > 1:
+        number = self._agreed or self.received or 0
+        if trainer.world_size > 1 and not self._agreed:
             if trainer.global_step % self.every_n_steps and not trainer.is_last_batch:
                 return
             asked = torch.tensor(number, device=pl_module.device)
             distributed.all_reduce(asked, distributed.ReduceOp.MAX)
             number = int(asked)
-        if not number:
+        self._agreed = number
+        if number:  # before a validation that is due too: whoever asked may not wait for its end
+            self._save(trainer)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Take what was measured into the checkpoint, with the next step or the end of the epoch."""
+        if self._agreed and not self._went_on:  # once: there may be a validation after every step
+            self._saved, self._went_on = False, True
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save with all that belongs to the epoch."""
+        if self._agreed:
+            self._save(trainer)
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Stop before another step, when the last one is in the log."""
+        self._stop(trainer)
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Stop before another epoch."""
+        self._stop(trainer)
+
+    def _save(self, trainer: Trainer) -> None:
+        trainer.save_checkpoint(self.folder / LAST, weights_only=False)
+        self._saved = True
+
+    def _stop(self, trainer: Trainer) -> None:
+        if not self._saved:
             return
         self._restore()
-        trainer.save_checkpoint(self.folder / LAST, weights_only=False)
+        number = self._agreed
         name = signal.Signals(number).name
         message = f"stopped by {name} after step {trainer.global_step}, everything is saved; {way_on(self.folder)}"
         # Where one process starts the others, it takes a bad end of theirs for a crash.

@@ -62,12 +62,25 @@ class SelfSupervisedDepth(TrainedModule):
     def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
         """Return the loss of one batch, a scalar, eq. (14)."""
         pyramid, poses, _, terms = self.predict_and_compare(batch)
-        self.log_dict(terms.named("train"), prog_bar=False, batch_size=len(batch["name"]))
-        figures = health(pyramid, poses, terms, float(getattr(self.depth, "max_depth", torch.inf)))
-        self.log_dict({f"health/{name}": value for name, value in figures.items()}, batch_size=len(batch["name"]))
+        watched = health(pyramid, poses, terms, float(getattr(self.depth, "max_depth", torch.inf)))
+        figures = {**terms.named("train"), **{f"health/{name}": value for name, value in watched.items()}}
+        figures = self._of_all_processes(figures)
+        self.log_dict(figures, prog_bar=False, batch_size=len(batch["name"]))
         self.log("train/lr", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=len(batch["name"]))
-        self.log("loss", terms.total.detach(), prog_bar=True, logger=False, batch_size=len(batch["name"]))
+        self.log("loss", figures["train/loss"], prog_bar=True, logger=False, batch_size=len(batch["name"]))
         return terms.total
+
+    def _of_all_processes(self, figures: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the means over the processes of a run, in one exchange, where somebody will look at them."""
+        trainer, step = self.trainer, self.global_step + 1
+        every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        # After the last step of an epoch or training, all of them must come to the same decision about the best state.
+        looked_at = (every and step % every == 0) or trainer.is_last_batch or step == trainer.max_steps
+        if trainer.world_size == 1 or not looked_at:
+            return figures
+        stacked = torch.stack([value.float() for value in figures.values()])
+        means: Tensor = trainer.strategy.reduce(stacked, reduce_op="mean")
+        return dict(zip(figures, means.unbind(), strict=True))
 
     def step(self, batch: TrainBatch) -> tuple[DepthPyramid, tuple[View, ...], LossTerms]:
         """Return depth, the sources warped into the target, and the loss of a batch."""
@@ -147,8 +160,9 @@ class SelfSupervisedDepth(TrainedModule):
         """Log the metrics over the whole validation set, exact over any number of processes."""
         result = self.metrics.compute()
         if result["images"] > 0:
-            # Every process holds the same synchronised numbers, so nothing is left to reduce.
+            # Every process holds the same synchronised numbers; the trainer warns where they are not reduced all the
+            # same, and the largest of them is each of them, to the last digit.
             named = {f"val/{name}": value.to(torch.float32) for name, value in result.items()}
-            self.log_dict(named)
-            self.log("abs_rel", named["val/abs_rel"], prog_bar=True, logger=False)
+            self.log_dict(named, sync_dist=True, reduce_fx="max")
+            self.log("abs_rel", named["val/abs_rel"], prog_bar=True, logger=False, sync_dist=True, reduce_fx="max")
         self.metrics.reset()

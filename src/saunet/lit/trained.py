@@ -53,6 +53,8 @@ class TrainedModule(LightningModule):
         for part in self.recipe.frozen(self):
             part.requires_grad_(False).eval()
             warnings.filterwarnings("ignore", message=r"Found \d+ module\(s\) in eval mode")  # as it is meant to be
+        # A convolution of 1x1 has several right strides, and DDP copies a gradient that comes in another one.
+        warnings.filterwarnings("ignore", message=r"Grad strides do not match bucket view strides")
         self.speed.apply(self)
 
     def train(self, mode: bool = True) -> TrainedModule:
