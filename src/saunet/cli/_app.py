@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import re
-import shutil
 import sys
 import warnings
 from collections.abc import Callable
@@ -23,10 +22,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from saunet import schema
 from saunet.checks import SaunetError, suggest
+from saunet.cli._folders import Folder, noted
 from saunet.cli._globs import expand_globs
 from saunet.cli._sweep import summary, swept_folder
 from saunet.config import config_dir, register_configs
-from saunet.lit.run_record import FILE, Stopped
+from saunet.lit.run_record import Stopped
 from saunet.registry import REGISTRIES
 from saunet.roots import ROOTS
 
@@ -43,8 +43,9 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then lets exceptions through instead of printing them its own way
     register_configs()
 
-    folders: list[Path] = []  # of a single run, once they exist
+    folders: list[Folder] = []  # of a single run, as they were before it
     failed: list[Exception] = []
+    noted()  # what an earlier run of this process left
 
     @wraps(task)
     def required(cfg: DictConfig) -> Any:
@@ -52,9 +53,11 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
         hydra_cfg = HydraConfig.get()
         if hydra_cfg.mode == RunMode.MULTIRUN:
             return _job(name, task, cfg)
-        folders.append(Path(hydra_cfg.runtime.output_dir))
-        if "output_dir" in cfg:
-            folders.append(Path(cfg.output_dir).resolve())
+        run_folder = noted()
+        if run_folder is not None:
+            folders.append(run_folder)
+        if "output_dir" in cfg and Path(cfg.output_dir).resolve() != Path(hydra_cfg.runtime.output_dir).resolve():
+            folders.append(Folder.as_it_is(Path(cfg.output_dir).resolve()))
         try:
             missing = sorted(OmegaConf.missing_keys(cfg))
             if missing:
@@ -83,7 +86,7 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
             raise
         _end_sweep(name)
         for folder in folders:
-            _remove_if_bare(folder)
+            folder.remove_traces(name)
         _fail(name, reason)
     finally:
         if before is None:
@@ -144,26 +147,6 @@ def _one_voice() -> None:
 def _fail(name: str, message: str, code: int = 1) -> NoReturn:
     print(f"saunet-{name}: {message}", file=sys.stderr)
     raise SystemExit(code)
-
-
-def _remove_if_bare(folder: Path) -> None:
-    """Remove a run folder that holds nothing but its config and empty logs: the run never began."""
-    if folder == Path.cwd() or not ((folder / ".hydra").is_dir() or (folder / FILE).is_file()):
-        return
-    started = ("hparams.yaml", "events.out.tfevents", FILE)
-    files = [path for path in folder.rglob("*") if path.is_file() and path.parent.name != ".hydra"]
-    if not all(path.suffix == ".log" or path.name.startswith(started) for path in files):
-        return
-    (folder / FILE).unlink(missing_ok=True)
-    if (folder / ".hydra").is_dir():
-        logging.shutdown()
-        shutil.rmtree(folder, ignore_errors=True)
-        for parent in folder.parents:  # outputs/NAME and outputs, where nothing else is in them
-            if Path.cwd() not in parent.parents or any(parent.iterdir()):
-                break
-            parent.rmdir()
-    elif not any(folder.iterdir()):
-        folder.rmdir()
 
 
 def sentence(error: Exception) -> str | None:
