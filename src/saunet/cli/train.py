@@ -15,7 +15,7 @@ from saunet.cli._app import run, sentence
 
 
 def train(cfg: DictConfig) -> float | None:
-    """Train, print where the results are, and return the best monitored value: what a search minimises."""
+    """Train, print where the results are, and return what a search minimises: see `BestCheckpoint.cost`."""
     return fit(cfg)[1]
 
 
@@ -23,7 +23,7 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
     """Build every part from the config and train; ``run.json`` in the run's folder says how that went.
 
     Returns:
-        The data module, and the best monitored value.
+        The data module, and the best monitored value, its negative where more is better.
     """
     from lightning import seed_everything
 
@@ -67,8 +67,8 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
             raise
     if trainer.is_global_zero:
         print(f"results: {cfg.output_dir}")
-    scores = [each.best_model_score for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint)]
-    return data, next((float(score) for score in scores if score is not None), None)
+    costs = [each.cost for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint)]
+    return data, next((cost for cost in costs if cost is not None), None)
 
 
 def main() -> None:

@@ -21,6 +21,9 @@ from saunet.losses.base import Objective
 from saunet.metrics.depth import DepthMetrics
 from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
 
+EPOCH_LOSS = "train/loss_epoch"
+"""Name of the mean of ``train/loss`` over an epoch and all processes, which is itself the last batch's."""
+
 
 class SelfSupervisedDepth(TrainedModule):
     """Depth and pose networks trained together on video by view synthesis (SAU-Net section III).
@@ -67,6 +70,9 @@ class SelfSupervisedDepth(TrainedModule):
         self.log_dict({f"health/{name}": value for name, value in figures.items()}, batch_size=len(batch["name"]))
         self.log("train/lr", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=len(batch["name"]))
         self.log("loss", terms.total.detach(), prog_bar=True, logger=False, batch_size=len(batch["name"]))
+        # What best.ckpt is chosen by where nothing is validated: the last batch alone would be chance.
+        mean: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True, "logger": False}
+        self.log(EPOCH_LOSS, terms.total.detach(), batch_size=len(batch["name"]), **mean)
         return terms.total
 
     def step(self, batch: TrainBatch) -> tuple[DepthPyramid, tuple[View, ...], LossTerms]:
