@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -109,6 +110,29 @@ def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, 
     outcome = tool("train", *again, f"resume={last}", f"init_from={last}")
     assert outcome.code == 1
     assert "resume= and init_from= are both set" in outcome.err
+
+
+def test_a_finished_run_is_not_replaced_by_mistake(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(smoke_run, run)
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    for mistake, words in (
+        ((), "holds best.ckpt of an earlier run; go on with it by resume=auto"),
+        (("seed=-1", "resume=auto"), "seed is -1"),
+    ):
+        outcome = tool("train", *QUICK, "hydra.run.dir=run", *mistake)
+        outcome.says(words)
+        assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    outcome = tool("train", *QUICK, "trainer.limit_train_batches=1", "hydra.run.dir=run", "overwrite=true")
+    assert outcome.code == 0, outcome.err
+    assert (run / "checkpoints" / "best.ckpt").read_bytes() != before[run / "checkpoints" / "best.ckpt"]
+
+
+def test_a_job_whose_config_is_refused_is_recorded(tool: Tool, tmp_path: Path) -> None:
+    outcome = tool("train", "--multirun", *QUICK, "seed=-1,-2", "hydra.sweep.dir=sweep")
+    assert outcome.code == 1
+    assert "seed=-2) failed: seed is -2; it must be at least 0" in outcome.err
+    assert record(tmp_path / "sweep" / "1")["status"] == "failed"
 
 
 @pytest.mark.slow

@@ -31,14 +31,18 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
     from saunet.lit.callbacks import BestCheckpoint, SplitsRecorded
     from saunet.lit.durable import way_on
     from saunet.lit.run_record import recording
-    from saunet.lit.start import check_resume, keep_rows, resume_path, warm_start
+    from saunet.lit.start import check_resume, check_unused, keep_rows, resume_path, warm_start
     from saunet.lit.storage import AtomicCheckpointIO
     from saunet.registry import instantiate
 
-    with recording(cfg.output_dir, cfg.name, sentence) as record:
+    def check() -> None:
         config.check(cfg)
-        seed_everything(cfg.seed, workers=True, verbose=False)
+        if not (cfg.resume or cfg.overwrite):
+            check_unused(cfg.output_dir)
+
+    with recording(cfg.output_dir, cfg.name, sentence, check) as record:
         resume = resume_path(cfg.resume, cfg.output_dir, cfg.init_from)
+        seed_everything(cfg.seed, workers=True, verbose=False)
         data = instantiate(config.plain(cfg.data))
         model = assemble(config.plain(cfg), data, pretrained=resume is None and cfg.init_from is None)
         loggers = [hydra_instantiate(logger) for logger in cfg.logger.values() if logger]
