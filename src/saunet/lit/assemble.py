@@ -50,7 +50,7 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule, pretrained: bool = T
             f"protocol '{rules.name}' is defined on '{rules.ground_truth}' ground truth and the data give "
             f"'{data.ground_truth}'; leave protocol unset, or choose the matching ground truth"
         )
-    return SelfSupervisedDepth(
+    module = SelfSupervisedDepth(
         depth=depth,
         pose=pose,
         objective=objective,
@@ -60,6 +60,8 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule, pretrained: bool = T
         record=record.to_plain(),
         speed=Speed(**_settings(cfg.get("speed", {}))),
     )
+    module.objective_node = cfg["objective"]
+    return module
 
 
 def _settings(node: Mapping[str, Any]) -> dict[str, Any]:
