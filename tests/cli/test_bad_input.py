@@ -12,6 +12,21 @@ import pytest
 import torch
 
 Tool = Callable[..., Any]
+
+
+class Absent:
+    """A package that Lightning looked for and did not find."""
+
+    def __init__(self, message: str) -> None:
+        self.message = message
+
+    def __bool__(self) -> bool:
+        return False
+
+    def __str__(self) -> str:
+        return self.message
+
+
 KITTI = (
     "experiment=selfsup",
     "model=sau_net_nano",
@@ -55,6 +70,29 @@ KITTI = (
 def test_train(tool: Tool, override: str, words: tuple[str, ...], tmp_path: Path) -> None:
     tool("train", *override.split()).says(*words)
     assert list(tmp_path.iterdir()) == []  # nothing half-written is left, nor an empty folder
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("callbacks.last.every_n_steps=-1", "every_n_steps is -1; it must be at least 0"),
+        ("trainer.strategy=foo", "You selected an invalid strategy name"),
+        ("logger=wandb", "logger=wandb needs a package that is not installed; run `pip install 'saunet[track]'`"),
+        ("logger=mlflow", "logger=mlflow needs a package that is not installed; run `pip install 'saunet[track]'`"),
+    ],
+)
+def test_what_hydra_builds_speaks_for_itself(
+    tool: Tool, override: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module, flag in (("wandb", "_WANDB_AVAILABLE"), ("mlflow", "_MLFLOW_AVAILABLE")):
+        absent = f"Requirement '{module}>=1' not met. HINT: Try running `pip install -U '{module}>=1'`"
+        monkeypatch.setattr(f"lightning.pytorch.loggers.{module}.{flag}", Absent(absent))
+    outcome = tool("train", "experiment=smoke", override)
+    outcome.says(words)
+    last = outcome.err.strip().splitlines()[-1]
+    assert last.startswith(f"saunet-train: {words}")
+    assert "full_key" not in last
+    assert last.count(words) == 1
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -156,6 +156,13 @@ def sentence(error: Exception) -> str | None:
     raised_elsewhere = re.search(r"^saunet\.checks\.\w+: (.*)", str(error), re.MULTILINE)
     if raised_elsewhere:  # in a process that was spawned: only its traceback's text arrives here
         return raised_elsewhere[1]
+    cause = error.__cause__
+    if isinstance(error, InstantiationException) and not isinstance(cause, OmegaConfBaseException):
+        missing = re.search(r"\b(wandb|mlflow)\b", str(cause)) if isinstance(cause, ModuleNotFoundError) else None
+        if missing:
+            return f"logger={missing[1]} needs a package that is not installed; run `pip install 'saunet[track]'`"
+        if isinstance(cause, SaunetError | ValueError | TypeError):
+            return " ".join(str(cause).split())
     for each in (error, error.__cause__):  # Hydra wraps what a constructor raises
         if type(each).__name__ == "MisconfigurationException":  # Lightning's word for a user's error
             return " ".join(str(each).split())
