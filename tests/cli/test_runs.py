@@ -17,6 +17,7 @@ import pytest
 import yaml
 
 from saunet.cli._sweep import summary
+from saunet.lit.durable import GracefulStop
 from saunet.lit.run_record import RunRecord
 
 Tool = Callable[..., Any]
@@ -101,6 +102,21 @@ def test_a_job_that_vanished_is_marked_failed_in_the_summary(tmp_path: Path) -> 
     assert "killed" in record(tmp_path / "10")["error"]
 
 
+def test_an_interrupted_sweep_names_the_jobs_that_never_started(
+    tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def press(self: GracefulStop, *_: Any) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(GracefulStop, "on_train_batch_start", press, raising=False)
+    outcome = tool("train", "--multirun", *QUICK, "seed=1,2,3", "hydra.sweep.dir=sweep")
+    assert outcome.code == 130
+    assert "sweep: 0 of 3 jobs finished" in outcome.err
+    assert re.findall(r"\(.*seed=(\d)\) (interrupted|not started)", outcome.err) == [
+        ("1", "interrupted"), ("2", "not started"), ("3", "not started")
+    ]  # fmt: skip
+
+
 def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
     last = smoke_run / "checkpoints" / "last.ckpt"
     again = ("experiment=smoke", "logger=none", "callbacks.pictures=null", "trainer.limit_train_batches=1")
@@ -140,16 +156,22 @@ def test_sigterm_ends_a_run_with_a_message_and_a_record(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "saunet.cli.train", *QUICK, "trainer.max_epochs=500", "resume=auto"]
     command += [f"hydra.run.dir={tmp_path}/r", "trainer.limit_train_batches=1.0", "trainer.limit_val_batches=0"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    errors = tmp_path / "stderr"  # a file: a pipe that nobody reads fills and blocks the run
     for attempt in range(2):
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-        ) as run:
+        with (
+            errors.open("w") as stderr,
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=environment) as run,
+        ):
             assert run.stdout is not None
             heard = ""
             while "loss=" not in heard:  # the progress bar, once a step was made
-                heard += run.stdout.read(1)
+                letter = run.stdout.read(1)
+                if not letter:
+                    pytest.fail(f"the run ended before its first step: {errors.read_text()}")
+                heard += letter
             run.send_signal(signal.SIGTERM)
-            out, err = run.communicate()
+            out, _ = run.communicate()
+        err = errors.read_text()
         assert run.returncode == 143
         assert "saunet-train: stopped by SIGTERM after step" in err
         assert f"go on with resume={tmp_path}/r/checkpoints/last.ckpt" in err

@@ -72,19 +72,21 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
         hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(required)()
         if failed:
             raise failed[0]
-        _end_sweep(name)
+        if not _end_sweep():
+            raise SystemExit(1)
     except KeyboardInterrupt:
-        _end_sweep(name)
+        _end_sweep()
         _fail(name, "interrupted", code=130)
     except Stopped as stop:
-        _end_sweep(name)
+        _end_sweep()
         if stop.code:
             _fail(name, stop.message, code=int(stop.code))
     except Exception as error:
         reason = sentence(error)
         if debug or reason is None:
             raise
-        _end_sweep(name)
+        if not _end_sweep():
+            raise SystemExit(1) from error
         for folder in folders:
             folder.remove_traces(name)
         _fail(name, reason)
@@ -104,15 +106,14 @@ def _job(name: str, task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         raise
 
 
-def _end_sweep(name: str) -> None:
-    """After a sweep, say how its jobs ended; exit with code 1 if one failed."""
+def _end_sweep() -> bool:
+    """After a sweep, say how its jobs ended; return whether all finished, or there was none."""
     folder = swept_folder()
     if folder is None:
-        return
+        return True
     text, finished = summary(folder)
     print(text, file=sys.stdout if finished else sys.stderr)
-    if not finished:
-        raise SystemExit(1)
+    return finished
 
 
 def pick_device(name: str) -> str:
