@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import torch
 
+from saunet.cli._app import sentence
+
 Tool = Callable[..., Any]
 
 
@@ -53,6 +55,17 @@ KITTI = (
         ("data=kitti data.root=/nowhere/at/all", ("no data root at /nowhere/at/all", "set data.root")),
         ("experiment=smoke data.height=90", ("90x96", "nearest valid size is 96x96")),
         ("experiment=smoke seed=-1", ("seed is -1; it must be at least 0",)),
+        ("experiment=smoke seed=4294967296", ("seed is 4294967296; it must lie between 0 and 4294967295",)),
+        ("experiment=smoke model.pose=null", ("model.pose is null", "data.stereo=true")),
+        ("experiment=smoke trainer.accumulate_grad_batches=0", ("trainer.accumulate_grad_batches is 0",)),
+        ("experiment=smoke trainer.val_check_interval=0", ("trainer.val_check_interval is 0",)),
+        ("experiment=smoke trainer.check_val_every_n_epoch=0", ("trainer.check_val_every_n_epoch is 0",)),
+        ("experiment=smoke trainer.precision=64", ("trainer.precision is '64'", "allowed: 32-true")),
+        ("experiment=smoke trainer.overfit_batches=1", ("use trainer.limit_train_batches",)),
+        ("experiment=smoke logger=null", ("cannot be null; choose logger=none",)),
+        ("experiment=smoke callbacks=null", ("a group of the config cannot be null",)),
+        ("experiment=smoke output_dir=", ("output_dir= is empty",)),
+        ("experiment=smoke resume=", ("resume= is empty",)),
         ("experiment=smoke trainer.max_epochs=-1", ("trainer.max_epochs is -1",)),
         ("experiment=smoke protocol=eigen_lidar_x", ("protocol 'eigen_lidar_x' is defined on 'lidar_x'", "'exact'")),
         ("experiment=smoke optim.lr=-1", ("optim.lr is -1.0; it must be greater than 0",)),
@@ -100,6 +113,20 @@ def test_a_gpu_that_is_not_there(tool: Tool) -> None:
     outcome = tool("train", "experiment=smoke", "trainer=gpu")
     outcome.says("gpu")
     assert "Error in call" not in outcome.err  # Hydra's wrapping
+
+
+def test_an_empty_path_is_refused(tool: Tool, tmp_path: Path) -> None:
+    tool("predict", "checkpoint=x", "output=out", "input=").says("input= is empty")
+    outcome = tool("train", "-m", "experiment=smoke", "output_dir=", "hydra.sweep.dir=sweep")
+    assert outcome.code == 1
+    assert "output_dir= is empty" in outcome.err
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
+
+
+def test_a_full_gpu_is_one_sentence() -> None:
+    said = sentence(torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"))
+    assert said is not None
+    assert "data.batch_size" in said
 
 
 def test_a_missing_value_is_asked_for(tool: Tool) -> None:

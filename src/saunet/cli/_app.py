@@ -30,6 +30,9 @@ from saunet.lit.run_record import Stopped
 from saunet.registry import REGISTRIES
 from saunet.roots import ROOTS
 
+PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "predictions", "resume", "root")
+"""Keys at the root of a tool's config that name files or folders."""
+
 
 def run(name: str, task: Callable[[DictConfig], Any]) -> None:
     """Run ``task`` as the Hydra application whose root config is ``conf/<name>.yaml``.
@@ -59,10 +62,7 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
         if "output_dir" in cfg and Path(cfg.output_dir).resolve() != Path(hydra_cfg.runtime.output_dir).resolve():
             folders.append(Folder.as_it_is(Path(cfg.output_dir).resolve()))
         try:
-            missing = sorted(OmegaConf.missing_keys(cfg))
-            if missing:
-                needed = " ".join(f"{key}=..." for key in missing)
-                raise SaunetError(f"{missing[0]} is not set; add {needed} to the command line")
+            _check_given(cfg)
             return task(cfg)
         except Exception as error:
             failed.append(error)  # raised again outside of Hydra, which would print a line of its own before ours
@@ -95,9 +95,25 @@ def run(name: str, task: Callable[[DictConfig], Any]) -> None:
             del os.environ["HYDRA_FULL_ERROR"]
 
 
+def _check_given(cfg: DictConfig) -> None:
+    """Check that what must be given is, and that no path is empty, as one from an unset variable of the shell.
+
+    Raises:
+        SaunetError: naming the keys.
+    """
+    missing = sorted(OmegaConf.missing_keys(cfg))
+    if missing:
+        needed = " ".join(f"{key}=..." for key in missing)
+        raise SaunetError(f"{missing[0]} is not set; add {needed} to the command line")
+    for key in PATHS:
+        if cfg.get(key) == "":
+            raise SaunetError(f"{key}= is empty, perhaps from a shell variable that is not set; name a path")
+
+
 def _job(name: str, task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
     """Run one job of a sweep; what goes wrong is said at once and ends this job only."""
     try:
+        _check_given(cfg)
         return task(cfg)
     except Exception as error:
         job = HydraConfig.get().job
@@ -154,6 +170,10 @@ def sentence(error: Exception) -> str | None:
     """Say in one sentence what a user can mend; None for a defect of the program."""
     if isinstance(error, SaunetError):
         return str(error)
+    if isinstance(error, torch.cuda.OutOfMemoryError):
+        return "the GPU's memory is too small for this; lower the batch size (in training data.batch_size) or the size"
+    if str(error).startswith("Config group override must be a string or a list"):
+        return "a group of the config cannot be null; choose logger=none, or set single members to null"
     raised_elsewhere = re.search(r"^saunet\.checks\.\w+: (.*)", str(error), re.MULTILINE)
     if raised_elsewhere:  # in a process that was spawned: only its traceback's text arrives here
         return raised_elsewhere[1]

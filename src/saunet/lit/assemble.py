@@ -93,6 +93,13 @@ def _check_sources(cfg: Mapping[str, Any], data: DepthDataModule) -> None:
             "data.offsets is empty and data.stereo is false, so there is no source image to learn from; "
             "set data.offsets=[-1,1] for video, data.stereo=true for a stereo pair, or both"
         )
+    if cfg["model"]["pose"] is None:
+        if not data.offsets:  # the stereo rig's motion is known
+            return
+        raise ConfigError(
+            f"model.pose is null but the data give neighbours in time at {list(data.offsets)}, whose motion has to be "
+            "learnt; choose a model/pose, or learn from a stereo partner alone with data.stereo=true data.offsets=[]"
+        )
     offsets = cfg["model"]["pose"]["offsets"]
     if list(offsets) != list(data.offsets):
         raise ConfigError(
