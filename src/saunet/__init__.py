@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+from saunet.checks import CheckpointError
 from saunet.registry import registry
 
 __version__ = "0.1.0"
@@ -53,6 +55,8 @@ def load(source: Any, *, device: str = "cpu", flip: bool = False, keep_aspect: b
         CheckpointError: if it is missing, broken, or not a saunet model.
         ConfigError: if a package is missing or the device does not exist.
     """
+    if not isinstance(source, str | Path) or not str(source):
+        raise CheckpointError(f"saunet.load got {source!r}; give the path of a checkpoint or an exported folder")
     from saunet.infer.load import load as load_any
 
     return load_any(source, device=device, flip=flip, keep_aspect=keep_aspect)

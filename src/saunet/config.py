@@ -10,9 +10,12 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from saunet import schema
-from saunet.checks import ConfigError, positive
+from saunet.checks import ConfigError, in_range, one_of, positive
 from saunet.registry import REGISTRIES
 from saunet.roots import ROOTS, ModelConfig, ScaleConfig
+
+PRECISIONS = ("32-true", "32", "16-mixed", "16", "bf16-mixed", "bf16")
+"""Precisions in which a training runs: images and losses stay in float32."""
 
 
 def config_dir() -> Path:
@@ -74,7 +77,8 @@ def check(cfg: DictConfig) -> None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
-    positive("seed", cfg.seed, allow_zero=True)
+    in_range("seed", positive("seed", cfg.seed, allow_zero=True), 0, 2**32 - 1)
+    _check_trainer(cfg.trainer)
     if cfg.optim.fused and str(cfg.trainer.precision).startswith("16") and cfg.trainer.gradient_clip_val:
         raise ConfigError(
             "optim.fused=true, trainer.precision=16-mixed and trainer.gradient_clip_val do not go together: the fused "
@@ -102,6 +106,25 @@ def check(cfg: DictConfig) -> None:
         raise ConfigError(
             "objective.gradient.target=lidar needs LiDAR depth in the training batches; "
             "set data.target_depth=true, or use objective.gradient.target=image"
+        )
+
+
+def _check_trainer(trainer: Any) -> None:
+    """Check what Lightning's trainer takes in silence and stumbles over later.
+
+    Raises:
+        ConfigError: for a value with which no training can run.
+    """
+    for key in ("accumulate_grad_batches", "check_val_every_n_epoch", "val_check_interval"):
+        value = trainer.get(key)
+        if isinstance(value, int | float):
+            positive(f"trainer.{key}", value)
+    if trainer.precision is not None:
+        one_of("trainer.precision", str(trainer.precision), PRECISIONS)
+    if trainer.overfit_batches:
+        raise ConfigError(
+            f"trainer.overfit_batches is {trainer.overfit_batches}, which takes the place in the data order away that "
+            "a training keeps; use trainer.limit_train_batches with few frames instead"
         )
 
 

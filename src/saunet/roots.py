@@ -36,6 +36,7 @@ class TrainConfig:
     output_dir: str = MISSING
     resume: str | None = None
     init_from: str | None = None
+    overwrite: bool = False
     monitor: str = MISSING
     protocol: str | None = None
 

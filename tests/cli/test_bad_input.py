@@ -11,7 +11,24 @@ import numpy as np
 import pytest
 import torch
 
+from saunet.cli._app import sentence
+
 Tool = Callable[..., Any]
+
+
+class Absent:
+    """A package that Lightning looked for and did not find."""
+
+    def __init__(self, message: str) -> None:
+        self.message = message
+
+    def __bool__(self) -> bool:
+        return False
+
+    def __str__(self) -> str:
+        return self.message
+
+
 KITTI = (
     "experiment=selfsup",
     "model=sau_net_nano",
@@ -38,6 +55,17 @@ KITTI = (
         ("data=kitti data.root=/nowhere/at/all", ("no data root at /nowhere/at/all", "set data.root")),
         ("experiment=smoke data.height=90", ("90x96", "nearest valid size is 96x96")),
         ("experiment=smoke seed=-1", ("seed is -1; it must be at least 0",)),
+        ("experiment=smoke seed=4294967296", ("seed is 4294967296; it must lie between 0 and 4294967295",)),
+        ("experiment=smoke model.pose=null", ("model.pose is null", "data.stereo=true")),
+        ("experiment=smoke trainer.accumulate_grad_batches=0", ("trainer.accumulate_grad_batches is 0",)),
+        ("experiment=smoke trainer.val_check_interval=0", ("trainer.val_check_interval is 0",)),
+        ("experiment=smoke trainer.check_val_every_n_epoch=0", ("trainer.check_val_every_n_epoch is 0",)),
+        ("experiment=smoke trainer.precision=64", ("trainer.precision is '64'", "allowed: 32-true")),
+        ("experiment=smoke trainer.overfit_batches=1", ("use trainer.limit_train_batches",)),
+        ("experiment=smoke logger=null", ("cannot be null; choose logger=none",)),
+        ("experiment=smoke callbacks=null", ("a group of the config cannot be null",)),
+        ("experiment=smoke output_dir=", ("output_dir= is empty",)),
+        ("experiment=smoke resume=", ("resume= is empty",)),
         ("experiment=smoke trainer.max_epochs=-1", ("trainer.max_epochs is -1",)),
         ("experiment=smoke trainer.enable_progress_bar=false", ("set callbacks.progress=null instead",)),
         ("experiment=smoke protocol=eigen_lidar_x", ("protocol 'eigen_lidar_x' is defined on 'lidar_x'", "'exact'")),
@@ -58,11 +86,48 @@ def test_train(tool: Tool, override: str, words: tuple[str, ...], tmp_path: Path
     assert list(tmp_path.iterdir()) == []  # nothing half-written is left, nor an empty folder
 
 
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("callbacks.last.every_n_steps=-1", "every_n_steps is -1; it must be at least 0"),
+        ("trainer.strategy=foo", "You selected an invalid strategy name"),
+        ("logger=wandb", "logger=wandb needs a package that is not installed; run `pip install 'saunet[track]'`"),
+        ("logger=mlflow", "logger=mlflow needs a package that is not installed; run `pip install 'saunet[track]'`"),
+    ],
+)
+def test_what_hydra_builds_speaks_for_itself(
+    tool: Tool, override: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module, flag in (("wandb", "_WANDB_AVAILABLE"), ("mlflow", "_MLFLOW_AVAILABLE")):
+        absent = f"Requirement '{module}>=1' not met. HINT: Try running `pip install -U '{module}>=1'`"
+        monkeypatch.setattr(f"lightning.pytorch.loggers.{module}.{flag}", Absent(absent))
+    outcome = tool("train", "experiment=smoke", override)
+    outcome.says(words)
+    last = outcome.err.strip().splitlines()[-1]
+    assert last.startswith(f"saunet-train: {words}")
+    assert "full_key" not in last
+    assert last.count(words) == 1
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there(tool: Tool) -> None:
     outcome = tool("train", "experiment=smoke", "trainer=gpu")
     outcome.says("gpu")
     assert "Error in call" not in outcome.err  # Hydra's wrapping
+
+
+def test_an_empty_path_is_refused(tool: Tool, tmp_path: Path) -> None:
+    tool("predict", "checkpoint=x", "output=out", "input=").says("input= is empty")
+    outcome = tool("train", "-m", "experiment=smoke", "output_dir=", "hydra.sweep.dir=sweep")
+    assert outcome.code == 1
+    assert "output_dir= is empty" in outcome.err
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
+
+
+def test_a_full_gpu_is_one_sentence() -> None:
+    said = sentence(torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"))
+    assert said is not None
+    assert "data.batch_size" in said
 
 
 def test_a_missing_value_is_asked_for(tool: Tool) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import pytest
 import yaml
 
 from saunet.cli._sweep import summary
+from saunet.lit.durable import GracefulStop
 from saunet.lit.run_record import RunRecord
 
 Tool = Callable[..., Any]
@@ -120,6 +122,21 @@ def test_a_sweep_without_a_job_has_not_finished(tmp_path: Path) -> None:
     assert text.startswith("sweep: 0 of 0 jobs finished")
 
 
+def test_an_interrupted_sweep_names_the_jobs_that_never_started(
+    tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def press(self: GracefulStop, *_: Any) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(GracefulStop, "on_train_batch_start", press, raising=False)
+    outcome = tool("train", "--multirun", *QUICK, "seed=1,2,3", "hydra.sweep.dir=sweep")
+    assert outcome.code == 130
+    assert "sweep: 0 of 3 jobs finished" in outcome.err
+    assert re.findall(r"\(.*seed=(\d)\) (interrupted|not started)", outcome.err) == [
+        ("1", "interrupted"), ("2", "not started"), ("3", "not started")
+    ]  # fmt: skip
+
+
 def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
     last = smoke_run / "checkpoints" / "last.ckpt"
     again = ("experiment=smoke", "logger=none", "callbacks.pictures=null", "trainer.limit_train_batches=1")
@@ -131,21 +148,50 @@ def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, 
     assert "resume= and init_from= are both set" in outcome.err
 
 
+def test_a_finished_run_is_not_replaced_by_mistake(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(smoke_run, run)
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    for mistake, words in (
+        ((), "holds best.ckpt of an earlier run; go on with it by resume=auto"),
+        (("seed=-1", "resume=auto"), "seed is -1"),
+    ):
+        outcome = tool("train", *QUICK, "hydra.run.dir=run", *mistake)
+        outcome.says(words)
+        assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    outcome = tool("train", *QUICK, "trainer.limit_train_batches=1", "hydra.run.dir=run", "overwrite=true")
+    assert outcome.code == 0, outcome.err
+    assert (run / "checkpoints" / "best.ckpt").read_bytes() != before[run / "checkpoints" / "best.ckpt"]
+
+
+def test_a_job_whose_config_is_refused_is_recorded(tool: Tool, tmp_path: Path) -> None:
+    outcome = tool("train", "--multirun", *QUICK, "seed=-1,-2", "hydra.sweep.dir=sweep")
+    assert outcome.code == 1
+    assert "seed=-2) failed: seed is -2; it must be at least 0" in outcome.err
+    assert record(tmp_path / "sweep" / "1")["status"] == "failed"
+
+
 @pytest.mark.slow
 def test_sigterm_ends_a_run_with_a_message_and_a_record(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "saunet.cli.train", *QUICK, "trainer.max_epochs=500", "resume=auto"]
     command += [f"hydra.run.dir={tmp_path}/r", "trainer.limit_train_batches=1.0", "trainer.limit_val_batches=0"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "FORCE_COLOR": "1", "TERM": "xterm"}  # a bar in a pipe
+    errors = tmp_path / "stderr"  # a file: a pipe that nobody reads fills and blocks the run
     for attempt in range(2):
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-        ) as run:
+        with (
+            errors.open("w") as stderr,
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=environment) as run,
+        ):
             assert run.stdout is not None
             heard = ""
             while "loss=" not in heard:  # the progress bar, once a step was made
-                heard += run.stdout.read(1)
+                letter = run.stdout.read(1)
+                if not letter:
+                    pytest.fail(f"the run ended before its first step: {errors.read_text()}")
+                heard += letter
             run.send_signal(signal.SIGTERM)
-            out, err = run.communicate()
+            out, _ = run.communicate()
+        err = errors.read_text()
         assert run.returncode == 143
         assert "saunet-train: stopped by SIGTERM after step" in err
         assert f"go on with resume={tmp_path}/r/checkpoints/last.ckpt" in err

@@ -176,3 +176,9 @@ def test_a_resized_camera_is_that_of_the_geometry() -> None:
     expected = scale_intrinsics(torch.from_numpy(camera.K), 37 / 80, 23 / 60).numpy()
     assert np.allclose(camera.resized(23, 37).K, expected)
     assert np.allclose(Camera.from_numbers([90.0], 60, 80).K[0, 0], 40)
+
+
+@pytest.mark.parametrize("source", [None, "", 3])
+def test_what_names_no_model_is_refused(source: Any) -> None:
+    with pytest.raises(CheckpointError, match=r"saunet\.load got .*; give the path of a checkpoint"):
+        saunet.load(source)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from saunet.checks import CheckpointError
+from saunet.checks import CheckpointError, ConfigError
 from saunet.data.module import DepthDataModule
 from saunet.lit.assemble import assemble
 from saunet.models.encoders.resnet import ResNet
@@ -21,6 +21,24 @@ def test_training_starts_from_the_named_weights(config: dict[str, Any], walls: D
     model = assemble(config, walls)
     torch.testing.assert_close(model.depth.encoder.layer3[1].conv2.weight, public.layer3[1].conv2.weight)
     assert model.record["model"]["encoder"]["weights"] == str(tmp_path / "w.pth")  # what it started from stays known
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"monitor": "val/abs_ral"}, "monitor is 'val/abs_ral'; did you mean 'val/abs_rel'"),
+        (
+            {"callbacks": {"best": {"_target_": "saunet.lit.callbacks.BestCheckpoint", "monitor": "a1"}}},
+            "callbacks.best.monitor is 'a1'",
+        ),
+    ],
+)
+def test_a_monitor_that_nothing_measures_is_refused(
+    config: dict[str, Any], walls: DepthDataModule, change: dict[str, Any], words: str
+) -> None:
+    assemble({**config, "monitor": "val/photometric"}, walls)
+    with pytest.raises(ConfigError, match=words):
+        assemble({**config, **change}, walls)
 
 
 def test_weights_that_cannot_be_had_stop_it(config: dict[str, Any], walls: DepthDataModule) -> None:

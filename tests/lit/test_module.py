@@ -157,6 +157,45 @@ def test_validation_without_ground_truth_says_nothing_of_metrics(tmp_path: Path)
     assert "val/abs_rel" not in trainer.callback_metrics
 
 
+def test_where_more_is_better_the_highest_is_kept(
+    config: dict[str, Any], walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    class Best(BestCheckpoint):
+        def _monitor_candidates(self, trainer: Trainer) -> dict[str, torch.Tensor]:
+            value = torch.tensor((0.5, 0.9, 0.7)[trainer.current_epoch])
+            return {**super()._monitor_candidates(trainer), "val/a1": value}
+
+    best = Best(str(tmp_path), "val/a1")
+    make_trainer = partial(make_trainer, enable_checkpointing=True, limit_train_batches=1, limit_val_batches=1)
+    make_trainer(max_epochs=3, callbacks=[best]).fit(assemble(config, walls), walls)
+    assert read_checkpoint(tmp_path / "best.ckpt").epoch == 1
+    assert best.cost == pytest.approx(-0.9)
+
+
+def test_without_validation_the_mean_loss_of_the_epoch_decides(
+    config: dict[str, Any],
+    walls: DepthDataModule,
+    make_trainer: Callable[..., Trainer],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    losses = []
+
+    class Watch(Callback):
+        def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any) -> None:
+            losses.append(float(outputs["loss"]))
+
+    best = BestCheckpoint(str(tmp_path), "val/a1")
+    trainer = make_trainer(
+        max_epochs=2, limit_train_batches=2, limit_val_batches=0, callbacks=[Watch(), best], enable_checkpointing=True
+    )
+    with caplog.at_level("INFO"):
+        trainer.fit(assemble(config, walls), walls)
+    assert best.cost == pytest.approx(min(sum(losses[:2]), sum(losses[2:])) / 2, rel=1e-4)
+    said = [each.getMessage() for each in caplog.records if "best.ckpt" in each.getMessage()]
+    assert said == ["val/a1 is not measured in this run; best.ckpt is chosen by the epoch's mean train/loss"]
+
+
 def test_a_picture_is_written_after_every_epoch(
     model: SelfSupervisedDepth, walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
 ) -> None:

@@ -17,6 +17,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from saunet.checks import CheckpointError, ConfigError
 from saunet.lit.callbacks import LastCheckpoint
+from saunet.lit.continuity import changes
 from saunet.lit.durable import GracefulStop
 from saunet.lit.optim import Recipe
 from saunet.lit.run_record import Stopped
@@ -165,3 +166,62 @@ def test_a_writer_that_dies_midway_leaves_the_previous_checkpoint(tmp_path: Path
     done = subprocess.run([sys.executable, "-c", code, str(path)], check=False, capture_output=True)
     assert done.returncode == 9
     assert torch.load(path, weights_only=True) == {"epoch": 1}
+
+
+@pytest.mark.parametrize(
+    ("seed", "data", "words"),
+    [
+        (5, {}, "with seed 0 and this run has 5"),
+        (0, {"batch_size": 2}, "with data.batch_size 4 and this run has 2"),
+        (0, {"offsets": (-2, 2)}, r"with training frames \(SHA-256 of their names\)"),
+    ],
+)
+def test_a_resumed_run_sees_the_same_samples(seed: int, data: dict[str, Any], words: str, tmp_path: Path) -> None:
+    first = tiny.tiny_trainer(tmp_path, max_epochs=1, callbacks=[LastCheckpoint(str(tmp_path))])
+    first.fit(tiny.tiny_model(), tiny.tiny_walls())
+    model = tiny.tiny_model()
+    model.seed = seed
+    again = tiny.tiny_trainer(tmp_path, max_epochs=2)
+    with pytest.raises(CheckpointError, match=words):
+        again.fit(model, tiny.tiny_walls(**data), ckpt_path=str(tmp_path / "last.ckpt"), weights_only=True)
+
+
+def test_a_checkpoint_without_settings_is_resumed(tmp_path: Path) -> None:
+    first = tiny.tiny_trainer(tmp_path, max_epochs=1, callbacks=[LastCheckpoint(str(tmp_path))])
+    first.fit(tiny.tiny_model(), tiny.tiny_walls())
+    old = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    del old["saunet_training"]["settings"]
+    torch.save(old, tmp_path / "old.ckpt")
+    again = tiny.tiny_trainer(tmp_path, max_epochs=2)
+    model = tiny.tiny_model()
+    model.seed = 5
+    again.fit(model, tiny.tiny_walls(), ckpt_path=str(tmp_path / "old.ckpt"), weights_only=True)
+    assert again.current_epoch == 2
+
+
+def test_changed_networks_and_objectives_are_named(model: Any) -> None:
+    before = {"objective": {"_target_": "a.Saunet", "alpha": 10.0}, "model": model.record["model"]}
+    assert changes(before, before) is None
+    now = {
+        "objective": {"_target_": "a.Saunet", "alpha": 5.0},
+        "model": {**before["model"], "pose": {**before["model"]["pose"], "_target_": "b.Other"}},
+    }
+    said = changes(before, now)
+    assert said is not None
+    assert "goes on with the new objective.alpha 5.0 (it was 10.0), model.pose Other (it was PoseCNN);" in said
+    assert changes({"objective": {}, "model": {}}, now) is None
+
+
+def test_a_changed_objective_is_not_kept_in_silence(
+    config: dict[str, Any], walls: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    from saunet.lit.assemble import assemble
+
+    few = {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 0}
+    first = tiny.tiny_trainer(tmp_path, **few, callbacks=[LastCheckpoint(str(tmp_path))])
+    first.fit(assemble(config, walls), walls)
+    config["objective"]["alpha"] = 3.0
+    again = tiny.tiny_trainer(tmp_path, **few)
+    with caplog.at_level("INFO"):
+        again.fit(assemble(config, walls), walls, ckpt_path=str(tmp_path / "last.ckpt"), weights_only=True)
+    assert "goes on with the new objective.alpha 3.0 (it was 10.0)" in caplog.text

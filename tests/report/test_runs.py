@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import socket
@@ -68,6 +69,23 @@ def test_validation_counts_at_its_best_epoch(tmp_path: Path) -> None:
     (score,) = read_run(make_run(tmp_path / "a", abs_rel=(0.4, 0.2, 0.3))).scores
     assert score.errors == (0.2, *ERRORS[1:])
     assert (score.images, score.validation, score.data) == (4, True, "synthetic, validation split")
+
+
+def test_best_is_the_highest_where_more_is_better(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "a", abs_rel=(0.4, 0.2, 0.3))
+    log = folder / "csv" / "metrics.csv"
+    rows = list(csv.DictReader(log.read_text().splitlines()))
+    measured = [row for row in rows if row["val/a1"]]
+    for row, value in zip(measured, (0.5, 0.7, 0.9), strict=True):
+        row["val/a1"] = str(value)
+    with log.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    config = folder / ".hydra" / "config.yaml"
+    config.write_text(config.read_text() + "\nmonitor: val/a1\n")
+    (score,) = read_run(folder).scores
+    assert score.errors[4] == 0.9
 
 
 def test_files_cut_short_by_a_kill_do_no_harm(tmp_path: Path) -> None:

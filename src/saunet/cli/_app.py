@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import re
-import shutil
 import sys
 import warnings
 from collections.abc import Callable, Collection
@@ -15,19 +14,23 @@ from typing import Any, NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from saunet import schema
 from saunet.checks import SaunetError, suggest, usable_device
+from saunet.cli._folders import Folder, noted
 from saunet.cli._globs import expand_globs
 from saunet.cli._sweep import check_folder, summary, swept_folder
 from saunet.config import config_dir, register_configs
 from saunet.lit.run_record import FILE, Stopped
 from saunet.registry import REGISTRIES
 from saunet.roots import ROOTS
+
+PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "predictions", "resume", "root")
+"""Keys at the root of a tool's config that name files or folders."""
 
 
 def run(name: str, task: Callable[[DictConfig], Any], kinds: Collection[str] = tuple(REGISTRIES)) -> None:
@@ -44,8 +47,9 @@ def run(name: str, task: Callable[[DictConfig], Any], kinds: Collection[str] = t
     debug = before == "1" and "LOCAL_RANK" not in os.environ
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then lets exceptions through instead of printing them its own way
 
-    folders: list[Path] = []  # of a single run, once they exist
+    folders: list[Folder] = []  # of a single run, as they were before it
     failed: list[Exception] = []
+    noted()  # what an earlier run of this process left
 
     @wraps(task)
     def required(cfg: DictConfig) -> Any:
@@ -54,14 +58,13 @@ def run(name: str, task: Callable[[DictConfig], Any], kinds: Collection[str] = t
         hydra_cfg = HydraConfig.get()
         if hydra_cfg.mode == RunMode.MULTIRUN:
             return _job(name, task, cfg)
-        folders.append(Path(hydra_cfg.runtime.output_dir))
-        if "output_dir" in cfg:
-            folders.append(Path(cfg.output_dir).resolve())
+        run_folder = noted()
+        if run_folder is not None:
+            folders.append(run_folder)
+        if "output_dir" in cfg and Path(cfg.output_dir).resolve() != Path(hydra_cfg.runtime.output_dir).resolve():
+            folders.append(Folder.as_it_is(Path(cfg.output_dir).resolve()))
         try:
-            missing = sorted(OmegaConf.missing_keys(cfg))
-            if missing:
-                needed = " ".join(f"{key}=..." for key in missing)
-                raise SaunetError(f"{missing[0]} is not set; add {needed} to the command line")
+            _check_given(cfg)
             return task(cfg)
         except Exception as error:
             failed.append(error)  # raised again outside of Hydra, which would print a line of its own before ours
@@ -72,30 +75,48 @@ def run(name: str, task: Callable[[DictConfig], Any], kinds: Collection[str] = t
         hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(required)()
         if failed:
             raise failed[0]
-        _end_sweep(name)
+        if not _end_sweep():
+            raise SystemExit(1)
     except KeyboardInterrupt:
-        _end_sweep(name, other="interrupted")
+        _end_sweep(other="interrupted")
         _fail(name, "interrupted", code=130)
     except Stopped as stop:
-        _end_sweep(name)
+        _end_sweep()
         if stop.code:
             _fail(name, stop.message, code=int(stop.code))
     except Exception as error:
         reason = sentence(error)
         if debug or reason is None:
             raise
-        _end_sweep(name, other=reason)
+        if not _end_sweep(other=reason):
+            raise SystemExit(1) from error
         for folder in folders:
-            _remove_if_bare(folder)
+            folder.remove_traces(name)
         _fail(name, reason)
     finally:
         if before is None:
             del os.environ["HYDRA_FULL_ERROR"]
 
 
+def _check_given(cfg: DictConfig) -> None:
+    """Check that what must be given is, and that no path is empty, as one from an unset variable of the shell.
+
+    Raises:
+        SaunetError: naming the keys.
+    """
+    missing = sorted(OmegaConf.missing_keys(cfg))
+    if missing:
+        needed = " ".join(f"{key}=..." for key in missing)
+        raise SaunetError(f"{missing[0]} is not set; add {needed} to the command line")
+    for key in PATHS:
+        if cfg.get(key) == "":
+            raise SaunetError(f"{key}= is empty, perhaps from a shell variable that is not set; name a path")
+
+
 def _job(name: str, task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
     """Run one job of a sweep; what goes wrong is said at once and ends this job only."""
     try:
+        _check_given(cfg)
         if "output_dir" in cfg:
             check_folder(cfg.output_dir, HydraConfig.get().runtime.output_dir)
         return task(cfg)
@@ -106,15 +127,18 @@ def _job(name: str, task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         raise
 
 
-def _end_sweep(name: str, other: str | None = None) -> None:
-    """After a sweep, say how its jobs ended; exit with code 1 if one failed, or none began and nothing else says so."""
+def _end_sweep(other: str | None = None) -> bool:
+    """After a sweep, say how its jobs ended, unless none began and ``other`` is said of it.
+
+    Returns:
+        Whether all finished, or there is nothing to tell.
+    """
     folder = swept_folder()
     if folder is None or (other and not any(folder.glob(f"**/{FILE}"))):
-        return
+        return True
     text, finished = summary(folder)
     print(text, file=sys.stdout if finished else sys.stderr)
-    if not finished:
-        raise SystemExit(1)
+    return finished
 
 
 def pick_device(name: str) -> str:
@@ -159,33 +183,24 @@ def _fail(name: str, message: str, code: int = 1) -> NoReturn:
     raise SystemExit(code)
 
 
-def _remove_if_bare(folder: Path) -> None:
-    """Remove a run folder that holds nothing but its config and empty logs: the run never began."""
-    if folder == Path.cwd() or not ((folder / ".hydra").is_dir() or (folder / FILE).is_file()):
-        return
-    started = ("hparams.yaml", "events.out.tfevents", FILE)
-    files = [path for path in folder.rglob("*") if path.is_file() and path.parent.name != ".hydra"]
-    if not all(path.suffix == ".log" or path.name.startswith(started) for path in files):
-        return
-    (folder / FILE).unlink(missing_ok=True)
-    if (folder / ".hydra").is_dir():
-        logging.shutdown()
-        shutil.rmtree(folder, ignore_errors=True)
-        for parent in folder.parents:  # outputs/NAME and outputs, where nothing else is in them
-            if Path.cwd() not in parent.parents or any(parent.iterdir()):
-                break
-            parent.rmdir()
-    elif not any(folder.iterdir()):
-        folder.rmdir()
-
-
 def sentence(error: Exception) -> str | None:
     """Say in one sentence what a user can mend; None for a defect of the program."""
     if isinstance(error, SaunetError):
         return str(error)
+    if type(error).__name__ == "OutOfMemoryError":  # torch's, which is not imported for its name
+        return "the GPU's memory is too small for this; lower the batch size (in training data.batch_size) or the size"
+    if str(error).startswith("Config group override must be a string or a list"):
+        return "a group of the config cannot be null; choose logger=none, or set single members to null"
     raised_elsewhere = re.search(r"^saunet\.checks\.\w+: (.*)", str(error), re.MULTILINE)
     if raised_elsewhere:  # in a process that was spawned: only its traceback's text arrives here
         return raised_elsewhere[1]
+    cause = error.__cause__
+    if isinstance(error, InstantiationException) and not isinstance(cause, OmegaConfBaseException):
+        missing = re.search(r"\b(wandb|mlflow)\b", str(cause)) if isinstance(cause, ModuleNotFoundError) else None
+        if missing:
+            return f"logger={missing[1]} needs a package that is not installed; run `pip install 'saunet[track]'`"
+        if isinstance(cause, SaunetError | ValueError | TypeError):
+            return " ".join(str(cause).split())
     for each in (error, error.__cause__):  # Hydra wraps what a constructor raises
         if type(each).__name__ == "MisconfigurationException":  # Lightning's word for a user's error
             return " ".join(str(each).split())

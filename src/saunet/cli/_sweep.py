@@ -9,8 +9,10 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from saunet.checks import ConfigError
+from saunet.cli._runs import planned_jobs
 from saunet.lit.run_record import FILE, mark_lost, read
 
+UNKNOWN = "overrides unknown"
 _folders: list[Path] = []
 
 
@@ -48,6 +50,8 @@ def check_folder(output_dir: str, job: str) -> None:
 def summary(folder: Path) -> tuple[str, bool]:
     """Say how the jobs of a sweep ended, one line for each that did not finish; jobs that vanished are marked failed.
 
+    Jobs that never started count too, where it is known which were to run.
+
     Args:
         folder: The sweep's folder, with one ``run.json`` in each job's.
 
@@ -64,8 +68,13 @@ def summary(folder: Path) -> tuple[str, bool]:
         else:
             reason = content.get("error") or "its record cannot be read"
             lines.append(f"  {job.relative_to(folder)} ({_overrides(job)}) {content.get('status', 'failed')}: {reason}")
-    head = f"sweep: {finished} of {len(jobs)} jobs finished; results: {folder}"
-    return "\n".join([head, *lines]), 0 < finished == len(jobs)
+    started = [_overrides(job) for job in jobs]
+    planned = [", ".join(job) for job in planned_jobs(folder) or []]
+    waiting = [each for each in planned if each not in started] if UNKNOWN not in started else []
+    lines += [f"  ({each}) not started" for each in waiting]
+    count = len(jobs) + len(waiting)
+    head = f"sweep: {finished} of {count} jobs finished; results: {folder}"
+    return "\n".join([head, *lines]), 0 < finished == count
 
 
 def _in_order(path: Path) -> tuple[int, str]:
@@ -75,4 +84,4 @@ def _in_order(path: Path) -> tuple[int, str]:
 
 def _overrides(job: Path) -> str:
     path = job / ".hydra" / "overrides.yaml"
-    return ", ".join(str(each) for each in OmegaConf.load(path)) if path.is_file() else "overrides unknown"
+    return ", ".join(str(each) for each in OmegaConf.load(path)) if path.is_file() else UNKNOWN

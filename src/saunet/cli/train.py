@@ -15,7 +15,7 @@ from saunet.cli._app import run, sentence
 
 
 def train(cfg: DictConfig) -> float | None:
-    """Train, print where the results are, and return the best monitored value: what a search minimises."""
+    """Train, print where the results are, and return what a search minimises: see `BestCheckpoint.cost`."""
     return fit(cfg)[1]
 
 
@@ -23,7 +23,7 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
     """Build every part from the config and train; ``run.json`` in the run's folder says how that went.
 
     Returns:
-        The data module, and the best monitored value.
+        The data module, and the best monitored value, its negative where more is better.
     """
     from hydra.core.hydra_config import HydraConfig
     from lightning import seed_everything
@@ -32,16 +32,20 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
     from saunet.lit.callbacks import BestCheckpoint, SplitsRecorded
     from saunet.lit.durable import way_on
     from saunet.lit.run_record import recording
-    from saunet.lit.start import check_resume, keep_rows, resume_path, warm_start
+    from saunet.lit.start import check_resume, check_unused, keep_rows, resume_path, warm_start
     from saunet.lit.storage import AtomicCheckpointIO
     from saunet.registry import instantiate
 
-    with recording(cfg.output_dir, cfg.name, sentence) as record:
+    def check() -> None:
+        config.check(cfg)
+        if not (cfg.resume or cfg.overwrite):
+            check_unused(cfg.output_dir)
+
+    with recording(cfg.output_dir, cfg.name, sentence, check) as record:
         hydra = HydraConfig.get()
         record.describe(config.plain(cfg), config.plain(hydra.runtime.choices), list(hydra.overrides.task))
-        config.check(cfg)
-        seed_everything(cfg.seed, workers=True, verbose=False)
         resume = resume_path(cfg.resume, cfg.output_dir, cfg.init_from)
+        seed_everything(cfg.seed, workers=True, verbose=False)
         data = instantiate(config.plain(cfg.data))
         record.write(protocol=cfg.protocol or data.protocol)
         model = assemble(config.plain(cfg), data, pretrained=resume is None and cfg.init_from is None)
@@ -71,8 +75,8 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
             raise
     if trainer.is_global_zero:
         print(f"results: {cfg.output_dir}")
-    scores = [each.best_model_score for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint)]
-    return data, next((float(score) for score in scores if score is not None), None)
+    costs = [each.cost for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint)]
+    return data, next((cost for cost in costs if cost is not None), None)
 
 
 def main() -> None:

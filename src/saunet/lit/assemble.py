@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from saunet.checkpoint import build_networks
-from saunet.checks import ConfigError, divisible
+from saunet.checks import ConfigError, divisible, one_of
 from saunet.data.module import DepthDataModule
 from saunet.lit.module import SelfSupervisedDepth
 from saunet.lit.optim import Recipe
 from saunet.lit.speed import Speed
 from saunet.metrics.depth import DepthMetrics
+from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import protocol
 from saunet.record import ModelRecord, Scale
 from saunet.registry import instantiate
@@ -30,6 +31,8 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule, pretrained: bool = T
         CheckpointError: if public weights cannot be fetched, read or fitted.
     """
     _check_sources(cfg, data)
+    objective = instantiate(cfg["objective"])
+    _check_monitor(cfg, getattr(objective, "terms", {}))
     model = cfg["model"] if data.offsets else {**cfg["model"], "pose": None}  # the stereo rig's motion is known
     record = ModelRecord(
         **model,
@@ -47,20 +50,36 @@ def assemble(cfg: Mapping[str, Any], data: DepthDataModule, pretrained: bool = T
             f"protocol '{rules.name}' is defined on '{rules.ground_truth}' ground truth and the data give "
             f"'{data.ground_truth}'; leave protocol unset, or choose the matching ground truth"
         )
-    return SelfSupervisedDepth(
+    module = SelfSupervisedDepth(
         depth=depth,
         pose=pose,
-        objective=instantiate(cfg["objective"]),
+        objective=objective,
         recipe=Recipe(**_settings(cfg["optim"])),
         metrics=DepthMetrics(rules),
         seed=cfg["seed"],
         record=record.to_plain(),
         speed=Speed(**_settings(cfg.get("speed", {}))),
     )
+    module.objective_node = cfg["objective"]
+    return module
 
 
 def _settings(node: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in node.items() if not key.startswith("_")}
+
+
+def _check_monitor(cfg: Mapping[str, Any], terms: Iterable[str]) -> None:
+    """Check that what shall choose ``best.ckpt`` is something that a training measures.
+
+    Raises:
+        ConfigError: otherwise.
+    """
+    measured = ["val/loss", *(f"val/{name}" for name in (*ERROR_NAMES, *terms)), "train/loss"]
+    if "monitor" in cfg:
+        one_of("monitor", cfg["monitor"], measured)
+    for name, node in (cfg.get("callbacks") or {}).items():
+        if node and str(node.get("_target_")).endswith(".BestCheckpoint"):
+            one_of(f"callbacks.{name}.monitor", node.get("monitor", measured[0]), measured)
 
 
 def _check_sources(cfg: Mapping[str, Any], data: DepthDataModule) -> None:
@@ -73,6 +92,13 @@ def _check_sources(cfg: Mapping[str, Any], data: DepthDataModule) -> None:
         raise ConfigError(
             "data.offsets is empty and data.stereo is false, so there is no source image to learn from; "
             "set data.offsets=[-1,1] for video, data.stereo=true for a stereo pair, or both"
+        )
+    if cfg["model"]["pose"] is None:
+        if not data.offsets:  # the stereo rig's motion is known
+            return
+        raise ConfigError(
+            f"model.pose is null but the data give neighbours in time at {list(data.offsets)}, whose motion has to be "
+            "learnt; choose a model/pose, or learn from a stereo partner alone with data.stereo=true data.offsets=[]"
         )
     offsets = cfg["model"]["pose"]["offsets"]
     if list(offsets) != list(data.offsets):

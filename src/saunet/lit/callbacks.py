@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from lightning import Callback, LightningModule, Trainer
@@ -17,8 +17,10 @@ from saunet.atomic import replacing
 from saunet.checks import CheckpointError, positive
 from saunet.data.module import DepthDataModule
 from saunet.images import write_image
+from saunet.lit.module import EPOCH_LOSS
 from saunet.lit.pictures import training_panel
 from saunet.lit.run_record import RunRecord
+from saunet.metrics.functional import RISING
 from saunet.progress import watched
 from saunet.types import EvalBatch
 
@@ -66,17 +68,25 @@ class LastCheckpoint(ModelCheckpoint):
 
 
 class BestCheckpoint(ModelCheckpoint):
-    """``best.ckpt``: the state with the smallest monitored value.
+    """``best.ckpt``: the state with the best monitored value, the smallest but for ``val/a1``, ``a2`` and ``a3``.
 
     Args:
         folder: Where it goes.
         monitor: What decides; where it is not measured (no validation frame has ground truth), ``val/loss`` does, and
-            without validation ``train/loss``.
+            without validation ``train/loss``, its mean over the epoch.
     """
 
     def __init__(self, folder: str, monitor: str = "val/abs_rel") -> None:
-        super().__init__(folder, "best", monitor, mode="min", enable_version_counter=False)
+        super().__init__(folder, "best", monitor, mode=_direction(monitor), enable_version_counter=False)
         self.wanted = monitor
+        self._scored_by, self._said = monitor, False
+
+    @property
+    def cost(self) -> float | None:
+        """The best monitored value as what a search minimises: its negative where more is better."""
+        if self.best_model_score is None:
+            return None
+        return -float(self.best_model_score) if self.mode == "max" else float(self.best_model_score)
 
     @property
     def state_key(self) -> str:
@@ -99,20 +109,36 @@ class BestCheckpoint(ModelCheckpoint):
                 "best_k_models": {moved: state_dict["best_model_score"]},
             }
         super().load_state_dict(state_dict)
+        self._scored_by = state_dict["monitor"]
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Choose what to monitor, then save."""
-        self._choose(trainer)
+        if not (trainer.sanity_checking or self._should_save_on_train_epoch_end(trainer)):
+            self._choose(trainer)
         super().on_validation_end(trainer, pl_module)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Choose what to monitor, then save."""
-        self._choose(trainer)
+        if self._should_save_on_train_epoch_end(trainer):
+            self._choose(trainer)
         super().on_train_epoch_end(trainer, pl_module)
 
     def _choose(self, trainer: Trainer) -> None:
-        measured = [name for name in (self.wanted, "val/loss", "train/loss") if name in trainer.callback_metrics]
-        self.monitor = measured[0] if measured else self.wanted
+        wanted = EPOCH_LOSS if self.wanted == "train/loss" else self.wanted
+        measured = [name for name in (wanted, "val/loss", EPOCH_LOSS) if name in trainer.callback_metrics]
+        self.monitor = measured[0] if measured else wanted
+        self.mode = _direction(self.monitor)
+        if self.monitor != wanted and not self._said:
+            self._said = True
+            named = "the epoch's mean train/loss" if self.monitor == EPOCH_LOSS else self.monitor
+            rank_zero_info(f"{self.wanted} is not measured in this run; best.ckpt is chosen by {named}")
+        if self.monitor != self._scored_by:  # what is known of the best is of another kind
+            self._scored_by = self.monitor
+            self.best_k_models, self.kth_best_model_path, self.best_model_score = {}, "", None
+
+
+def _direction(monitor: str) -> Literal["min", "max"]:
+    return "max" if monitor.removeprefix("val/") in RISING else "min"
 
 
 class PicturePanel(Callback):

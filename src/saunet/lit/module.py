@@ -21,6 +21,9 @@ from saunet.losses.base import Objective
 from saunet.metrics.depth import DepthMetrics
 from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
 
+EPOCH_LOSS = "train/loss_epoch"
+"""Name of the mean of ``train/loss`` over an epoch and all processes, which is itself the last batch's."""
+
 
 class SelfSupervisedDepth(TrainedModule):
     """Depth and pose networks trained together on video by view synthesis (SAU-Net section III).
@@ -68,6 +71,9 @@ class SelfSupervisedDepth(TrainedModule):
         self.log_dict(figures, prog_bar=False, batch_size=len(batch["name"]))
         self.log("train/lr", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=len(batch["name"]))
         self.log("loss", figures["train/loss"], prog_bar=True, logger=False, batch_size=len(batch["name"]))
+        # What best.ckpt is chosen by where nothing is validated: the last batch alone would be chance.
+        mean: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True, "logger": False}
+        self.log(EPOCH_LOSS, terms.total.detach(), batch_size=len(batch["name"]), **mean)
         return terms.total
 
     def _of_all_processes(self, figures: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -113,7 +113,10 @@ class RunRecord:
 
 @contextmanager
 def recording(
-    folder: str | Path, name: str, describe: Callable[[Exception], str | None] = lambda error: None
+    folder: str | Path,
+    name: str,
+    describe: Callable[[Exception], str | None] = lambda error: None,
+    check: Callable[[], None] = lambda: None,
 ) -> Iterator[RunRecord]:
     """Keep ``run.json`` while the block runs, however it ends.
 
@@ -121,17 +124,25 @@ def recording(
         folder: The run's folder.
         name: The run's name.
         describe: Says in one sentence what went wrong, or None for a defect of the program.
+        check: Raises if the run cannot begin; an earlier run's record in the folder then stays as it is.
     """
     record = RunRecord(folder, name)
-    record.start()
+    of_earlier_run = record.path.is_file()
     try:
+        check()
+        of_earlier_run = False
+        record.start()
         yield record
     except Exception as error:
+        if of_earlier_run:
+            raise
         sentence = str(error) if isinstance(error, SaunetError) else describe(error)
         with suppress(SaunetError):  # on a full disk, what filled it is the news, not that this cannot be noted
             record.end("failed", sentence or " ".join(f"{type(error).__name__}: {error}".split())[:500])
         raise
     except BaseException as error:  # Ctrl-C, or a stop that was asked for
+        if of_earlier_run:
+            raise
         record.end("interrupted", str(error) if isinstance(error, Stopped) else "interrupted")
         raise
     record.end("finished")

@@ -37,6 +37,23 @@ def resume_path(resume: str | None, output_dir: str | Path, init_from: str | Non
     return str(Path(resume).expanduser().resolve()) if resume else None
 
 
+def check_unused(output_dir: str | Path) -> None:
+    """Check that a new training would not replace what an earlier one left.
+
+    Args:
+        output_dir: The run's folder.
+
+    Raises:
+        ConfigError: if it holds checkpoints.
+    """
+    found = sorted((Path(output_dir) / "checkpoints").glob("*.ckpt"))
+    if found:
+        raise ConfigError(
+            f"{output_dir} holds {found[0].name} of an earlier run; go on with it by resume=auto, choose another "
+            "folder, or replace it with overwrite=true"
+        )
+
+
 def check_resume(model: SelfSupervisedDepth, path: str) -> int:
     """Check that a training can go on from a checkpoint, before the trainer finds out in its own words.
 

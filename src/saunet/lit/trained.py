@@ -15,6 +15,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 
 from saunet.lit.averaging import WeightAverage
+from saunet.lit.continuity import changes, check_continues, settings
 from saunet.lit.optim import Recipe
 from saunet.lit.speed import Speed
 
@@ -41,6 +42,8 @@ class TrainedModule(LightningModule):
         self.speed = speed if speed is not None else Speed()
         self.seed = seed
         self.record = dict(record or {})
+        self.objective_node: Mapping[str, Any] | None = None
+        """Config node of the objective, where it is known; kept in checkpoints."""
         self.average: WeightAverage | None = None
         self._loaded_average: dict[str, Tensor] | None = None
         self._prepared = False
@@ -120,7 +123,7 @@ class TrainedModule(LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the record from which the networks are rebuilt, the recipe, and both kinds of weights."""
         checkpoint["saunet"] = self.record
-        training: dict[str, Any] = {"recipe": self.recipe.to_plain()}
+        training: dict[str, Any] = {"recipe": self.recipe.to_plain(), "settings": self._settings()}
         if self.average is not None:
             training["weights"] = self.average.training_weights()
             checkpoint["state_dict"] = {**checkpoint["state_dict"], **self.average.values}
@@ -131,9 +134,16 @@ class TrainedModule(LightningModule):
         if self._trainer is None or self.trainer.state.fn != TrainerFn.FITTING:
             return
         training = checkpoint.get("saunet_training", {})
+        before, now = training.get("settings", {}), self._settings()
+        check_continues(before, now)
         if "weights" in training:
             self._loaded_average = dict(checkpoint["state_dict"])
             checkpoint["state_dict"] = {**checkpoint["state_dict"], **training["weights"]}
-        sentence = self.recipe.resumed_from(training.get("recipe", {}))
-        if sentence:
-            rank_zero_info(sentence)
+        old = {"objective": before.get("objective", {}), "model": checkpoint.get("saunet", {}).get("model", {})}
+        new = {"objective": now.get("objective", {}), "model": self.record.get("model", {})}
+        for sentence in (self.recipe.resumed_from(training.get("recipe", {})), changes(old, new)):
+            if sentence:
+                rank_zero_info(sentence)
+
+    def _settings(self) -> dict[str, Any]:
+        return settings(self.seed, getattr(self.trainer, "datamodule", None), self.objective_node)

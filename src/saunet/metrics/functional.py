@@ -14,6 +14,8 @@ ERROR_HEADINGS: tuple[str, ...] = ("Abs Rel ↓", "Sq Rel ↓", "RMSE ↓", "RMS
 """Column headings of `ERROR_NAMES`; the arrow points to better."""
 HIGHER_IS_BETTER: tuple[bool, ...] = (False, False, False, False, True, True, True)
 """Which of `ERROR_NAMES` grow with quality."""
+RISING: tuple[str, ...] = tuple(name for name, up in zip(ERROR_NAMES, HIGHER_IS_BETTER, strict=True) if up)
+"""The names of those that do."""
 
 _GARG_ROWS = (0.40810811, 0.99189189)
 _GARG_COLUMNS = (0.03594771, 0.96405229)

@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from saunet.metrics.functional import ERROR_NAMES
+from saunet.metrics.functional import ERROR_NAMES, RISING
 from saunet.report.files import read_json, read_mapping, read_numbers, read_yaml
 
 Status = Literal["finished", "running", "failed", "interrupted", "unfinished", "unknown"]
@@ -215,7 +215,7 @@ def _validation(
         return None
     monitor = str(config.get("monitor"))
     monitor = monitor if all(monitor in row for row in rows) else "val/abs_rel"
-    best = min(rows, key=lambda row: row[monitor])
+    best = (max if monitor.removeprefix("val/") in RISING else min)(rows, key=lambda row: row[monitor])
     data = f"{choices.get('data') or 'its data'}, validation split"
     errors = tuple(best[f"val/{name}"] for name in ERROR_NAMES)
     protocol = str(record.get("protocol") or config.get("protocol") or "of the data")
