@@ -128,7 +128,7 @@ def test_an_interrupted_sweep_names_the_jobs_that_never_started(
     def press(self: GracefulStop, *_: Any) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(GracefulStop, "on_train_batch_start", press, raising=False)
+    monkeypatch.setattr(GracefulStop, "on_before_backward", press, raising=False)
     outcome = tool("train", "--multirun", *QUICK, "seed=1,2,3", "hydra.sweep.dir=sweep")
     assert outcome.code == 130
     assert "sweep: 0 of 3 jobs finished" in outcome.err

@@ -36,11 +36,14 @@ PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "
 def run(name: str, task: Callable[[DictConfig], Any], kinds: Collection[str] = tuple(REGISTRIES)) -> None:
     """Run ``task`` as the Hydra application whose root config is ``conf/<name>.yaml``.
 
-    ``kinds`` are those of the components that the config may name: a tool without losses and data sets starts without
-    importing what they are made of, Lightning among it.
-
     What a user can mend ends in one sentence and exit code 1; only a defect of the program shows a traceback.
     ``HYDRA_FULL_ERROR=1`` shows it always. In a sweep, the other jobs go on, and failures are named at the end.
+
+    Args:
+        name: The tool, without ``saunet-``.
+        task: What it does with its config.
+        kinds: Those of the components that the config may name: a tool without losses and data sets starts without
+            importing what they are made of, Lightning among it.
     """
     before = os.environ.get("HYDRA_FULL_ERROR")
     # A process that DDP started inherits the variable from us, not from the user.

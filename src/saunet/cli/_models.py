@@ -28,7 +28,11 @@ def build(model: DictConfig) -> Any:
 
 
 def chosen(cfg: DictConfig) -> dict[str, DictConfig]:
-    """Return the ``model`` nodes to measure by the name they are shown under, which a changed model does not share."""
+    """Return the ``model`` nodes to measure by the name they are shown under, which a changed model does not share.
+
+    Raises:
+        ConfigError: if ``models`` stands beside changes of a model.
+    """
 
     def named(name: str) -> DictConfig:
         return compose("benchmark", overrides=[f"model={name}"]).model  # type: ignore[no-any-return]

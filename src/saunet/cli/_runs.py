@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 from omegaconf import OmegaConf
 
@@ -57,8 +58,11 @@ def planned_jobs(sweep: Path) -> list[list[str]] | None:
         hydra = OmegaConf.load(sweep / "multirun.yaml").hydra
         if "BasicSweeper" not in hydra.sweeper._target_:
             return None
+        given = cast(
+            list[str], OmegaConf.to_container(hydra.overrides.task, resolve=False)
+        )  # some refer to a job that is not there now
         params = [f"{key}={value}" for key, value in (hydra.sweeper.params or {}).items()]
-        parsed = OverridesParser.create().parse_overrides([*params, *hydra.overrides.task])
+        parsed = OverridesParser.create().parse_overrides([*params, *given])
         return [job for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]
     except (OSError, AttributeError, HydraException):
         return None

@@ -39,7 +39,11 @@ def evaluate_model(network: Any, data: Any, protocols: Sequence[str], *, split: 
 
 
 def evaluate(cfg: DictConfig) -> None:
-    """Load what is scored and the data, print the tables, write them to the output folder."""
+    """Load what is scored and the data, print the tables, write them to the output folder.
+
+    Raises:
+        ConfigError: if a setting is out of range.
+    """
     from hydra.core.hydra_config import HydraConfig
 
     from saunet.atomic import check_folder

@@ -25,11 +25,9 @@ from saunet.data.sequences import Drive
 from saunet.data.transforms import Augment, Prepare
 from saunet.data.unreadable import SkippingWindows, readable
 from saunet.data.windows import Selection, Usage, WindowDataset, check_offsets, collate, find_windows
-from saunet.data.workers import available_cores, single_threaded
+from saunet.data.workers import processes
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
 
-AHEAD = 4
-"""Batches that each loader process keeps ready: enough that one slow file, or a validation, is not felt."""
 STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("predict",)}
 
 
@@ -296,13 +294,4 @@ class DepthDataModule(LightningDataModule):
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
     def _loading(self) -> Mapping[str, Any]:
-        workers = min(self.workers, available_cores())
-        return {
-            "batch_size": None,  # the samplers yield whole batches
-            "collate_fn": collate,
-            "num_workers": workers,
-            "prefetch_factor": AHEAD if workers else None,
-            "pin_memory": torch.cuda.is_available(),
-            "persistent_workers": workers > 0,
-            "worker_init_fn": single_threaded,
-        }
+        return {**processes(self.workers), "batch_size": None, "collate_fn": collate}  # samplers yield whole batches

@@ -215,7 +215,7 @@ def clip_sinks(
     max_depth: float | int | None,
     odometer: Odometer | None,
 ) -> list[Sink]:
-    """Return what those of ``outputs`` go into that are made of a clip as a whole; see `predict_clip`."""
+    """Return what takes the outputs that are made of a clip as a whole; arguments as in `predict_clip`."""
     sinks, paths = list[Sink](), {output: folder / f"{title}{_NAMES[output]}" for output in CLIP_OUTPUTS}
     if "mp4" in outputs:
         sinks.append(VideoSink(paths["mp4"], fps, layout, palette, codec=codec))

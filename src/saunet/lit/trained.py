@@ -146,4 +146,4 @@ class TrainedModule(LightningModule):
                 rank_zero_info(sentence)
 
     def _settings(self) -> dict[str, Any]:
-        return settings(self.seed, getattr(self.trainer, "datamodule", None), self.objective_node)
+        return settings(self.seed, getattr(self._trainer, "datamodule", None), self.objective_node)
