@@ -58,6 +58,7 @@ def planned_jobs(sweep: Path) -> list[list[str]] | None:
         hydra = OmegaConf.load(sweep / "multirun.yaml").hydra
         if "BasicSweeper" not in hydra.sweeper._target_:
             return None
+        # Unresolved: some refer to a job, and there is none now.
         given = cast(
             list[str], OmegaConf.to_container(hydra.overrides.task, resolve=False)
         )  # some refer to a job that is not there now
