@@ -23,28 +23,28 @@ import scipy.sparse
 import scipy.sparse.linalg
 import torch
 
-from saunet.prepare.colorization import colorize
-from saunet.prepare.densify import interpolate
+from saunet.tools.prepare.colorization import colorize
+from saunet.tools.prepare.densify import interpolate
 
 
 def usual(image: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Write the equations down pixel by pixel and give them to a general sparse solver."""
-    grey = image @ (np.array([0.299, 0.587, 0.114]) / 255)
-    height, width = grey.shape
-    numbers = np.arange(grey.size).reshape(grey.shape)
+    gray = image @ (np.array([0.299, 0.587, 0.114]) / 255)
+    height, width = gray.shape
+    numbers = np.arange(gray.size).reshape(gray.shape)
     rows, columns, values = [], [], []
     for y in range(height):
         for x in range(width):
             window = (slice(max(0, y - 1), y + 2), slice(max(0, x - 1), x + 2))
             around = numbers[window].ravel() != numbers[y, x]
             to = numbers[window].ravel()[around]
-            difference = (grey[window].ravel()[around] - grey[y, x]) ** 2
-            spread = max(0.6 * grey[window].var(), -difference.min() / np.log(0.01), 2e-6)
+            difference = (gray[window].ravel()[around] - gray[y, x]) ** 2
+            spread = max(0.6 * gray[window].var(), -difference.min() / np.log(0.01), 2e-6)
             weight = np.exp(-difference / spread)
             rows += [numbers[y, x]] * (len(to) + 1)
             columns += [*to, numbers[y, x]]
             values += [*(-weight / weight.sum()), 1.0 + (depth[y, x] > 0)]
-    matrix = scipy.sparse.csr_matrix((values, (rows, columns)), shape=(grey.size, grey.size))
+    matrix = scipy.sparse.csr_matrix((values, (rows, columns)), shape=(gray.size, gray.size))
     top = depth.max()
     solved = scipy.sparse.linalg.spsolve(matrix, depth.astype(np.float64).ravel() / top).reshape(depth.shape) * top
     return np.where(depth > 0, depth, solved)
@@ -61,7 +61,7 @@ def frames(root: str | None, count: int) -> Iterator[tuple[np.ndarray, np.ndarra
         known = (rng.random(ramp.shape) < 0.05) & (np.arange(375)[:, None] > 130)
         yield image, np.where(known, ramp, 0).astype(np.float32)
         return
-    from saunet.prepare.recordings import kitti_recordings
+    from saunet.tools.prepare.recordings import kitti_recordings
 
     taken = 0
     for drive, numbers in kitti_recordings(root):

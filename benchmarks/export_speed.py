@@ -20,9 +20,9 @@ import numpy as np
 import torch
 
 from saunet.checkpoint import ModelRecord, atomic_save, build_networks
-from saunet.images import write_image
-from saunet.infer.exporters import export_onnx, run_eager, run_onnx
-from saunet.infer.parity import milliseconds
+from saunet.exporting.exporters import export_onnx, run_eager, run_onnx
+from saunet.exporting.parity import milliseconds
+from saunet.io.images import write_image
 from saunet.registry import REGISTRIES
 
 MODELS = ("resnet18+unet", "stratified_nano+aunet")

@@ -1,9 +1,9 @@
 """How many frame triplets a core loads from KITTI's originals: saunet's loader beside a straightforward one.
 
 The baselines are what most training code for this task does, written down plainly: decode with PIL, resize every frame
-to four scales with an antialiasing filter, change the colours of every second sample on the CPU, convert everything to
+to four scales with an antialiasing filter, change the colors of every second sample on the CPU, convert everything to
 float tensors; once with the full-size frames jittered too, as Monodepth2's code does. saunet decodes
-and resizes with OpenCV, once a frame, and hands bytes over; crop, flip, colour and scales are the device's work, whose
+and resizes with OpenCV, once a frame, and hands bytes over; crop, flip, color and scales are the device's work, whose
 cost on the CPU is printed too for those who train there. One thread, processor time, files in the page cache::
 
     python benchmarks/loading.py --root DATA/kitti/raw
@@ -33,7 +33,7 @@ OFFSETS = (-1, 1)
 
 
 class StraightforwardLoader:
-    """Triplets as float tensors at four scales, with and without colour jitter, by PIL.
+    """Triplets as float tensors at four scales, with and without color jitter, by PIL.
 
     Args:
         triplets: Files of each triplet.
@@ -54,16 +54,16 @@ class StraightforwardLoader:
             if flip:
                 image = image.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
             if self.native:
-                sample["colour", number, -1] = to_tensor(image)
-                sample["jittered", number, -1] = to_tensor(change_colours(image, *strength) if jitter else image)
+                sample["color", number, -1] = to_tensor(image)
+                sample["jittered", number, -1] = to_tensor(change_colors(image, *strength) if jitter else image)
             for scale in range(SCALES):
                 image = image.resize((SIZE[1] >> scale, SIZE[0] >> scale), Image.Resampling.LANCZOS)
-                sample["colour", number, scale] = to_tensor(image)
-                sample["jittered", number, scale] = to_tensor(change_colours(image, *strength) if jitter else image)
+                sample["color", number, scale] = to_tensor(image)
+                sample["jittered", number, scale] = to_tensor(change_colors(image, *strength) if jitter else image)
         return {key: value for key, value in sample.items() if key[-1] >= 0}
 
 
-def change_colours(image: Any, brightness: float, contrast: float, saturation: float, hue: float) -> Any:
+def change_colors(image: Any, brightness: float, contrast: float, saturation: float, hue: float) -> Any:
     """Change brightness, contrast, saturation and hue of a PIL image, one after the other."""
     image = ImageEnhance.Brightness(image).enhance(brightness)
     image = ImageEnhance.Contrast(image).enhance(contrast)

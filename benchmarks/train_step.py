@@ -24,9 +24,9 @@ from omegaconf import OmegaConf
 
 from saunet import config
 from saunet.data.windows import DRAWS
-from saunet.lit.assemble import assemble
-from saunet.lit.speed import Speed
 from saunet.registry import instantiate
+from saunet.training.assemble import assemble
+from saunet.training.speed import Speed
 
 SIZE = (192, 640)
 
@@ -95,7 +95,7 @@ def step(model: Any, data: Any, frames: Any, optimizer: Any, timer: Any, precisi
         gradients = torch.autograd.grad(terms.total, [*pyramid.sigmoid, poses])
     with timer("7 backward, networks"):
         torch.autograd.backward([*pyramid.sigmoid, poses], list(gradients))
-    with timer("8 optimiser"):
+    with timer("8 optimizer"):
         optimizer.step()
         optimizer.zero_grad()
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from saunet.checkpoint import ModelRecord, Scale, atomic_save, build_networks, load_weights, read_checkpoint
-from saunet.checks import CheckpointError, ConfigError
+from saunet.errors import CheckpointError, ConfigError
 
 Node = Callable[..., dict[str, Any]]
 
@@ -275,7 +275,7 @@ class TestAtomicSave:
         code = (
             "import resource, signal, sys, torch\n"
             "from saunet.checkpoint import atomic_save\n"
-            "from saunet.checks import CheckpointError\n"
+            "from saunet.errors import CheckpointError\n"
             "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
             "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
             "try:\n    atomic_save({'w': torch.zeros(100000)}, sys.argv[1])\n"

@@ -12,8 +12,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from saunet import config
-from saunet.lit.assemble import assemble
 from saunet.registry import instantiate
+from saunet.training.assemble import assemble
 
 GOLDEN: dict[str, list[float]] = {
     "saunet": [1.41653, 1.39354, 1.28218, 1.2556],
@@ -26,7 +26,7 @@ def test_the_first_losses_of_a_seeded_training(objective: str) -> None:
     config.register_configs()
     config.register_training_configs()
     with initialize_config_dir(str(config.config_dir()), version_base="1.3"):
-        cfg = compose("train", ["experiment=smoke", f"objective={objective}", "output_dir=unused", "data.colour=0"])
+        cfg = compose("train", ["experiment=smoke", f"objective={objective}", "output_dir=unused", "data.color=0"])
     torch.manual_seed(cfg.seed)
     data = instantiate(config.plain(cfg.data))
     model = assemble(dict(OmegaConf.to_container(cfg, resolve=True)), data)  # type: ignore[call-overload, arg-type]

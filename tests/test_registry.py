@@ -10,7 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import saunet
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.registry import REGISTRIES, Registry, encoders, instantiate
 
 

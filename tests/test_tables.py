@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from hydra import compose
 
-from saunet.benchmarking.report import PAPER_METHODS
-from saunet.checks import ConfigError
 from saunet.cli._globs import expand_globs
 from saunet.config import check, config_dir, plain
+from saunet.errors import ConfigError
+from saunet.tools.benchmark.report import PAPER_METHODS
 
 pytestmark = pytest.mark.usefixtures("hydra")
 

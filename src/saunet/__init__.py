@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from saunet.checks import CheckpointError
+from saunet.errors import CheckpointError
 from saunet.registry import registry
 
 __version__ = "0.1.0"
@@ -43,13 +43,13 @@ def load(source: Any, *, device: str = "cpu", flip: bool = False, keep_aspect: b
 
     Args:
         source: A checkpoint, a folder or ``model.onnx`` written by ``saunet-export``, or a model on the Hugging Face
-            hub (``hf://organisation/name``).
+            hub (``hf://organization/name``).
         device: Where to run, such as ``"cpu"`` or ``"cuda"``.
         flip: Average with the prediction of the mirrored image.
         keep_aspect: Feed each image at its own aspect ratio.
 
     Returns:
-        A `saunet.infer.Predictor`, or for ONNX a `saunet.infer.onnx.OnnxPredictor`, which does without torch.
+        A `saunet.prediction.Predictor`, or for ONNX a `saunet.exporting.onnx.OnnxPredictor`, which does without torch.
 
     Raises:
         CheckpointError: if it is missing, broken, or not a saunet model.
@@ -57,6 +57,6 @@ def load(source: Any, *, device: str = "cpu", flip: bool = False, keep_aspect: b
     """
     if not isinstance(source, str | Path) or not str(source):
         raise CheckpointError(f"saunet.load got {source!r}; give the path of a checkpoint or an exported folder")
-    from saunet.infer.load import load as load_any
+    from saunet.prediction.load import load as load_any
 
     return load_any(source, device=device, flip=flip, keep_aspect=keep_aspect)

@@ -14,12 +14,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from saunet.atomic import replacing
-from saunet.checks import CheckpointError, ConfigError
+from saunet.errors import CheckpointError, ConfigError
+from saunet.io.atomic import replacing
+from saunet.io.torch_files import read_plain
 from saunet.models.depth import DepthNet
-from saunet.record import ModelRecord, Scale
 from saunet.registry import instantiate
-from saunet.torch_files import read_plain
+from saunet.runs.record import ModelRecord, Scale
 
 __all__ = [
     "Checkpoint",
@@ -154,7 +154,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def store_scale(path: str | Path, scale: Scale) -> None:
-    """Write a measured factor to metres into a checkpoint; everything else in the file stays as it is.
+    """Write a measured factor to meters into a checkpoint; everything else in the file stays as it is.
 
     Raises:
         CheckpointError: if the file is no saunet checkpoint or cannot be written; it then stays as it was.

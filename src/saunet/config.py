@@ -10,7 +10,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from saunet import schema
-from saunet.checks import ConfigError, in_range, one_of, positive
+from saunet.errors import ConfigError, in_range, one_of, positive
 from saunet.registry import REGISTRIES
 from saunet.roots import ROOTS, ModelConfig, ScaleConfig
 
@@ -51,11 +51,11 @@ def register_configs(kinds: Collection[str] = tuple(REGISTRIES)) -> None:
 
 
 def register_training_configs() -> None:
-    """Add the nodes that need Lightning to be imported: the trainer's own options and the optimisation recipe."""
+    """Add the nodes that need Lightning to be imported: the trainer's own options and the optimization recipe."""
     from lightning import Trainer
 
-    from saunet.lit.optim import Recipe
-    from saunet.lit.speed import Speed
+    from saunet.training.optim import Recipe
+    from saunet.training.speed import Speed
 
     store = ConfigStore.instance()
     store.store(group="trainer", name="lightning", node=schema.node(Trainer, root="lightning.Trainer"))
@@ -82,7 +82,7 @@ def check(cfg: DictConfig) -> None:
     if cfg.optim.fused and str(cfg.trainer.precision).startswith("16") and cfg.trainer.gradient_clip_val:
         raise ConfigError(
             "optim.fused=true, trainer.precision=16-mixed and trainer.gradient_clip_val do not go together: the fused "
-            "optimiser unscales gradients after they would have been clipped; use trainer.precision=bf16-mixed, or "
+            "optimizer unscales gradients after they would have been clipped; use trainer.precision=bf16-mixed, or "
             "leave one out"
         )
     if cfg.trainer.max_epochs == -1 and cfg.trainer.max_steps == -1:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from saunet import schema
-from saunet.checks import ConfigError, suggest
+from saunet.errors import ConfigError, suggest
 
 C = TypeVar("C", bound=Callable[..., Any])
 

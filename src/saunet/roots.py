@@ -47,7 +47,7 @@ SCALE_METHODS = ("auto", "none", "stored", "camera_height", "speed", "stereo")
 
 @dataclass
 class ScaleConfig:
-    """How depth becomes metres without ground truth; see docs/scale.md."""
+    """How depth becomes meters without ground truth; see docs/scale.md."""
 
     method: str = "auto"
     camera_height: float | None = None
@@ -91,7 +91,7 @@ class PredictConfig:
     input: str = MISSING
     output: str = MISSING
     outputs: list[str] | None = None
-    palette: str = "magma"
+    colormap: str = "magma"
     camera: list[float] | None = None
     rectify: str | None = None
     max_depth: float | None = None

@@ -21,24 +21,24 @@ class FrameBatch(TypedDict):
     """RGB frames; index 0 is the target, then the sources in the order of the data module's ``offsets``, and last the
     stereo partner, if ``T_stereo_tgt`` says that there is one."""
     K: Float[Tensor, "b 3 3"]
-    """Intrinsics in pixels of ``frames`` (integer coordinates are pixel centres)."""
+    """Intrinsics in pixels of ``frames`` (integer coordinates are pixel centers)."""
     name: list[str]
     """One readable name a sample, such as ``2011_09_26/..._sync 0000000005 l``."""
     target_depth: NotRequired[Float[Tensor, "b 1 h w"]]
-    """Depth of the target in metres at the size of ``frames``, 0 where unknown; for losses that use LiDAR."""
+    """Depth of the target in meters at the size of ``frames``, 0 where unknown; for losses that use LiDAR."""
     target_teacher: NotRequired[Float[Tensor, "b 1 h w"]]
     """Depth of the target as another model predicts it, at the size of ``frames``, up to scale, 0 where unknown."""
     depth: NotRequired[Float[Tensor, "b 1 hg wg"]]
-    """Ground-truth depth in metres at its native size, 0 where unknown, padded to the largest in the batch."""
+    """Ground-truth depth in meters at its native size, 0 where unknown, padded to the largest in the batch."""
     depth_size: NotRequired[Int[Tensor, "b 2"]]
     """Native (height, width) of each ground truth inside the padding."""
     T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
-    """True motion, where the data set knows it: a target point times it is a source point, in metres."""
+    """True motion, where the data set knows it: a target point times it is a source point, in meters."""
     T_stereo_tgt: NotRequired[Float[Tensor, "b 4 4"]]
-    """Where the stereo partner is, from the calibration: a target point times it is a partner's point, in metres.
+    """Where the stereo partner is, from the calibration: a target point times it is a partner's point, in meters.
     Where it is given, the partner's image is the last source."""
     distance: NotRequired[Float[Tensor, "b s"]]
-    """Metres the camera travelled between the target and each source; NaN where unknown and for the stereo partner."""
+    """Meters the camera traveled between the target and each source; NaN where unknown and for the stereo partner."""
     draws: NotRequired[Float[Tensor, "b n"]]
     """Uniform random numbers in [0, 1) that augmentation uses; training samples only."""
 
@@ -47,13 +47,13 @@ class TrainBatch(TypedDict):
     """One training step's input, on the device, augmented. Images are RGB in [0, 1]."""
 
     target: Float[Tensor, "b 3 h w"]
-    """The target image as the networks see it (colour-jittered)."""
+    """The target image as the networks see it (color-jittered)."""
     sources: Float[Tensor, "b s 3 h w"]
     """The source images as the networks see them (the same jitter)."""
     loss_target: Float[Tensor, "b 3 h w"]
-    """The target image without colour jitter: what the loss compares."""
+    """The target image without color jitter: what the loss compares."""
     loss_sources: Float[Tensor, "b s 3 h w"]
-    """The source images without colour jitter."""
+    """The source images without color jitter."""
     K: Float[Tensor, "b 3 3"]
     """Intrinsics in pixels, after resize, crop and flip."""
     name: list[str]
@@ -97,9 +97,9 @@ class DepthPyramid:
     sigmoid: tuple[Float[Tensor, "b 1 _ _"], ...]
     """The raw output in (0, 1): relative disparity."""
     disparity: tuple[Float[Tensor, "b 1 _ _"], ...]
-    """Inverse depth in 1/metre (up to the scale ambiguity of monocular training)."""
+    """Inverse depth in 1/meter (up to the scale ambiguity of monocular training)."""
     depth: tuple[Float[Tensor, "b 1 _ _"], ...]
-    """Depth in metres (up to the same scale)."""
+    """Depth in meters (up to the same scale)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class LossTerms:
-    """An objective's result: what is optimised is what is logged."""
+    """An objective's result: what is optimized is what is logged."""
 
     total: Float[Tensor, ""]
     values: Mapping[str, Float[Tensor, ""]]

@@ -22,8 +22,8 @@ from saunet.cli.evaluate import evaluate
 from saunet.cli.odometry import odometry
 from saunet.cli.predict import predict
 from saunet.cli.train import train
-from saunet.data.synthetic import SyntheticDrive
-from saunet.data.synthetic.kitti_writer import write_raw
+from saunet.synthetic import SyntheticDrive
+from saunet.synthetic.kitti_writer import write_raw
 
 TASKS = {
     "benchmark": benchmark,

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import saunet
-from saunet.data.boards import Board
 from saunet.data.camera_file import CameraFile, write_camera
 from saunet.data.kitti import KittiRaw
 from saunet.data.lens import Lens
-from saunet.images import read_image
+from saunet.io.images import read_image
+from saunet.tools.calibrate.boards import Board
 
 Tool = Callable[..., Any]
 TINY = (

@@ -14,8 +14,8 @@ import pytest
 
 import saunet
 from saunet.checkpoint import read_checkpoint
-from saunet.prepare.densify import densify
-from saunet.prepare.recordings import kitti_recordings
+from saunet.tools.prepare.densify import densify
+from saunet.tools.prepare.recordings import kitti_recordings
 
 Tool = Callable[..., Any]
 SMALL = ("data.height=64", "data.width=96", "data.batch_size=2", "data.workers=0", "trainer=smoke")
@@ -71,7 +71,7 @@ def test_predict_writes_pictures_that_match_the_library(tool: Tool, smoke_run: P
     for name in ("a", "b"):
         cv2.imwrite(str(tmp_path / "in" / f"{name}.png"), rng.integers(0, 255, (60, 90, 3), dtype=np.uint8))
     checkpoint = smoke_run / "checkpoints" / "best.ckpt"
-    arguments = (f"checkpoint={checkpoint}", "input=in", "output=out", "outputs=[colour,png16,npy]")
+    arguments = (f"checkpoint={checkpoint}", "input=in", "output=out", "outputs=[color,png16,npy]")
     outcome = tool("predict", *arguments)
     assert outcome.code == 0, outcome.err
     assert "depth is relative" in outcome.out

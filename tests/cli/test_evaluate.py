@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from saunet.data.kitti import KittiRaw
+from saunet.io.trajectories import read_kitti
 from saunet.metrics.functional import ERROR_NAMES
-from saunet.trajectories import read_kitti
 
 Tool = Callable[..., Any]
 RAW = ("data=kitti", "data.split=all", "data.cameras=[left]", "data.workers=0", "baselines=false")
@@ -124,7 +124,7 @@ def test_exported_depth_is_scaled_by_the_first_protocol(
     assert alone == first
 
 
-def test_without_ground_truth_by_how_the_neighbours_are_explained(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+def test_without_ground_truth_by_how_the_neighbors_are_explained(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
     outcome = tool(
         "evaluate", checkpoint(smoke_run), "data=synthetic_tiny", "protocols=[campus,synthetic]", "output_dir=out"
     )

@@ -1,4 +1,4 @@
-"""``saunet-predict``: point clouds, colours, videos, and what does not apply to a video."""
+"""``saunet-predict``: point clouds, colors, videos, and what does not apply to a video."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from torch import nn
 
 import saunet
 from saunet.checkpoint import ModelRecord, atomic_save, build_networks
-from saunet.images import read_image
-from saunet.infer.clips import VideoWriter
-from saunet.infer.files import predict_files
-from saunet.infer.pointcloud import Camera, point_cloud, write_ply
-from saunet.infer.video import predict_clip
+from saunet.io.images import read_image
+from saunet.io.video import VideoReader
+from saunet.prediction.clips import VideoWriter
+from saunet.prediction.files import predict_files
+from saunet.prediction.pointcloud import Camera, point_cloud, write_ply
+from saunet.prediction.video import predict_clip
 from saunet.roots import PredictConfig
-from saunet.videos import VideoReader
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +58,10 @@ def video(tmp_path: Path, image: Path) -> Path:
 def test_the_tool_writes_what_the_library_writes_by_default() -> None:
     defaults = {name: p.default for name, p in inspect.signature(predict_files).parameters.items()}
     config = PredictConfig()
-    assert config.outputs is None  # ("colour", "png16") for images, ("mp4",) for a clip
-    assert defaults["outputs"] == ("colour", "png16")
+    assert config.outputs is None  # ("color", "png16") for images, ("mp4",) for a clip
+    assert defaults["outputs"] == ("color", "png16")
     of_clips = {name: p.default for name, p in inspect.signature(predict_clip).parameters.items()}
-    for key in ("palette", "camera", "max_depth", "batch_size", "max_frames", "overwrite"):
+    for key in ("colormap", "camera", "max_depth", "batch_size", "max_frames", "overwrite"):
         assert getattr(config, key) == defaults[key] == of_clips[key]
     for key in ("fps", "layout", "memory", "codec"):
         assert getattr(config, key) == of_clips[key]
@@ -109,16 +109,16 @@ def test_point_clouds_need_the_camera_and_get_it(
     assert "intrinsics have 3 numbers" in tool("predict", *arguments, "camera=[80,80,44.5]").err
 
 
-def test_palette_and_keep_aspect(tool: Callable[..., Any], checkpoint: Path, image: Path, tmp_path: Path) -> None:
-    arguments = (f"checkpoint={checkpoint}", "input=a.png", "palette=turbo", "keep_aspect=true")
+def test_colormap_and_keep_aspect(tool: Callable[..., Any], checkpoint: Path, image: Path, tmp_path: Path) -> None:
+    arguments = (f"checkpoint={checkpoint}", "input=a.png", "colormap=turbo", "keep_aspect=true")
     outcome = tool("predict", *arguments, "output=out")
     assert outcome.code == 0, outcome.err
-    from saunet.infer.predictor import Predictor
+    from saunet.prediction.predictor import Predictor
 
-    expected = Predictor.from_checkpoint(checkpoint, keep_aspect=True).predict(image).colour(None, "turbo")
+    expected = Predictor.from_checkpoint(checkpoint, keep_aspect=True).predict(image).color(None, "turbo")
     assert np.array_equal(read_image(tmp_path / "out" / "a_disparity.png"), expected)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "out"]  # no run folder, no log
-    assert "did you mean 'turbo'" in tool("predict", *arguments, "palette=turbi", "output=out2").err
+    assert "did you mean 'turbo'" in tool("predict", *arguments, "colormap=turbi", "output=out2").err
     assert not (tmp_path / "out2").exists()
 
 
@@ -166,7 +166,7 @@ def test_folder_into_files_and_a_page(tool: Callable[..., Any], checkpoint: Path
     assert "0 files written, 1 images were finished before: out" in again.out
     assert f"finished before: {Path('out') / tmp_path.name}_points.html" in again.out
     tool("predict", *arguments, "fps=3").says("_points.html exists", "set overwrite=true")
-    assert "outputs is 'color'; did you mean 'colour'" in tool("predict", *arguments[:3], "outputs=[color]").err
+    assert "outputs is 'color'; did you mean 'color'" in tool("predict", *arguments[:3], "outputs=[color]").err
 
 
 def test_one_picture_does_not_import_the_trainer(checkpoint: Path, image: Path, tmp_path: Path) -> None:
@@ -207,23 +207,23 @@ class TestBadInput:
     def run(self, tool: Callable[..., Any], checkpoint: Path) -> Callable[..., Any]:
         return lambda name, *more: tool("predict", f"checkpoint={checkpoint}", f"input={name}", "output=out", *more)
 
-    @pytest.mark.parametrize("kind", ["one pixel", "grey", "grey16", "colour16", "rgba"])
+    @pytest.mark.parametrize("kind", ["one pixel", "gray", "gray16", "color16", "rgba"])
     def test_unusual_images(self, run: Callable[..., Any], tmp_path: Path, kind: str) -> None:
         ramp = np.arange(40, dtype=np.uint8)[:, None].repeat(60, 1) * 6
         pictures: dict[str, Any] = {
             "one pixel": np.full((1, 1, 3), 77, np.uint8),
-            "grey": ramp,
-            "grey16": ramp.astype(np.uint16) * 257,
-            "colour16": np.dstack([ramp] * 3).astype(np.uint16) * 257,
+            "gray": ramp,
+            "gray16": ramp.astype(np.uint16) * 257,
+            "color16": np.dstack([ramp] * 3).astype(np.uint16) * 257,
             "rgba": np.dstack([ramp, ramp, ramp, 255 - ramp]),
         }
         cv2.imwrite(str(tmp_path / "a.png"), pictures[kind])
-        outcome = run("a.png", "outputs=[colour,png16,npy]")
+        outcome = run("a.png", "outputs=[color,png16,npy]")
         assert outcome.code == 0, outcome.err
         depth = np.load(tmp_path / "out" / "a_depth.npy")
         assert depth.shape == pictures[kind].shape[:2]
         assert np.isfinite(depth).all()
-        if kind != "one pixel":  # all are the same grey picture
+        if kind != "one pixel":  # all are the same gray picture
             cv2.imwrite(str(tmp_path / "b.png"), np.dstack([ramp] * 3))
             assert run("b.png", "outputs=[npy]").code == 0
             assert np.array_equal(depth, np.load(tmp_path / "out" / "b_depth.npy"))
@@ -284,7 +284,7 @@ class TestBadInput:
         code = (
             "import os, resource, signal, sys\n"
             "from saunet.cli.predict import main\n"
-            "from saunet.infer import files, sinks\n"
+            "from saunet.prediction import files, sinks\n"
             "how, sys.argv = sys.argv[1], sys.argv[:1] + sys.argv[2:]\n"
             "signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell job ignores it\n"
             "if how == 'full':\n"

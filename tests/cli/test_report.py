@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 import yaml
 
-from saunet.checks import ConfigError
 from saunet.cli._app import run
 from saunet.cli._runs import arguments, planned_jobs
 from saunet.cli.report import report
-from saunet.report import collect
+from saunet.errors import ConfigError
+from saunet.reporting import collect
 
 
 def tool(*given: str) -> tuple[int, str, str]:

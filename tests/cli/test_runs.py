@@ -17,8 +17,8 @@ import pytest
 import yaml
 
 from saunet.cli._sweep import summary
-from saunet.lit.durable import GracefulStop
-from saunet.lit.run_record import RunRecord
+from saunet.runs.run_record import RunRecord
+from saunet.training.stopping import GracefulStop
 
 Tool = Callable[..., Any]
 QUICK = ("experiment=smoke", "logger=none", "callbacks.pictures=null", "model/encoder=resnet18", "model/pose=posecnn")

@@ -17,14 +17,14 @@ from omegaconf import OmegaConf
 
 import saunet
 from saunet.checkpoint import read_checkpoint, store_scale
-from saunet.checks import CheckpointError, ConfigError
 from saunet.cli._scale import apply_scale, scale_predictor
 from saunet.data.camera_file import CameraFile, write_camera
-from saunet.data.synthetic import SyntheticDrive
+from saunet.errors import CheckpointError, ConfigError
 from saunet.geometry.pose import pose_matrix
-from saunet.infer.pipeline import ImagePredictor
-from saunet.record import Scale
+from saunet.prediction.pipeline import ImagePredictor
 from saunet.roots import EvaluateConfig, PredictConfig
+from saunet.runs.record import Scale
+from saunet.synthetic import SyntheticDrive
 
 Tool = Callable[..., Any]
 UNKNOWN = 0.037
@@ -98,7 +98,7 @@ def test_predict_finds_the_unknown_factor(
     true, found = street.depth(1), predictor.predict(recording / "left" / "1.png")
     near = (true > 0) & (true < 50)
     np.testing.assert_allclose(found.depth[near], true[near], rtol=tolerance)
-    assert found.unit.startswith("metres (scale from ")
+    assert found.unit.startswith("meters (scale from ")
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_evaluate_measures_stores_and_predict_uses_it(tool: Tool, checkpoint: Pa
     cv2.imwrite(str(tmp_path / "road.png"), np.full((64, 96, 3), 99, np.uint8))
     outcome = tool("predict", f"checkpoint={checkpoint}", "input=road.png", "output=out", "outputs=[npy]")
     assert outcome.code == 0, outcome.err
-    assert "depth is metres (scale from speed)" in outcome.out
+    assert "depth is meters (scale from speed)" in outcome.out
 
 
 def test_evaluate_with_a_table_of_speeds_and_with_stereo(tool: Tool, checkpoint: Path, tmp_path: Path) -> None:
@@ -221,7 +221,7 @@ def test_speeds_of_a_clip_of_which_every_third_frame_is_used(given: float | None
         "data", "campus", root=str(tmp_path / "campus"), fps=10.0, height=32, width=64, workers=0, val_share=0.4
     )
     data.setup("test")
-    (tmp_path / "speeds.csv").write_text("frame,speed\n0,0\n44,44\n")  # a metre a second more with each frame
+    (tmp_path / "speeds.csv").write_text("frame,speed\n0,0\n44,44\n")  # a meter a second more with each frame
     cfg = OmegaConf.structured(EvaluateConfig)
     cfg.output_dir = str(tmp_path / "out")
     cfg.scale = OmegaConf.merge(cfg.scale, {"method": "speed", "speeds": str(tmp_path / "speeds.csv"), "fps": given})

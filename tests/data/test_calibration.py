@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from kitti_tree import CALIBRATION, SCANNER
 
-from saunet.checks import DataError
 from saunet.data.calibration import read_calibration
+from saunet.errors import DataError
 
 
 def write(folder, cameras=CALIBRATION, scanner=SCANNER):
@@ -60,7 +60,7 @@ def test_a_scanner_without_its_position_is_named(tmp_path):
 
 def test_intrinsics_that_cannot_be_right_are_refused(tmp_path):
     calibration = read_calibration(write(tmp_path, CALIBRATION.replace("50 0 30 3", "50 0 61 3")))
-    with pytest.raises(DataError, match=r"P_rect_02 has focal lengths 50, 50 and centre 61, 10 for an image of 20x60"):
+    with pytest.raises(DataError, match=r"P_rect_02 has focal lengths 50, 50 and center 61, 10 for an image of 20x60"):
         calibration.intrinsics(2)
     with pytest.raises(DataError, match=r"has no P_rect_01; cameras in it: 00, 02, 03"):
         calibration.intrinsics(1)
@@ -72,7 +72,7 @@ def test_intrinsics_that_cannot_be_right_are_refused(tmp_path):
         ("0 0 0 0 0 0 0 0 0 0 0 0", r"P_rect_02 has K .*; expected \[\[fx, skew, cx\]"),
         ("-50 0 30 3 0 50 10 0 0 0 1 0", "the lengths must be positive"),
         ("1e-3 0 30 3 0 50 10 0 0 0 1 0", "a focal length is some 0.3 to 3 image widths"),
-        ("100 0 60 3 0 100 20 0 0 0 1 0", "the centre must lie inside"),  # of images twice as large
+        ("100 0 60 3 0 100 20 0 0 0 1 0", "the center must lie inside"),  # of images twice as large
         ("25 0 15 3 0 25 5 0 0 0 1 0", "near a corner it is that of images of another size"),  # half as large
     ],
 )

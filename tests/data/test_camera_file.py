@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from saunet.checks import DataError
 from saunet.data.camera_file import CameraFile, read_camera, write_camera
 from saunet.data.lens import Lens
+from saunet.errors import DataError
 
 GOOD = "image_size: [640, 480]\nK: [500, 510, 321, 242]\n"
 
@@ -42,8 +42,8 @@ def test_intrinsics_follow_the_size_of_the_frames(tmp_path):
     camera = read_camera(write(tmp_path, GOOD))
     half = camera.intrinsics(240, 320)
     np.testing.assert_allclose(half, [[250, 0, 160.25], [0, 255, 120.75], [0, 0, 1]])
-    normalised = read_camera(write(tmp_path, "normalised: true\nK: [0.78125, 1.0625, 0.5, 0.5]\n"))
-    np.testing.assert_allclose(normalised.intrinsics(480, 640), [[500, 0, 319.5], [0, 510, 239.5], [0, 0, 1]])
+    normalized = read_camera(write(tmp_path, "normalized: true\nK: [0.78125, 1.0625, 0.5, 0.5]\n"))
+    np.testing.assert_allclose(normalized.intrinsics(480, 640), [[500, 0, 319.5], [0, 510, 239.5], [0, 0, 1]])
     with pytest.raises(DataError, match=r"the frames are 640x360 .*camera.yaml is for 640x480; give frames of the"):
         camera.intrinsics(360, 640)
 
@@ -59,15 +59,15 @@ def test_intrinsics_follow_the_size_of_the_frames(tmp_path):
         ("image_size: [640, 480]\nK: [500, x, 320, 240]\n", "finite numbers, got 'x' among them"),
         ("image_size: [640]\nK: [500, 500, 320, 240]\n", "image_size needs a list of 2 numbers, got 1"),
         ("image_size: [640, 0]\nK: [500, 500, 320, 240]\n", r"image_size is \[640, 0\]; expected whole numbers"),
-        ("image_size: [640, 480]\nK: [500, 500, 700, 240]\n", "the centre must lie inside"),
-        ("image_size: [640, 480]\nK: [0.8, 1.0, 0.5, 0.5]\n", "or normalised \\(then set normalised: true\\)"),
-        ("image_size: [621, 187]\nK: [721, 721, 609, 173]\n", "the centre must lie inside, not near the left or"),
+        ("image_size: [640, 480]\nK: [500, 500, 700, 240]\n", "the center must lie inside"),
+        ("image_size: [640, 480]\nK: [0.8, 1.0, 0.5, 0.5]\n", "or normalized \\(then set normalized: true\\)"),
+        ("image_size: [621, 187]\nK: [721, 721, 609, 173]\n", "the center must lie inside, not near the left or"),
         ("image_size: [1242, 374]\nK: [180, 180, 152, 43]\n", "a focal length is some 0.3 to 3 image widths"),
         ("image_size: [1242, 374]\nK: [360, 360, 304, 86]\n", "near a corner it is that of images of another size"),
         ("image_size: [640, 480]\nK: [500, 1" + "0" * 400 + ", 320, 240]\n", "finite numbers, got '1000"),
         ("image_size: [640, 480]\nK: [500, 1" + "0" * 5000 + ", 320, 240]\n", "camera.yaml cannot be read as YAML"),
-        ("normalised: true\nK: [500, 500, 320, 240]\n", "normalised K has fx 500 and centre 320, 240"),
-        ("normalised: maybe\nK: [1, 1, 0.5, 0.5]\n", "normalised is 'maybe'"),
+        ("normalized: true\nK: [500, 500, 320, 240]\n", "normalized K has fx 500 and center 320, 240"),
+        ("normalized: maybe\nK: [1, 1, 0.5, 0.5]\n", "normalized is 'maybe'"),
         (GOOD + "distortion: [0.1, 0.2]\n", "distortion needs a list of 0 or 4 or 5 or 8"),
         (
             GOOD + "distortion: [0.1, 0.2, 0, 0, 0]\nmodel: fisheye\n",

@@ -9,8 +9,8 @@ import pytest
 from campus_tree import CAMERA, frames, make_clip, make_video
 from jaxtyping import TypeCheckError
 
-from saunet.checks import ConfigError, DataError
 from saunet.data.clips import every, find_clips, read_clip
+from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 
 
@@ -178,7 +178,7 @@ def test_a_broken_frame_is_named_or_skipped_and_counted(tmp_path):
     assert "1 unreadable" in data.summary("train")
     drive = data.drives()[0]
     assert drive.left_out["unreadable"] == 1
-    assert 6 not in drive.indices  # a gap, so that frames 5 and 7 are no neighbours
+    assert 6 not in drive.indices  # a gap, so that frames 5 and 7 are no neighbors
     assert len(names(data, "train")) == 16 - 1 - 2 - 2
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from kitti_tree import DATE, make_drive, name
 
-from saunet.checks import ConfigError, DataError
+from saunet.data.drive import Drive
 from saunet.data.kitti import KittiRaw
-from saunet.data.sequences import Drive
+from saunet.errors import ConfigError, DataError
 
 
 @pytest.mark.parametrize("where", ["..", ".", DATE, f"{DATE}/{DATE}_drive_0001_sync"])
@@ -89,7 +89,7 @@ def test_images_made_smaller_need_the_size_of_the_originals(tmp_path):
     calibration = tmp_path / DATE / "calib_cam_to_cam.txt"
     lines = calibration.read_text().splitlines()
     calibration.write_text("\n".join(line for line in lines if not line.startswith("S_rect")))
-    with pytest.raises(DataError, match=r"P_rect_02 \(without S_rect\) has .* centre 30, 10 for an image of 10x30"):
+    with pytest.raises(DataError, match=r"P_rect_02 \(without S_rect\) has .* center 30, 10 for an image of 10x30"):
         KittiRaw(tmp_path).drive(name(1)).intrinsics(0)
 
 

@@ -5,8 +5,8 @@ import torch
 from jaxtyping import TypeCheckError
 from kitti_tree import make_drive, name
 
-from saunet.checks import ConfigError, DataError
 from saunet.data.windows import fingerprint
+from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 
 
@@ -29,7 +29,7 @@ def test_everything_found_is_divided_without_overlap(tmp_path):
     assert len(names(data, "val")) == 3 * 2 * 1
     assert len(names(data, "test")) == 2 * 2  # one drive has scans
     assert len(names(data, "predict")) == 3 * 2 * 2
-    assert "left out: 12 between training and validation, 6 without neighbour" in data.summary("train")
+    assert "left out: 12 between training and validation, 6 without neighbor" in data.summary("train")
     assert "left out: 8 without ground truth" in data.summary("test")
     shared = {n[:-2] for n in names(data, "train")} & {n[:-2] for n in names(data, "val")}
     assert not shared
@@ -87,7 +87,7 @@ def test_batches_carry_truth_and_target_depth(tmp_path):
     assert len(names(data, "test")) == 40
 
 
-def test_speed_becomes_the_way_travelled(tmp_path):
+def test_speed_becomes_the_way_traveled(tmp_path):
     make_drive(tmp_path, 1, frames=range(12))
     with pytest.raises(DataError, match=r"with_speed is true but no training frame .* has an OXTS record"):
         module(tmp_path, with_speed=True).setup("fit")
@@ -122,7 +122,7 @@ def test_ground_truth_names_its_protocol(tmp_path, depth, protocol):
             r"split is .*did you mean 'eigen_zhou_by_drive'.*existing file",
         ),
         ({"test_split": "eigen_tset"}, ConfigError, r"test_split is .*did you mean 'eigen_test'"),
-        ({"cameras": ["centre"]}, ConfigError, r"cameras is 'centre'"),
+        ({"cameras": ["center"]}, ConfigError, r"cameras is 'center'"),
         ({"cameras": []}, ConfigError, r"cameras is empty"),
         ({"depth": "stereo"}, ConfigError, r"depth is 'stereo'|parameter 'depth'"),
         ({"val_share": 1.5}, ConfigError, r"val_share is 1.5"),

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from saunet.checks import ConfigError, DataError
 from saunet.data.calibration import read_calibration
 from saunet.data.lidar import lidar_depth, read_scan
+from saunet.errors import ConfigError, DataError
 
 
 def calibration(arrays, prefix):

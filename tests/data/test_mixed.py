@@ -7,7 +7,7 @@ import torch
 from campus_tree import CAMERA, frames, make_clip
 from kitti_tree import make_drive, name
 
-from saunet.checks import ConfigError, DataError
+from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 
 SIZE = {"height": 20, "width": 40, "batch_size": 4, "workers": 0}
@@ -49,7 +49,7 @@ def test_two_data_sets_are_one(tmp_path):
     assert pickle.loads(pickle.dumps(drive)).name == drive.name == f"town/{name(1)} l"
 
 
-def test_one_source_knows_the_way_travelled(tmp_path):
+def test_one_source_knows_the_way_traveled(tmp_path):
     made = sources(tmp_path, with_speed=True)
     records = tmp_path / "raw" / name(1) / "oxts" / "data"
     records.mkdir(parents=True)
@@ -101,7 +101,7 @@ def test_what_does_not_go_together_is_refused(tmp_path):
     ("key", "value", "ours"),
     [
         *(("height", 96, "20"), ("offsets", [-2, 2], r"\(-1, 1\)"), ("batch_size", 99, "4"), ("workers", 2, "0")),
-        *(("translate", 0.2, "0.05"), ("flip", 0.0, "0.5"), ("colour", 0.0, "0.5"), ("seed", 3, "0")),
+        *(("translate", 0.2, "0.05"), ("flip", 0.0, "0.5"), ("color", 0.0, "0.5"), ("seed", 3, "0")),
         *(("target_depth", True, "False"), ("on_error", "skip", "raise")),
     ],
 )

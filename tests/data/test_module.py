@@ -4,10 +4,10 @@ import pytest
 import torch
 from drives import NumberDrive
 
-from saunet.checks import ConfigError, DataError
 from saunet.data.module import DepthDataModule
 from saunet.data.windows import Selection
 from saunet.data.workers import available_cores
+from saunet.errors import ConfigError, DataError
 
 
 class Drives(DepthDataModule):
@@ -83,15 +83,15 @@ def test_summary_says_what_is_used_and_left_out():
     data = module()
     data.setup("fit")
     assert data.summary("train").startswith(
-        "train (2 of 2 drives): 12 frames used; left out: 4 without neighbour; sha256 "
+        "train (2 of 2 drives): 12 frames used; left out: 4 without neighbor; sha256 "
     )
-    assert "a l: 6 frames used; left out: 2 without neighbour" in data.summary("train")
+    assert "a l: 6 frames used; left out: 2 without neighbor" in data.summary("train")
     assert len(data.fingerprints()["train"]) == 64
 
 
 def test_no_usable_frame_is_an_error():
     data = module(offsets=(-20, 20))
-    with pytest.raises(DataError, match=r"split 'train' has no usable frame .*need neighbours at \[-20, 20\]"):
+    with pytest.raises(DataError, match=r"split 'train' has no usable frame .*need neighbors at \[-20, 20\]"):
         data.setup("fit")
 
 

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 import torch
 
-from saunet.checks import ConfigError, DataError
+from saunet.data.drive import Drive
 from saunet.data.odometry import OdometrySequence, find_root
-from saunet.data.sequences import Drive
+from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 
 
 @pytest.fixture
 def root(tmp_path):
-    """Two sequences of ten frames: the colour camera stands 0.5 m right of camera 0, the car drives 1 m a frame."""
+    """Two sequences of ten frames: the color camera stands 0.5 m right of camera 0, the car drives 1 m a frame."""
     for sequence in ("00", "09"):
         for camera in (0, 2):
             folder = tmp_path / "sequences" / sequence / f"image_{camera}"
@@ -43,7 +43,7 @@ def test_sequence(root):
     assert drive.intrinsics(0).tolist() == [[50, 0, 29], [0, 50, 9], [0, 0, 1]]
     assert drive.depth(0) is None
     assert drive.pose(3)[:3, 3].tolist() == [0.5, 0, 3]  # right of camera 0
-    assert OdometrySequence(root, "00", "grey_left").pose(3)[:3, 3].tolist() == [0, 0, 3]
+    assert OdometrySequence(root, "00", "gray_left").pose(3)[:3, 3].tolist() == [0, 0, 3]
     assert OdometrySequence(root, "09").pose(3) is None
 
 
@@ -53,7 +53,7 @@ def test_sequence(root):
         ("0 0 0 0 0 0 0 0 0 0 0 0", r"P2 has K .*; expected \[\[fx, skew, cx\]"),
         ("0 0 30 -25 0 0 10 0 0 0 1 0", "the lengths must be positive"),
         ("-50 0 300 -25 0 50 300 0 0 0 1 0", "the lengths must be positive"),
-        ("100 0 60 -50 0 100 20 0 0 0 1 0", "the centre must lie inside"),  # of images twice as large
+        ("100 0 60 -50 0 100 20 0 0 0 1 0", "the center must lie inside"),  # of images twice as large
     ],
 )
 def test_a_k_that_does_not_belong_to_the_images_is_named(root, numbers, message):
@@ -66,7 +66,7 @@ def test_a_k_that_does_not_belong_to_the_images_is_named(root, numbers, message)
 def test_a_bad_first_frame_decides_nothing_and_odd_frames_are_named_or_skipped(root):
     images = root / "sequences" / "00" / "image_2"
     (images / "000000.png").write_bytes(b"")
-    for number in (5, 6, 7):  # neighbours of one size, which is not that of the calibration
+    for number in (5, 6, 7):  # neighbors of one size, which is not that of the calibration
         cv2.imwrite(str(images / f"{number:06d}.png"), np.zeros((12, 30), np.uint8))
     data = module(root, val_share=0.0)
     data.setup("fit")
@@ -99,7 +99,7 @@ def test_batches_with_motion(root):
     assert data.usage["train"][0].left_out == {
         "between training and validation": 2,
         "without pose": 0,
-        "without neighbour": 1,
+        "without neighbor": 1,
     }
 
 
@@ -114,7 +114,7 @@ def test_without_poses_motion_is_left_out_and_counted(root):
     assert short.usage["train"][0].left_out == {
         "between training and validation": 0,
         "without pose": 6,
-        "without neighbour": 1,
+        "without neighbor": 1,
     }
     assert short.val_dataloader() == []
 
@@ -130,7 +130,7 @@ def test_without_motion_poses_are_not_needed(root):
     ("options", "error", "message"),
     [
         ({"test_sequences": ["21"]}, DataError, r"no sequence '21' at .*sequences there: 00, 09"),
-        ({"camera": "colour_right"}, DataError, r"image_3 holds no images; cameras .*: grey_left, colour_left"),
+        ({"camera": "color_right"}, DataError, r"image_3 holds no images; cameras .*: gray_left, color_left"),
         ({"val_share": 2.0}, ConfigError, r"val_share is 2.0"),
         ({"root": "/nowhere"}, DataError, r"no folder 'sequences' at /nowhere"),
     ],
@@ -160,7 +160,7 @@ def test_real_sequence(kitti_mini):
         kitti_mini / "odometry",
         train_sequences=["06"],
         test_sequences=["06"],
-        camera="grey_left",
+        camera="gray_left",
         with_pose=True,
     )
     data.setup()

@@ -50,17 +50,17 @@ def check(point, K, size, height, width, translate, draws, flip):
     batch = collate([data[Item(0, 0)]])
     batch["draws"] = torch.tensor([[*draws, 0, 0.5, 0.5, 0.5, 0.5, 0.5]])
     batch["draws"][0, 2] = 0.0 if flip else 0.9
-    out = Augment(height, width, flip=0.5, colour=0.0)(batch)
+    out = Augment(height, width, flip=0.5, color=0.0)(batch)
     moved = np.array([-point[0], point[1], point[2]]) if flip else point
     expected = (out["K"][0].double().numpy() @ moved)[:2] / moved[2]
-    # the whole blob must be in the window, else its centre of mass is not its centre
+    # the whole blob must be in the window, else its center of mass is not its center
     reach = 4 * drive.radius * np.array([(width + margin[1]) / size[1], (height + margin[0]) / size[0]]) + 1.5
     assume((expected > reach).all() and (expected < np.array([width, height]) - 1 - reach).all())
     for image in (out["target"][0, 0], out["loss_sources"][0, 1, 2]):
         mass = image.double().numpy()
         rows, columns = np.mgrid[:height, :width]
-        centre = np.array([(mass * columns).sum(), (mass * rows).sum()]) / mass.sum()
-        assert np.abs(centre - expected).max() < 0.06, (centre, expected)
+        center = np.array([(mass * columns).sum(), (mass * rows).sum()]) / mass.sum()
+        assert np.abs(center - expected).max() < 0.06, (center, expected)
     ((row, column),) = np.argwhere(out["target_depth"][0, 0].numpy() > 0)
     scale = max(1.0, (width + margin[1]) / size[1], (height + margin[0]) / size[0])
     assert np.abs(np.array([column, row]) - expected).max() < 0.6 + 0.5 * scale
@@ -73,15 +73,15 @@ def check(point, K, size, height, width, translate, draws, flip):
     target=st.tuples(st.integers(40, 100), st.integers(50, 160)),
     seen_at=st.tuples(st.floats(0.3, 0.7), st.floats(0.3, 0.7)),
     focal=st.floats(0.5, 1.5),
-    centre=st.tuples(st.floats(0.35, 0.65), st.floats(0.35, 0.65)),
+    center=st.tuples(st.floats(0.35, 0.65), st.floats(0.35, 0.65)),
     depth=st.floats(1, 80),
     translate=st.floats(0, 0.3),
     draws=st.tuples(unit, unit),
     flip=st.booleans(),
 )
-def test_a_point_is_seen_where_its_picture_went(size, target, seen_at, focal, centre, depth, translate, draws, flip):
+def test_a_point_is_seen_where_its_picture_went(size, target, seen_at, focal, center, depth, translate, draws, flip):
     rows, columns = size
-    K = np.array([[focal * columns, 0, centre[0] * columns], [0, focal * columns, centre[1] * rows], [0, 0, 1]])
+    K = np.array([[focal * columns, 0, center[0] * columns], [0, focal * columns, center[1] * rows], [0, 0, 1]])
     pixel = np.array([seen_at[0] * columns, seen_at[1] * rows, 1])
     check(depth * np.linalg.solve(K, pixel), K, size, *target, translate, draws, flip)
 
@@ -112,6 +112,6 @@ def test_in_the_middle_window_of_evaluation(margin, seen_at):
     out = Prepare(40, 60)(batch)
     mass = out["target"][0, 0].double().numpy()
     rows, columns = np.mgrid[:40, :60]
-    centre = np.array([(mass * columns).sum(), (mass * rows).sum()]) / mass.sum()
+    center = np.array([(mass * columns).sum(), (mass * rows).sum()]) / mass.sum()
     point = np.linalg.solve(K, [seen_at[0] * 100, seen_at[1] * 80, 1])
-    assert (out["K"][0].double().numpy() @ point)[:2] == pytest.approx(centre, abs=0.06)
+    assert (out["K"][0].double().numpy() @ point)[:2] == pytest.approx(center, abs=0.06)

@@ -7,8 +7,8 @@ import pytest
 
 from saunet.data.kitti import KittiRaw
 from saunet.data.odometry import OdometrySequence
-from saunet.data.synthetic import SyntheticDrive, write_odometry, write_raw
 from saunet.registry import datamodules
+from saunet.synthetic import SyntheticDrive, write_odometry, write_raw
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_the_data_module_trains_on_it(root):
 
 def test_odometry_poses_come_back(rendered, tmp_path):
     write_odometry(tmp_path / "odometry", [rendered], right=[rendered.right()])
-    for camera, truth in (("colour_left", rendered), ("colour_right", rendered.right())):
+    for camera, truth in (("color_left", rendered), ("color_right", rendered.right())):
         drive = OdometrySequence(tmp_path / "odometry", "00", camera)
         assert drive.intrinsics(0) == pytest.approx(truth.intrinsics(0), abs=1e-4)
         for index in (1, 4):

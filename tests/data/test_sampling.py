@@ -5,9 +5,9 @@ import pytest
 import torch
 from drives import NumberDrive
 
-from saunet.checks import ConfigError
 from saunet.data.sampling import EvalBatches, ResumableLoader, TrainBatches, evenly
 from saunet.data.windows import WindowDataset, collate
+from saunet.errors import ConfigError
 
 
 class Numbers(list, torch.utils.data.Dataset):

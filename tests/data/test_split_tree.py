@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from kitti_tree import CALIBRATION, SCANNER
-from test_splits import PUBLISHED
+from published_splits import PUBLISHED
 
 from saunet.data import kitti, splits
 from saunet.data.windows import fingerprint

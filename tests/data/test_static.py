@@ -6,9 +6,9 @@ import pytest
 from drives import NumberDrive
 from kitti_tree import make_drive, name
 
-from saunet.checks import DataError
 from saunet.data.kitti import KittiRaw
 from saunet.data.static import median_flow, oxts_speed, static_by_flow
+from saunet.errors import DataError
 from saunet.registry import datamodules
 
 
@@ -53,7 +53,7 @@ def test_speed_comes_from_the_record(tmp_path):
 
 @pytest.mark.parametrize(("static", "used"), [("keep", 10), ("speed", 7), ("flow", 0)])
 def test_static_frames_are_dropped_and_counted(tmp_path, static, used):
-    make_drive(tmp_path, 1, frames=range(12), sides=(2,))  # every frame is of one colour: no flow anywhere
+    make_drive(tmp_path, 1, frames=range(12), sides=(2,))  # every frame is of one color: no flow anywhere
     for frame in range(12):
         record(tmp_path / name(1) / "oxts" / "data" / f"{frame:010d}.txt", 0.1 if 3 <= frame < 6 else 8.0)
     assert KittiRaw(tmp_path).drive(name(1)).speed(4) == pytest.approx(0.1)

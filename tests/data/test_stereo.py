@@ -12,18 +12,18 @@ import pytest
 import torch
 from drives import NumberDrive
 
-from saunet.checks import ConfigError, DataError
+from saunet.data.drive import MeasuredDrive, StereoDrive
 from saunet.data.kitti import KittiRaw
 from saunet.data.modules.kitti import KittiDataModule
 from saunet.data.modules.kitti_odometry import KittiOdometryDataModule
 from saunet.data.modules.synthetic import SyntheticDataModule
 from saunet.data.odometry import OdometrySequence
 from saunet.data.partners import measured_distance, partner_frames
-from saunet.data.sequences import MeasuredDrive, StereoDrive
-from saunet.data.synthetic import SyntheticDrive
-from saunet.data.synthetic.kitti_writer import write_odometry, write_raw
 from saunet.data.windows import Selection, WindowDataset, collate, find_windows
+from saunet.errors import ConfigError, DataError
 from saunet.geometry.warp import synthesize
+from saunet.synthetic import SyntheticDrive
+from saunet.synthetic.kitti_writer import write_odometry, write_raw
 
 SIZE = {"height": 48, "width": 96}
 
@@ -60,7 +60,7 @@ def test_true_depth_warps_the_partner_onto_the_target_also_when_mirrored(
     data = WindowDataset([drive], [(0, 1)], offsets=(), stereo=True, with_target_depth=True, **SIZE)
     batch: Any = collate([data[0]])
     batch["draws"] = torch.zeros(1, 8)
-    batch["draws"][:, 3:] = 1.0  # no colours
+    batch["draws"][:, 3:] = 1.0  # no colors
     batch["draws"][:, 2] = 0.0 if mirrored else 1.0
     out: Any = SyntheticDataModule(**SIZE).augment(batch)
     side = (-1 if camera == "left" else 1) * (-1 if mirrored else 1)  # where points move in the partner's camera
@@ -185,12 +185,12 @@ def test_unknown_calibration_of_the_other_camera_is_one_sentence(kitti_root: Pat
 def test_the_other_camera_of_a_sequence_that_has_one_only(tmp_path: Path) -> None:
     write_odometry(tmp_path / "odometry", [SyntheticDrive(seed=5, frames=2, **SIZE)])
     drive = OdometrySequence(tmp_path / "odometry", "00")
-    with pytest.raises(DataError, match="image_3 holds no images; cameras of sequence '00' there: colour_left"):
+    with pytest.raises(DataError, match="image_3 holds no images; cameras of sequence '00' there: color_left"):
         drive.partner()
 
 
 def test_assembling_needs_a_source() -> None:
-    from saunet.lit.assemble import assemble
+    from saunet.training.assemble import assemble
 
     data = SyntheticDataModule(offsets=(), **SIZE)
     with pytest.raises(ConfigError, match=r"data\.offsets is empty and data\.stereo is false"):

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import saunet
-from saunet.checks import ConfigError
 from saunet.data.modules.synthetic import SyntheticDataModule
+from saunet.errors import ConfigError
 from saunet.geometry.warp import synthesize
 from saunet.metrics.protocols import protocol
 from saunet.registry import datamodules
@@ -42,7 +42,7 @@ def test_splits_are_different_streets(module: SyntheticDataModule) -> None:
     seeds["other train"] = {d.settings.seed for d in other.drives("train")}
     everything = [seed for chosen in seeds.values() for seed in chosen]
     assert len(everything) == len(set(everything)) == 6
-    assert len(module.datasets["train"]) == 4  # two of four frames have both neighbours, in two drives
+    assert len(module.datasets["train"]) == 4  # two of four frames have both neighbors, in two drives
     assert len(module.datasets["test"]) == 4
 
 

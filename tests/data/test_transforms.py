@@ -5,8 +5,8 @@ import pickle
 import pytest
 import torch
 
-from saunet.checks import ConfigError, DataError
-from saunet.data.transforms import Augment, Prepare, flip_motion, jitter_colour
+from saunet.data.transforms import Augment, Prepare, flip_motion, jitter_color
+from saunet.errors import ConfigError, DataError
 
 H, W = 8, 12
 
@@ -15,14 +15,14 @@ def frame_batch(b=3, s=2, margin=(0, 0), **draws):
     frames = torch.randint(0, 256, (b, 1 + s, 3, H + margin[0], W + margin[1]), dtype=torch.uint8)
     numbers = torch.full((b, 8), 0.5)
     for name, value in draws.items():
-        numbers[:, ["top", "left", "flip", "colour"].index(name)] = torch.as_tensor(value)
+        numbers[:, ["top", "left", "flip", "color"].index(name)] = torch.as_tensor(value)
     K = torch.tensor([[10.0, 0, 5], [0, 11, 4], [0, 0, 1]]).repeat(b, 1, 1)
     return {"frames": frames, "K": K, "name": [f"sample {i}" for i in range(b)], "draws": numbers}
 
 
 def test_nothing_drawn_changes_nothing_but_the_type():
     batch = frame_batch()
-    out = Augment(H, W, flip=0.0, colour=0.0)(batch)
+    out = Augment(H, W, flip=0.0, color=0.0)(batch)
     assert torch.equal(out["target"], batch["frames"][:, 0].float() / 255)
     assert torch.equal(out["sources"], batch["frames"][:, 1:].float() / 255)
     assert torch.equal(out["loss_target"], out["target"])
@@ -34,7 +34,7 @@ def test_nothing_drawn_changes_nothing_but_the_type():
 def test_window_and_principal_point_move_together():
     batch = frame_batch(margin=(4, 6), top=[0.0, 0.5, 0.999], left=[0.999, 0.0, 0.3])
     batch["target_depth"] = torch.rand(3, 1, H + 4, W + 6)
-    out = Augment(H, W, flip=0.0, colour=0.0)(batch)
+    out = Augment(H, W, flip=0.0, color=0.0)(batch)
     for i, (top, left) in enumerate([(0, 6), (2, 0), (4, 2)]):
         window = (..., slice(top, top + H), slice(left, left + W))
         assert torch.equal(out["target"][i], batch["frames"][i, 0][window].float() / 255)
@@ -49,7 +49,7 @@ def test_flip_mirrors_images_depth_intrinsics_and_motion_of_its_samples_only():
     batch = frame_batch(flip=[0.1, 0.9, 0.4])
     batch["target_depth"] = torch.rand(3, 1, H, W)
     batch["T_src_tgt"] = torch.rand(3, 2, 4, 4)
-    out = Augment(H, W, flip=0.5, colour=0.0)(batch)
+    out = Augment(H, W, flip=0.5, color=0.0)(batch)
     original = batch["frames"].float() / 255
     assert torch.equal(out["target"][0], original[0, 0].flip(-1))
     assert torch.equal(out["loss_sources"][2], original[2, 1:].flip(-1))
@@ -72,11 +72,11 @@ def test_mirrored_motion_moves_mirrored_points():
     assert torch.allclose(moved, mirror * (T[0, 0] @ point), atol=1e-6)
 
 
-def test_colours_change_alike_in_all_frames_and_not_in_the_loss_images():
-    batch = frame_batch(colour=[0.1, 0.9, 0.1])
+def test_colors_change_alike_in_all_frames_and_not_in_the_loss_images():
+    batch = frame_batch(color=[0.1, 0.9, 0.1])
     batch["frames"] = batch["frames"][:, :1].expand(-1, 3, -1, -1, -1).contiguous()  # three equal frames stay equal
     batch["draws"][:, 4:] = torch.rand(3, 4)
-    out = Augment(H, W, flip=0.0, colour=0.5)(batch)
+    out = Augment(H, W, flip=0.0, color=0.5)(batch)
     original = batch["frames"].float() / 255
     assert torch.allclose(out["sources"], out["target"][:, None].expand(-1, 2, -1, -1, -1), atol=1e-6)
     assert not torch.allclose(out["target"][0], original[0, 0], atol=1e-2)
@@ -87,10 +87,10 @@ def test_colours_change_alike_in_all_frames_and_not_in_the_loss_images():
     assert out["target"].max() <= 1
 
 
-def test_contrast_turns_around_one_grey_for_all_frames():
+def test_contrast_turns_around_one_gray_for_all_frames():
     frames = torch.stack([torch.full((3, 4, 4), 0.2), torch.full((3, 4, 4), 0.6)])[None]
     one = torch.ones(1)
-    out = jitter_colour(frames, one.bool(), one, 0.5 * one, one, 0 * one)
+    out = jitter_color(frames, one.bool(), one, 0.5 * one, one, 0 * one)
     assert out[0, 0].mean() == pytest.approx(0.3, abs=1e-5)  # halfway from 0.2 to the common mean 0.4
     assert out[0, 1].mean() == pytest.approx(0.5, abs=1e-5)
 
@@ -98,7 +98,7 @@ def test_contrast_turns_around_one_grey_for_all_frames():
 def test_neutral_jitter_is_the_identity():
     frames = torch.rand(2, 2, 3, 6, 6)
     one = torch.ones(2)
-    assert torch.allclose(jitter_colour(frames, one.bool(), one, one, one, 0 * one), frames, atol=1e-5)
+    assert torch.allclose(jitter_color(frames, one.bool(), one, one, one, 0 * one), frames, atol=1e-5)
 
 
 def test_evaluation_cuts_the_middle_and_keeps_the_truth():
@@ -125,7 +125,7 @@ def test_too_small_frames_are_refused(transform):
         transform(frame_batch())
 
 
-@pytest.mark.parametrize("option", [{"flip": 1.5}, {"colour": -0.1}, {"hue": 0.6}, {"contrast": 2.0}])
+@pytest.mark.parametrize("option", [{"flip": 1.5}, {"color": -0.1}, {"hue": 0.6}, {"contrast": 2.0}])
 def test_impossible_ranges_are_refused(option):
     with pytest.raises(ConfigError, match=next(iter(option))):
         Augment(H, W, **option)

@@ -9,12 +9,12 @@ import pickle
 import numpy as np
 import pytest
 
-from saunet.checks import DataError
+from saunet.data.drive import Drive
 from saunet.data.kitti import KittiRaw
-from saunet.data.sequences import Drive
-from saunet.data.synthetic import SyntheticDrive
-from saunet.data.synthetic.kitti_writer import write_raw
 from saunet.data.truth_cache import CachedTruth, cache_truths
+from saunet.errors import DataError
+from saunet.synthetic import SyntheticDrive
+from saunet.synthetic.kitti_writer import write_raw
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import pytest
 import torch
 from drives import NumberDrive
 
-from saunet.checks import ConfigError, DataError
 from saunet.data.windows import (
     DRAWS,
     Item,
@@ -17,6 +16,7 @@ from saunet.data.windows import (
     reach,
     sample_name,
 )
+from saunet.errors import ConfigError, DataError
 from saunet.fingerprint import fingerprint
 
 
@@ -26,16 +26,16 @@ def dataset(drives, frames=range(8), offsets=(-1, 1), **options):
     return WindowDataset(drives, windows, offsets=offsets, **{"height": 10, "width": 15, **options})
 
 
-def test_only_frames_with_all_neighbours_are_used_and_the_rest_is_counted():
+def test_only_frames_with_all_neighbors_are_used_and_the_rest_is_counted():
     drive = NumberDrive(indices=[0, 1, 2, 4, 5, 6])
     windows, usage = find_windows([Selection(drive, range(8), {"static": 3})], (-1, 1))
     assert windows == [(0, 1), (0, 5)]
     assert usage[0].used == 2
-    assert usage[0].left_out == {"static": 3, "without neighbour": 4, "missing": 2}
-    assert str(usage[0]) == "day/drive l: 2 frames used; left out: 3 static, 4 without neighbour, 2 missing"
+    assert usage[0].left_out == {"static": 3, "without neighbor": 4, "missing": 2}
+    assert str(usage[0]) == "day/drive l: 2 frames used; left out: 3 static, 4 without neighbor, 2 missing"
 
 
-def test_single_frames_need_no_neighbour():
+def test_single_frames_need_no_neighbor():
     windows, _ = find_windows([Selection(NumberDrive(indices=[3]), [3])], ())
     assert windows == [(0, 3)]
 

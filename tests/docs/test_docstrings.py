@@ -23,7 +23,7 @@ OPEN = 3
 LIGHTNING = re.compile(r"on_\w+|setup|teardown|optimizer_step")
 """Its hooks, whose arguments it describes."""
 DRIVE = {"image", "intrinsics", "depth", "pose"}
-"""What `saunet.data.sequences.Drive` describes for all recordings."""
+"""What `saunet.data.drive.Drive` describes for all recordings."""
 SHAPED = r"(?:Float|Int|UInt|Bool|Num|Shaped)\d*\[(?:[^\[\]]|\[[^\]]*\])*\]"
 """An annotation of jaxtyping."""
 SHAPE = re.compile(

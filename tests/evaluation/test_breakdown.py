@@ -10,7 +10,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.evaluation import evaluate, print_table, write_results
 from saunet.evaluation.breakdown import Buckets, BucketSums, near_edge
 from saunet.metrics.functional import ERROR_NAMES

@@ -1,4 +1,4 @@
-"""Exported PNGs are metres x 256 at the original size, and score like what they were made from."""
+"""Exported PNGs are meters x 256 at the original size, and score like what they were made from."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from saunet.evaluation import evaluate
 from saunet.evaluation.export import ExportingPredictor
 from saunet.evaluation.foreign import ForeignFolder
-from saunet.images import read_depth
+from saunet.io.images import read_depth
 from saunet.metrics.protocols import protocol
 
 
@@ -43,7 +43,7 @@ def test_scaled_by_the_median_at_native_size_and_only_where_there_is_truth(tmp_p
         assert abs(again.rows[0].scale - 1) < 1e-3
 
 
-def test_metres_as_predicted_also_without_truth(tmp_path):
+def test_meters_as_predicted_also_without_truth(tmp_path):
     without = {key: value for key, value in batch().items() if not key.startswith("depth")}
     ExportingPredictor(lambda _: torch.full((3, 1, 8, 16), 0.1), tmp_path, protocol("metric"))(without)
     stored = read_depth(tmp_path / "day_c_2_l.png")

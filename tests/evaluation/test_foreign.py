@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from saunet.checks import ConfigError, DataError
+from saunet.errors import ConfigError, DataError
 from saunet.evaluation import evaluate
 from saunet.evaluation.foreign import ForeignArray, ForeignFolder, file_stem, foreign_predictor
 from saunet.metrics.protocols import protocol

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.evaluation.odometry import (
     STRAIGHT,
     Path3d,
@@ -25,7 +25,7 @@ from saunet.evaluation.odometry import (
     write_path,
 )
 from saunet.evaluation.plot import draw_path
-from saunet.trajectories import read_kitti, read_tum
+from saunet.io.trajectories import read_kitti, read_tum
 
 
 def winding(frames=120, step=2.0):
@@ -73,13 +73,13 @@ def test_a_scaled_and_moved_truth_has_no_error():
     assert errors.scale == pytest.approx(1 / 0.03)
     assert max(errors.snippet_ate, errors.ate, errors.t_rel) < 1e-9
     assert errors.r_rel < 1e-4
-    assert (errors.frames, errors.metres, errors.snippet) == (120, pytest.approx(238.0), 5)
+    assert (errors.frames, errors.meters, errors.snippet) == (120, pytest.approx(238.0), 5)
     assert errors.lengths == (100, 200, 300, 400, 500, 600, 700, 800)
 
 
 def test_a_short_path_gets_shorter_segments_and_says_so():
     errors = path_errors(a_path(31))
-    assert errors.metres == pytest.approx(60.0)
+    assert errors.meters == pytest.approx(60.0)
     assert errors.lengths == (12.0, 24.0, 36.0, 48.0)
     assert errors.segments > 10
     assert math.isfinite(errors.t_rel)

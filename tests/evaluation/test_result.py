@@ -1,4 +1,4 @@
-"""Joining, summarising and writing results; files appear whole or not at all."""
+"""Joining, summarizing and writing results; files appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from saunet.checks import ConfigError, DataError
-from saunet.evaluation.result import EvaluationResult, ImageRow, summarise
+from saunet.errors import ConfigError, DataError
+from saunet.evaluation.result import EvaluationResult, ImageRow, summarize
 from saunet.evaluation.tables import print_table
 from saunet.evaluation.writers import as_json, markdown, read_rows, write_results
 from saunet.metrics.functional import ERROR_HEADINGS
@@ -44,11 +44,11 @@ def test_summary_is_the_mean_over_images():
 
 
 def test_summary_of_blank_images_only():
-    summary = summarise([ImageRow("m", "metric", "a", 0, math.nan, NAN)])
+    summary = summarize([ImageRow("m", "metric", "a", 0, math.nan, NAN)])
     assert (summary.images, summary.images_without_truth) == (0, 1)
     assert math.isnan(summary.errors[0])
     with pytest.raises(DataError, match="0 rows"):
-        summarise([])
+        summarize([])
 
 
 def test_select_names_the_nearest():

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from saunet.checks import ConfigError, DataError
+from saunet.errors import ConfigError, DataError
 from saunet.evaluation import NetworkPredictor, evaluate
 from saunet.evaluation.breakdown import Buckets
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap

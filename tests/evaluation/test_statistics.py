@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from saunet.checks import ConfigError, DataError
+from saunet.errors import ConfigError, DataError
 from saunet.evaluation.result import EvaluationResult, ImageRow
 from saunet.evaluation.statistics import bootstrap_mean, compare, drive_of, spreads
 from saunet.metrics.protocols import protocol

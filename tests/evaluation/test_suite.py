@@ -7,10 +7,10 @@ import types
 import pytest
 import torch
 
-from saunet.checks import ConfigError, DataError
+from saunet.errors import ConfigError, DataError
 from saunet.evaluation import evaluate_protocols, read_earlier, with_statistics, write_results
 from saunet.evaluation.suite import passes
-from saunet.evaluation.views import evaluate_views, summarise_views
+from saunet.evaluation.views import evaluate_views, summarize_views
 from saunet.metrics.protocols import protocol
 
 
@@ -18,7 +18,7 @@ class Data:
     """Six images of three conditions with constant depth; remembers what was asked of it."""
 
     protocols = ("eigen_camera_z",)
-    neighbours = ("train",)
+    neighbors = ("train",)
 
     def __init__(self, kind="camera_z"):
         self.ground_truth, self.datasets, self.stages = kind, {}, []
@@ -32,7 +32,7 @@ class Data:
 
     def batches(self, split, device):
         for place in range(6):
-            sources = 1 if split in self.neighbours else 0
+            sources = 1 if split in self.neighbors else 0
             target = torch.rand(1, 3, 8, 16, generator=torch.Generator().manual_seed(place))
             yield {
                 "target": target,
@@ -98,10 +98,10 @@ def test_no_name_is_the_own_protocol():
 def test_without_truth_by_condition(tmp_path):
     result = run(["campus"], motion=standing)
     assert len(result.views) == 6
-    for row in result.views:  # the neighbour is the image itself and the camera stands
+    for row in result.views:  # the neighbor is the image itself and the camera stands
         assert row.warped == pytest.approx(0, abs=1e-4)
         assert row.visible == 1.0
-    assert [(group, images) for _, _, group, images, _ in summarise_views(result.views)] == [
+    assert [(group, images) for _, _, group, images, _ in summarize_views(result.views)] == [
         ("a", 3),
         ("b", 3),
         ("all", 6),
@@ -121,7 +121,7 @@ def test_views_refuse_protocols_that_compare_depth():
         evaluate_views({}, [], protocol("metric"), group_of=str, progress=False)
     data = Data()
     data.setup("test")
-    with pytest.raises(DataError, match="comes without neighbouring frames"):
+    with pytest.raises(DataError, match="comes without neighboring frames"):
         evaluate_views(
             {"m": (constant, standing)}, data.batches("test", "cpu"), protocol("campus"), group_of=str, progress=False
         )

@@ -32,7 +32,7 @@ def pixel(K: Tensor, point: Tensor) -> Tensor:
 
 @quick
 @given(intrinsics, points, st.floats(0.1, 4), st.floats(0.1, 4))
-def test_resize_moves_pixel_centres(K: Tensor, point: Tensor, sx: float, sy: float) -> None:
+def test_resize_moves_pixel_centers(K: Tensor, point: Tensor, sx: float, sy: float) -> None:
     scale = torch.tensor([sx, sy], dtype=torch.float64)
     expected = (pixel(K, point) + 0.5) * scale - 0.5
     torch.testing.assert_close(pixel(scale_intrinsics(K, sx, sy), point), expected, rtol=1e-9, atol=1e-6)

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from saunet.checks import ConfigError
-from saunet.data.synthetic import SyntheticDrive
+from saunet.errors import ConfigError
 from saunet.geometry.ground import fit_ground, road_region
+from saunet.synthetic import SyntheticDrive
 
 K = torch.tensor([[[110.0, 0.0, 95.5], [0.0, 110.0, 29.0], [0.0, 0.0, 1.0]]])
 HEIGHT, WIDTH = 64, 192

@@ -105,7 +105,7 @@ def test_behind_or_in_the_camera_is_invalid_and_gradients_stay_finite(z: float) 
     assert motion.grad.isfinite().all()
 
 
-def test_out_of_view_is_invalid_and_takes_the_border_colour() -> None:
+def test_out_of_view_is_invalid_and_takes_the_border_color() -> None:
     images = torch.rand(1, 1, 3, 12, 16)
     view = synthesize(images, torch.full((1, 1, 12, 16), 2.0), K_SMALL[None], shift(x=1e4))
     assert not view.valid.any()

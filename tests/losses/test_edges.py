@@ -11,22 +11,22 @@ import torch
 from torch import Tensor
 
 import saunet
-from saunet.checks import ConfigError
 from saunet.data.partners import measured_distance
-from saunet.data.synthetic import SyntheticDrive
 from saunet.data.windows import WindowDataset, collate
+from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.geometry.warp import synthesize
 from saunet.losses.functional import photometric_error
 from saunet.losses.terms.photometric import Photometric
 from saunet.losses.terms.velocity import Velocity
+from saunet.synthetic import SyntheticDrive
 from saunet.types import DepthPyramid
 
 Make = Callable[..., Any]
 TERMS = saunet.available("term")
 EMPTY = DepthPyramid(sigmoid=(), disparity=(), depth=())
 ELSEWHERE = torch.zeros(4, 4)
-ELSEWHERE[0, 3] = 1e5  # metres to the side: nothing of the target is in view
+ELSEWHERE[0, 3] = 1e5  # meters to the side: nothing of the target is in view
 
 
 def moved(inputs: Any, sources: list[int]) -> Any:
@@ -99,7 +99,7 @@ def test_velocity_of_stereo_alone_is_one_sentence(make_inputs: Make) -> None:
 
 @pytest.fixture(scope="module")
 def street() -> Any:
-    """A street with its true depth and motion: the neighbours in time and the stereo partner as sources."""
+    """A street with its true depth and motion: the neighbors in time and the stereo partner as sources."""
     drive = SyntheticDrive(seed=21, frames=3, height=64, width=192)
     data = WindowDataset(
         [drive],
@@ -152,7 +152,7 @@ def test_loss_is_minimal_at_true_motion(street: Any, source: int) -> None:
                 assert loss(street, depth, nudge @ poses, chosen) > truth, (axis, sign, nudge)
 
 
-def test_only_the_stereo_partner_knows_metres(street: Any) -> None:
+def test_only_the_stereo_partner_knows_meters(street: Any) -> None:
     depth, poses = street["depth"], street["T_src_tgt"]
     for factor in (0.8, 1.25):
         scaled = poses.clone()

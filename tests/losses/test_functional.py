@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.losses.functional import (
     automask,
     combine_sources,
@@ -202,7 +202,7 @@ def test_forward_differences_and_sobel_on_a_ramp() -> None:
 
 
 @pytest.mark.parametrize("operator", ["forward", "sobel"])
-def test_only_known_neighbours_count(operator: str) -> None:
+def test_only_known_neighbors_count(operator: str) -> None:
     prediction, target = torch.rand(1, 1, 8, 9), torch.rand(1, 1, 8, 9)
     known = torch.rand(1, 1, 8, 9) > 0.1
     loss = gradient_loss(prediction, target, known, operator)

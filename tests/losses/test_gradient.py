@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.geometry.depth import median_ratio
 from saunet.losses.functional import pool_known, smoothness_loss
 from saunet.losses.terms.gradient import Gradient

@@ -13,7 +13,7 @@ import torch
 from omegaconf import OmegaConf
 
 import saunet
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.losses.base import Objective, Term, TermResult
 from saunet.losses.objectives.monodepth2 import Monodepth2Objective
 from saunet.losses.objectives.saunet import SaunetObjective
@@ -242,7 +242,7 @@ def test_the_host_never_waits_for_a_gpu(name: str, make_inputs: Make) -> None:
     for key, value in inputs.batch.items():
         inputs.batch[key] = value.cuda() if isinstance(value, torch.Tensor) else value
     leaves = [leaf.detach().cuda().requires_grad_() for leaf in inputs.leaves]
-    objective(*inputs.rebuilt(*leaves)).total.backward()  # once before, so that nothing is left to initialise
+    objective(*inputs.rebuilt(*leaves)).total.backward()  # once before, so that nothing is left to initialize
     torch.cuda.set_sync_debug_mode("error")
     try:
         objective(*inputs.rebuilt(*leaves)).total.backward()

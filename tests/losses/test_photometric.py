@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.geometry.warp import synthesize
 from saunet.losses.terms import photometric as module
@@ -162,8 +162,8 @@ def render(T_tgt_cam: Tensor) -> tuple[Tensor, Tensor]:
     origin = T_tgt_cam[:3, 3]
     depth = (DISTANCE - NORMAL @ origin) / (rays @ NORMAL)
     x, y, _ = (origin + depth[..., None] * rays).unbind(-1)
-    colours = [torch.sin(4 * x + k) * torch.sin(5 * y + 2 * k) + 0.5 * torch.sin(3 * x - 4 * y + k) for k in range(3)]
-    return torch.stack(colours) / 3 + 0.5, depth
+    colors = [torch.sin(4 * x + k) * torch.sin(5 * y + 2 * k) + 0.5 * torch.sin(3 * x - 4 * y + k) for k in range(3)]
+    return torch.stack(colors) / 3 + 0.5, depth
 
 
 @pytest.fixture(scope="module")

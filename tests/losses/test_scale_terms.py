@@ -1,4 +1,4 @@
-"""Terms about scale: distance travelled, and depth that agrees between frames."""
+"""Terms about scale: distance traveled, and depth that agrees between frames."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.losses.objectives.monodepth2 import Monodepth2Objective
 from saunet.losses.objectives.saunet import SaunetObjective
@@ -20,7 +20,7 @@ Make = Callable[..., Any]
 EMPTY = DepthPyramid(sigmoid=(), disparity=(), depth=())
 
 
-def test_velocity_is_the_difference_in_metres() -> None:
+def test_velocity_is_the_difference_in_meters() -> None:
     translation = torch.tensor([[[3.0, 0.0, 4.0], [0.0, 0.0, -1.0]], [[0.0, 2.0, 0.0], [9.0, 9.0, 9.0]]])
     poses = pose_matrix(torch.randn(2, 2, 3), translation)
     batch: Any = {"distance": torch.tensor([[4.0, 1.0], [5.0, torch.nan]])}

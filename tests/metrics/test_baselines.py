@@ -7,7 +7,7 @@ import pickle
 import pytest
 import torch
 
-from saunet.checks import ConfigError, DataError
+from saunet.errors import ConfigError, DataError
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
 from saunet.metrics.protocols import evaluate_image, protocol
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from saunet.checks import ConfigError, DataError
+from saunet.errors import ConfigError, DataError
 from saunet.metrics.depth import DepthMetrics, native_depths
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import evaluate_image, protocol

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from saunet.checks import ConfigError, DataError
+from saunet.errors import ConfigError, DataError
 from saunet.geometry.pose import pose_matrix
 from saunet.metrics import odometry as O
 
@@ -141,9 +141,9 @@ def test_segment_errors_of_a_turning_path():
     motion[2, 3] = 1.0
     predicted = np.stack([np.linalg.matrix_power(motion, k) for k in range(301)])
     found = O.segment_errors(predicted, true, lengths=(100.0, 200.0))
-    per_metre = np.mean([1.01] * 20 + [2.01 / 2] * 10)
+    per_meter = np.mean([1.01] * 20 + [2.01 / 2] * 10)
     assert found.segments == 30
-    assert found.r_rel == pytest.approx(per_metre, rel=1e-6)
+    assert found.r_rel == pytest.approx(per_meter, rel=1e-6)
 
 
 def test_segments_do_not_depend_on_the_world_frame():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.metrics.functional import A1, ABS_REL, RMSE_LOG, flip_blend, garg_crop
 from saunet.metrics.protocols import PROTOCOLS, Protocol, evaluate_image, protocol, sample_image
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.registry import attentions
 
 
@@ -73,8 +73,8 @@ def test_gct(x):
         torch.nn.init.normal_(parameter)
     w = {name: value.ravel() for name, value in _weights(module).items()}
     s = w["alpha"] * np.sqrt((x.astype(np.float64) ** 2).sum((2, 3)) + 1e-5)
-    normalised = np.sqrt(32) * s / np.sqrt((s**2).sum(1, keepdims=True) + 32e-5)
-    gate = 1 + np.tanh(w["gamma"] * normalised + w["beta"])
+    normalized = np.sqrt(32) * s / np.sqrt((s**2).sum(1, keepdims=True) + 32e-5)
+    gate = 1 + np.tanh(w["gamma"] * normalized + w["beta"])
     np.testing.assert_allclose(_run(module, x), x * gate[:, :, None, None], atol=1e-5)
 
 

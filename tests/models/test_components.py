@@ -17,7 +17,7 @@ HEIGHT, WIDTH = 64, 96
 
 @cache
 def _features(name: str) -> tuple[FeatureSpec, ...]:
-    with torch.device("meta"):  # specs only: no memory, no initialisation
+    with torch.device("meta"):  # specs only: no memory, no initialization
         return encoders.build(name).features
 
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 import saunet
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.registry import decoders, encoders
 from saunet.types import FeatureSpec
 
 
 @cache
 def _resnet18() -> tuple[FeatureSpec, ...]:
-    with torch.device("meta"):  # specs only: no memory, no initialisation
+    with torch.device("meta"):  # specs only: no memory, no initialization
         return encoders.build("resnet18").features
 
 

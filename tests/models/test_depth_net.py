@@ -6,7 +6,7 @@ import pytest
 import torch
 from networks import assert_all_have_gradients
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.models.depth import DepthNet
 from saunet.registry import decoders, encoders, poses
 from saunet.types import DepthPyramid

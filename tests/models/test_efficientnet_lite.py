@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.models.encoders.efficientnet_lite import EfficientNetLite, SameConv2d
 from saunet.models.pretrained import load_pretrained
 from saunet.models.pretrained_keys import to_our_names

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from saunet.checks import ConfigError
-from saunet.layers.xca import CrossCovarianceAttention, FourierPosition
+from saunet.errors import ConfigError
 from saunet.models.depth import DepthNet
 from saunet.models.encoders.lite_mono import DilatedBlock
+from saunet.models.layers.xca import CrossCovarianceAttention, FourierPosition
 from saunet.registry import decoders, encoders
 from saunet.types import FeatureSpec
 

@@ -68,7 +68,7 @@ def check(net: DepthNet, image: torch.Tensor) -> None:
 
 def compile_networks(backend: str, *names: str) -> None:
     """Compile networks in a process of its own: the compiler cannot look into the tests' type checker."""
-    program = Path(__file__).with_name("compile_networks.py")
+    program = Path(__file__).parents[1] / "helpers" / "compile_networks.py"
     done = subprocess.run([sys.executable, str(program), backend, *names], capture_output=True, text=True, timeout=3600)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == list(names)

@@ -6,9 +6,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from saunet.checks import ConfigError
-from saunet.layers.packing import FOLDS, Packing, Unpacking
+from saunet.errors import ConfigError
 from saunet.models.depth import DepthNet
+from saunet.models.layers.packing import FOLDS, Packing, Unpacking
 from saunet.registry import decoders, encoders
 from saunet.types import FeatureSpec
 

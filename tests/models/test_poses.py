@@ -6,7 +6,7 @@ import jaxtyping
 import pytest
 import torch
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.geometry.pose import invert_pose
 from saunet.models.encoders.resnet import ResNet
 from saunet.models.poses.base import MOTION_SCALE, motions_to_sources
@@ -73,7 +73,7 @@ def test_starts_nearly_still(name, kwargs):
 
 @pytest.mark.parametrize(("name", "kwargs"), VARIANTS)
 def test_an_untrained_network_tells_pairs_apart_and_all_of_it_learns(name, kwargs):
-    """Seven layers without normalisation lose the signal on the way unless their weights start large enough."""
+    """Seven layers without normalization lose the signal on the way unless their weights start large enough."""
     pose = poses.build(name, **kwargs)
     T_src_tgt = pose(torch.rand(6, 3, 64, 64), torch.rand(6, 2, 3, 64, 64))
     forward = T_src_tgt[:, 1, :3, 3] / MOTION_SCALE

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from saunet.checks import CheckpointError
+from saunet.errors import CheckpointError
 from saunet.models import pretrained_files
 from saunet.models.depth import DepthNet
 from saunet.models.encoders.resnet import ResNet
@@ -65,7 +65,7 @@ def timm(network: SwinTransformer) -> State:
 
 
 def openmmlab(network: SwinTransformer) -> State:
-    """Its merging unfolds the 2x2 neighbours: channel (c, row, column) instead of (column, row, c)."""
+    """Its merging unfolds the 2x2 neighbors: channel (c, row, column) instead of (column, row, c)."""
     renamed = {}
     for key, value in network.state_dict().items():
         if ".downsample." in key:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.models.encoders.resnet import ResNet
 from saunet.models.pretrained_keys import tile_frames
 from saunet.registry import encoders

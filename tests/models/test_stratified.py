@@ -12,9 +12,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from saunet.checks import ConfigError
-from saunet.layers import window_plan
+from saunet.errors import ConfigError
 from saunet.models.encoders.stratified import StratifiedTransformer
+from saunet.models.layers import window_plan
 from saunet.registry import encoders
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from saunet.checks import ConfigError, DataError
+from saunet.errors import ConfigError, DataError
 from saunet.geometry.pose import pose_matrix
-from saunet.record import Scale
+from saunet.runs.record import Scale
 from saunet.scale import MetricDepth, MetricMotion, ScaleEstimate, estimate_scale
 from saunet.scale.clips import clip_batches
 from saunet.scale.speeds import read_speeds
@@ -27,7 +27,7 @@ def speed_batches(*distances: float) -> list[Any]:
     ]
 
 
-def one_metre(target: torch.Tensor, sources: torch.Tensor) -> torch.Tensor:
+def one_meter(target: torch.Tensor, sources: torch.Tensor) -> torch.Tensor:
     return pose_matrix(torch.zeros(1, 1, 3), torch.tensor([[[0.0, 0.0, 1.0]]]))
 
 
@@ -36,7 +36,7 @@ def no_depth(image: torch.Tensor) -> torch.Tensor:
 
 
 def test_one_factor_is_the_median_with_its_spread() -> None:
-    estimate = estimate_scale("speed", speed_batches(2.0, 3.0, 10.0, float("nan"), 4.0, 3.5), no_depth, one_metre)
+    estimate = estimate_scale("speed", speed_batches(2.0, 3.0, 10.0, float("nan"), 4.0, 3.5), no_depth, one_meter)
     assert estimate.factor == 3.5
     assert estimate.quartiles == (3.0, 4.0)
     assert estimate.left_out == 1
@@ -67,7 +67,7 @@ def test_metric_depth_divides_disparity() -> None:
     ("options", "message"),
     [
         ({"method": "sped"}, r"scale.method is 'sped'; did you mean 'speed'"),
-        ({"method": "camera_height"}, r"needs scale.camera_height, the metres from the road up to the camera"),
+        ({"method": "camera_height"}, r"needs scale.camera_height, the meters from the road up to the camera"),
         ({"method": "camera_height", "camera_height": -1.0}, r"scale.camera_height is -1.0; it must be greater than 0"),
         ({"method": "speed"}, r"scale.method=speed needs the pose network, which this model has not"),
     ],
@@ -80,7 +80,7 @@ def test_what_a_method_needs(options: dict[str, Any], message: str) -> None:
 
 def test_nothing_measured_is_one_sentence() -> None:
     with pytest.raises(DataError, match="cannot be measured by speed: in none of the 2 frames the speed is known"):
-        estimate_scale("speed", speed_batches(0.0, float("nan")), no_depth, one_metre)
+        estimate_scale("speed", speed_batches(0.0, float("nan")), no_depth, one_meter)
 
 
 def test_an_estimate_is_plain() -> None:

@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from saunet.data.synthetic import SyntheticDrive
 from saunet.geometry.pose import pose_matrix
 from saunet.scale.factors import height_factors, speed_factors, stereo_factors
+from saunet.synthetic import SyntheticDrive
 
 UNKNOWN = 0.042  # what the true depth is multiplied by before anything looks at it
 
@@ -56,8 +56,8 @@ def test_stereo_within_five_percent_from_either_camera(street: SyntheticDrive, s
 
 def test_stereo_of_images_that_do_not_match_is_unknown(street: SyntheticDrive) -> None:
     T = torch.from_numpy(street.T_partner_cam).float()[None]
-    grey = torch.full((1, 3, 96, 288), 0.5)
-    assert stereo_factors(depth_of(street, 1), grey, grey, K_of(street), T).isnan().all()
+    gray = torch.full((1, 3, 96, 288), 0.5)
+    assert stereo_factors(depth_of(street, 1), gray, gray, K_of(street), T).isnan().all()
 
 
 def test_speed_is_way_over_predicted_way() -> None:

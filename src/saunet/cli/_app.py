@@ -20,14 +20,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from saunet import schema
-from saunet.checks import SaunetError, suggest, usable_device
 from saunet.cli._folders import Folder, noted
 from saunet.cli._globs import expand_globs
 from saunet.cli._sweep import check_folder, summary, swept_folder
 from saunet.config import config_dir, register_configs
-from saunet.lit.run_record import FILE, Stopped
+from saunet.errors import SaunetError, suggest, usable_device
 from saunet.registry import REGISTRIES
 from saunet.roots import ROOTS
+from saunet.runs.run_record import FILE, Stopped
 
 PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "predictions", "resume", "root")
 """Keys at the root of a tool's config that name files or folders."""

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 
 _GLOB = re.compile(r"""(?P<group>\w+)=['"]?glob\(['"]?(?P<pattern>[^,()'"]*/[^,()'"]*)['"]?\)['"]?""")
 

@@ -10,7 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from saunet import config
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 
 CHANGED = " (changed)"
 """Stands behind the name of a model that the command line has changed: it is not what the paper measured."""
@@ -18,9 +18,9 @@ CHANGED = " (changed)"
 
 def build(model: DictConfig) -> Any:
     """Build the networks of a ``model`` config node, with random weights."""
-    from saunet.benchmarking import Networks
     from saunet.models.depth import DepthNet
     from saunet.registry import instantiate
+    from saunet.tools.benchmark import Networks
 
     node = config.plain(model)
     depth = DepthNet(instantiate(node["encoder"]), instantiate(node["decoder"]), node["min_depth"], node["max_depth"])

@@ -7,7 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 
 
 def rectify(cfg: DictConfig, predictor: Any) -> Any:
@@ -25,7 +25,7 @@ def rectify(cfg: DictConfig, predictor: Any) -> Any:
         return None
     from saunet.data.camera_file import read_camera
     from saunet.data.lens import Straightener
-    from saunet.infer.pointcloud import Camera
+    from saunet.prediction.pointcloud import Camera
     from saunet.scale import METHODS
 
     if cfg.scale.method in METHODS:

@@ -8,7 +8,7 @@ from typing import cast
 
 from omegaconf import OmegaConf
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 
 HYDRA = (
     "--config-dir",

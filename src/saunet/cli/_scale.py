@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from saunet.checks import ConfigError, one_of, positive
+from saunet.errors import ConfigError, one_of, positive
 from saunet.roots import SCALE_METHODS
 
 
@@ -27,8 +27,8 @@ def apply_scale(cfg: DictConfig, record: Any, network: Any, pose: Any, data: Any
         ConfigError: if the method is unknown or lacks what it needs.
         DataError: if no frame could be measured.
     """
+    from saunet.data.neighbors import mounting_height, surroundings
     from saunet.data.partners import measured_distance
-    from saunet.data.surroundings import mounting_height, surroundings
     from saunet.scale import METHODS, MetricDepth, MetricMotion, estimate_scale
 
     method, scale = _check(cfg), record.scale
@@ -59,7 +59,7 @@ def apply_scale(cfg: DictConfig, record: Any, network: Any, pose: Any, data: Any
 
 def _odometer(cfg: DictConfig, data: Any) -> Any:
     """Return the odometer of a table of speeds, which counts frames as they were recorded."""
-    from saunet.data.sequences import ClockedDrive
+    from saunet.data.drive import ClockedDrive
     from saunet.scale.speeds import read_speeds
 
     table = read_speeds(cfg.scale.speeds)
@@ -108,8 +108,8 @@ def scale_predictor(cfg: DictConfig, predictor: Any) -> None:
 
 @contextlib.contextmanager
 def _clip_batches(cfg: DictConfig, predictor: Any, method: str, offsets: Any) -> Iterator[Any]:
-    from saunet.infer.clips import open_clip
-    from saunet.infer.pointcloud import Camera
+    from saunet.prediction.clips import open_clip
+    from saunet.prediction.pointcloud import Camera
     from saunet.scale.clips import clip_batches
     from saunet.scale.speeds import read_speeds
 
@@ -138,7 +138,7 @@ def _clip_batches(cfg: DictConfig, predictor: Any, method: str, offsets: Any) ->
             other = open_clip(_needed(cfg.scale.partner, "scale.partner", method, "the other camera's images"))
             stack.callback(other.close)
             options["partner"] = other
-            options["baseline"] = _needed(cfg.scale.baseline, "scale.baseline", method, "metres to the right camera")
+            options["baseline"] = _needed(cfg.scale.baseline, "scale.baseline", method, "meters to the right camera")
         yield clip_batches(clip, predictor.height, predictor.width, count=clip.declared, **options)
 
 
@@ -183,8 +183,8 @@ def _needed(value: Any, key: str, method: str, what: str) -> Any:
 
 
 def _report(cfg: DictConfig, estimate: Any, folder: Path) -> Any:
-    from saunet.atomic import write_json
     from saunet.checkpoint import store_scale
+    from saunet.io.atomic import write_json
 
     print(estimate)
     folder.mkdir(parents=True, exist_ok=True)

@@ -11,8 +11,8 @@ import torch
 from omegaconf import DictConfig
 
 from saunet import config, schema
-from saunet.checks import ConfigError, DataError, one_of
 from saunet.cli._app import pick_device
+from saunet.errors import ConfigError, DataError, one_of
 
 
 def subject_of(cfg: DictConfig) -> Subject:

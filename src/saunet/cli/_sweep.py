@@ -8,9 +8,9 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from saunet.checks import ConfigError
 from saunet.cli._runs import planned_jobs
-from saunet.lit.run_record import FILE, mark_lost, read
+from saunet.errors import ConfigError
+from saunet.runs.run_record import FILE, mark_lost, read
 
 UNKNOWN = "overrides unknown"
 _folders: list[Path] = []

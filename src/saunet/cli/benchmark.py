@@ -6,9 +6,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from saunet.checks import positive
 from saunet.cli._app import pick_device, run
 from saunet.cli._models import CHANGED, build, chosen
+from saunet.errors import positive
 
 
 def benchmark(cfg: DictConfig) -> None:
@@ -16,9 +16,9 @@ def benchmark(cfg: DictConfig) -> None:
     import torch
     from rich.console import Console
 
-    from saunet.benchmarking import Plan, run_suite
-    from saunet.benchmarking.report import draw_figure, size_table, speed_table, write_measurements
-    from saunet.progress import bar
+    from saunet.io.progress import bar
+    from saunet.tools.benchmark import Plan, run_suite
+    from saunet.tools.benchmark.report import draw_figure, size_table, speed_table, write_measurements
 
     if cfg.threads is not None:
         torch.set_num_threads(int(positive("threads", cfg.threads)))

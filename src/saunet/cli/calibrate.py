@@ -8,8 +8,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from saunet.checks import ConfigError, one_of, positive
 from saunet.cli._app import run
+from saunet.errors import ConfigError, one_of, positive
 
 
 def calibrate(cfg: DictConfig) -> None:
@@ -19,11 +19,11 @@ def calibrate(cfg: DictConfig) -> None:
         ConfigError: if there is nothing to read, or the output exists.
         DataError: if the calibration cannot be trusted.
     """
-    from saunet.data.boards import Board
-    from saunet.data.calibrate import calibrate, check_picture
     from saunet.data.camera_file import MODELS, write_camera
-    from saunet.images import write_image
-    from saunet.progress import bar
+    from saunet.io.images import write_image
+    from saunet.io.progress import bar
+    from saunet.tools.calibrate.boards import Board
+    from saunet.tools.calibrate.calibrate import calibrate, check_picture
 
     board = Board(cfg.board, cfg.columns, cfg.rows, cfg.square, cfg.marker, cfg.dictionary)
     if cfg.print_board:

@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from saunet import schema
-from saunet.checks import ConfigError, SaunetError
+from saunet.errors import ConfigError, SaunetError
 from saunet.registry import REGISTRIES, Entry, Registry, registry
 
 NETWORKS = ["encoder", "decoder", "attention", "pose"]
 """Kinds whose components are networks."""
 COUNTED = {"decoder": ", after stratified_tiny", "attention": ", for 64 channels"}
-"""What `count` assumes, for the kinds whose size depends on their neighbours."""
+"""What `count` assumes, for the kinds whose size depends on their neighbors."""
 
 
 def describe(owner: Registry, entry: Entry) -> str:
@@ -44,7 +44,7 @@ def count(owner: Registry, entry: Entry) -> str:
     """
     import torch
 
-    from saunet.benchmarking import count_parameters
+    from saunet.tools.benchmark import count_parameters
 
     with torch.device("meta"):  # shapes without memory
         late: dict[str, Any] = {"channels": 64} if "channels" in owner.late else {}

@@ -42,13 +42,13 @@ def draw(predictor: Any, drive: Any, folder: Path) -> None:
     """Write ``depth.png`` (a few frames with truth and error) and ``depth.mp4`` (the whole drive).
 
     Args:
-        predictor: A `saunet.infer.predictor.Predictor`.
-        drive: A `saunet.data.sequences.Drive` with true depth.
+        predictor: A `saunet.prediction.predictor.Predictor`.
+        drive: A `saunet.data.drive.Drive` with true depth.
         folder: Where the files go.
     """
-    from saunet.images import write_image
-    from saunet.infer.panel import depth_panel
-    from saunet.infer.video import render_video
+    from saunet.io.images import write_image
+    from saunet.prediction.panel import depth_panel
+    from saunet.prediction.video import render_video
 
     frames = list(drive.indices)
     chosen = [frames[round(place)] for place in np.linspace(0, len(frames) - 1, PICTURES + 2)[1:-1]]

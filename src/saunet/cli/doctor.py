@@ -7,20 +7,20 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from saunet import config
-from saunet.checks import one_of, positive
 from saunet.cli._app import run
+from saunet.errors import one_of, positive
 
 
 def doctor(cfg: DictConfig) -> None:
     """Look, print what was found with what to do about it, and write ``doctor.png`` and ``manifest.json``."""
     from hydra.core.hydra_config import HydraConfig
 
-    from saunet.data.doctor import diagnose, draw_sheet, manifest_of, survey
-    from saunet.data.doctor.survey import SPLITS
     from saunet.data.manifest import write_manifest
-    from saunet.images import write_image
-    from saunet.progress import bar
+    from saunet.io.images import write_image
+    from saunet.io.progress import bar
     from saunet.registry import instantiate
+    from saunet.tools.doctor import diagnose, draw_sheet, manifest_of, survey
+    from saunet.tools.doctor.survey import SPLITS
 
     for split in cfg.splits:
         one_of("splits", split, SPLITS)

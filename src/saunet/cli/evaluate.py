@@ -9,9 +9,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from saunet.checks import ConfigError
 from saunet.cli._app import pick_device, run
 from saunet.cli._subjects import subject_of, trivial
+from saunet.errors import ConfigError
 
 
 def evaluate_model(network: Any, data: Any, protocols: Sequence[str], *, split: str = "test") -> Any:
@@ -46,7 +46,6 @@ def evaluate(cfg: DictConfig) -> None:
     """
     from hydra.core.hydra_config import HydraConfig
 
-    from saunet.atomic import check_folder
     from saunet.evaluation import (
         evaluate_protocols,
         print_table,
@@ -55,6 +54,7 @@ def evaluate(cfg: DictConfig) -> None:
         write_results,
     )
     from saunet.evaluation.breakdown import Buckets
+    from saunet.io.atomic import check_folder
 
     if cfg.intervals and not 0 < cfg.intervals < 1:
         raise ConfigError(f"intervals is {cfg.intervals:g}; it must lie between 0 and 1, such as intervals=0.95")

@@ -14,7 +14,7 @@ def export(cfg: DictConfig) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from saunet.infer.export import export_model
+    from saunet.exporting.export import export_model
 
     if cfg.images is None:
         print("saunet-export: images is not set, so only random images are compared", file=sys.stderr)

@@ -7,8 +7,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from saunet import config
-from saunet.checks import positive, require_matplotlib
 from saunet.cli._app import pick_device, run
+from saunet.errors import positive, require_matplotlib
 
 
 def odometry(cfg: DictConfig) -> None:
@@ -25,10 +25,10 @@ def odometry(cfg: DictConfig) -> None:
         write_path,
     )
     from saunet.evaluation.plot import draw_path
-    from saunet.infer.folder import read_model
-    from saunet.infer.load import locate
-    from saunet.infer.odometer import Odometer, follow
+    from saunet.exporting.folder import read_model
     from saunet.metrics.odometry import check_lengths, check_snippet
+    from saunet.prediction.load import locate
+    from saunet.prediction.odometer import Odometer, follow
     from saunet.registry import instantiate
 
     lengths = list(cfg.lengths) if cfg.lengths else None

@@ -8,23 +8,23 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from saunet.checks import one_of
 from saunet.cli._app import pick_device, run
+from saunet.errors import one_of
 
 
 def predict(cfg: DictConfig) -> None:
     """Predict the input into the output folder."""
     from saunet.cli._rectify import rectify
     from saunet.cli._scale import scale_predictor
-    from saunet.infer.files import OUTPUTS
-    from saunet.infer.load import load, locate
-    from saunet.infer.video import CLIP_OUTPUTS
-    from saunet.videos import VIDEO_SUFFIXES
+    from saunet.io.video import VIDEO_SUFFIXES
+    from saunet.prediction.files import OUTPUTS
+    from saunet.prediction.load import load, locate
+    from saunet.prediction.video import CLIP_OUTPUTS
 
     is_camera = cfg.input.isdecimal() and not Path(cfg.input).exists()
     source = int(cfg.input) if is_camera else cfg.input
     is_clip = is_camera or (Path(cfg.input).suffix.lower() in VIDEO_SUFFIXES and not Path(cfg.input).is_dir())
-    outputs = list(cfg.outputs if cfg.outputs is not None else ["mp4"] if is_clip else ["colour", "png16"])
+    outputs = list(cfg.outputs if cfg.outputs is not None else ["mp4"] if is_clip else ["color", "png16"])
     for output in outputs:
         one_of("outputs", output, (*OUTPUTS, *CLIP_OUTPUTS))
     predictor = load(cfg.checkpoint, device=pick_device(cfg.device), flip=cfg.flip, keep_aspect=cfg.keep_aspect)
@@ -32,7 +32,7 @@ def predict(cfg: DictConfig) -> None:
     scale_predictor(cfg, predictor)
     print(f"depth is {predictor.unit}")
     shared = {
-        "palette": cfg.palette,
+        "colormap": cfg.colormap,
         "camera": rectified if cfg.camera is None else list(cfg.camera),
         "max_depth": cfg.max_depth,
         "batch_size": cfg.batch_size,
@@ -45,7 +45,7 @@ def predict(cfg: DictConfig) -> None:
     shown = {key: cfg[key] for key in ("fps", "layout", "memory", "codec")}
     odometer = None
     if "trajectory" in outputs:
-        from saunet.infer.odometer import Odometer
+        from saunet.prediction.odometer import Odometer
 
         odometer = Odometer.from_model(locate(cfg.checkpoint), predictor.scale, pick_device(cfg.device), cfg.batch_size)
     each = _predict_clip if is_clip else _predict_recording
@@ -53,7 +53,7 @@ def predict(cfg: DictConfig) -> None:
 
 
 def _predict_images(cfg: DictConfig, predictor: Any, outputs: list[str], shared: dict[str, Any]) -> None:
-    from saunet.infer.files import predict_files
+    from saunet.prediction.files import predict_files
 
     summary = predict_files(predictor, cfg.input, cfg.output, outputs, **shared)
     for failure in summary.failures:
@@ -64,7 +64,7 @@ def _predict_images(cfg: DictConfig, predictor: Any, outputs: list[str], shared:
 
 
 def _predict_recording(cfg: DictConfig, predictor: Any, source: Any, outputs: list[str], how: dict[str, Any]) -> None:
-    from saunet.infer.recording import predict_recording
+    from saunet.prediction.recording import predict_recording
 
     done = predict_recording(predictor, source, cfg.output, outputs, **how)
     print(f"{len(done.images.written)} files written, {done.images.skipped} images were finished before: {cfg.output}")
@@ -74,7 +74,7 @@ def _predict_recording(cfg: DictConfig, predictor: Any, source: Any, outputs: li
 
 
 def _predict_clip(cfg: DictConfig, predictor: Any, source: Any, outputs: list[str], how: dict[str, Any]) -> None:
-    from saunet.infer.video import predict_clip
+    from saunet.prediction.video import predict_clip
 
     clip = predict_clip(predictor, source, cfg.output, outputs, **how)
     print(f"{clip.frames} frames: {', '.join(map(str, clip.paths))}")

@@ -8,8 +8,8 @@ from typing import Any
 from omegaconf import DictConfig
 
 from saunet import config
-from saunet.checks import ConfigError, one_of, suggest
 from saunet.cli._app import pick_device, run
+from saunet.errors import ConfigError, one_of, suggest
 from saunet.roots import PrepareConfig
 
 KITTI = ("root", "cameras", "drives", "split")
@@ -49,8 +49,8 @@ def prepare(cfg: DictConfig) -> None:
 
 
 def _recordings(cfg: dict[str, Any]) -> Any:
-    from saunet.prepare.recordings import kitti_recordings, module_recordings
     from saunet.registry import instantiate
+    from saunet.tools.prepare.recordings import kitti_recordings, module_recordings
 
     if cfg["data"]:
         data = instantiate(cfg["data"])
@@ -63,7 +63,7 @@ def _recordings(cfg: dict[str, Any]) -> Any:
 
 
 def _densify(cfg: dict[str, Any], recordings: Any, workers: int) -> tuple[str, ...]:
-    from saunet.prepare.densify import densify
+    from saunet.tools.prepare.densify import densify
 
     done = densify(recordings, cfg["kinds"], cfg["folder"], workers, cfg["on_error"])
     print(
@@ -73,7 +73,7 @@ def _densify(cfg: dict[str, Any], recordings: Any, workers: int) -> tuple[str, .
 
 
 def _teacher(cfg: dict[str, Any], recordings: Any, workers: int) -> tuple[str, ...]:
-    from saunet.prepare.teacher import source_of, teach
+    from saunet.tools.prepare.teacher import source_of, teach
 
     source = source_of(cfg["checkpoint"], cfg["input"], cfg["values"], pick_device(cfg["device"]))
     done = teach(recordings, source, cfg["folder"], cfg["on_error"])
@@ -83,7 +83,7 @@ def _teacher(cfg: dict[str, Any], recordings: Any, workers: int) -> tuple[str, .
 
 def _cache(cfg: dict[str, Any], recordings: Any, workers: int) -> tuple[str, ...]:
     from saunet.data.image_cache import CacheSettings
-    from saunet.prepare.cache import build_cache
+    from saunet.tools.prepare.cache import build_cache
 
     if cfg["folder"] is None:
         raise ConfigError("a cache needs a folder of its own; set folder=...")

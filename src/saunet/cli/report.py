@@ -9,20 +9,20 @@ from typing import Any
 from omegaconf import DictConfig
 
 from saunet import config
-from saunet.checks import ConfigError
 from saunet.cli._app import pick_device, run
 from saunet.cli._runs import arguments, planned_jobs
+from saunet.errors import ConfigError
 
 
 def report(cfg: DictConfig) -> None:
     """Read the runs and write the page, or, with ``compare=true``, print how they differ."""
     from rich.console import Console
 
-    from saunet.report import Options, build, collect, write
+    from saunet.reporting import Options, build, collect, write
 
     inputs = collect(list(cfg.runs or []), cfg.checkpoint, planned_jobs, strangers=not cfg.compare)
     if cfg.compare:
-        from saunet.report.compare import print_comparison
+        from saunet.reporting.compare import print_comparison
 
         console = Console()
         print_comparison(inputs, list(cfg.labels), console if console.is_terminal else Console(width=160))

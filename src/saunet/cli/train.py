@@ -10,12 +10,12 @@ from hydra.utils import instantiate as hydra_instantiate
 from omegaconf import DictConfig
 
 from saunet import config
-from saunet.checks import SaunetError
 from saunet.cli._app import run, sentence
+from saunet.errors import SaunetError
 
 
 def train(cfg: DictConfig) -> float | None:
-    """Train, print where the results are, and return what a search minimises: see `BestCheckpoint.cost`."""
+    """Train, print where the results are, and return what a search minimizes: see `BestCheckpoint.cost`."""
     return fit(cfg)[1]
 
 
@@ -28,13 +28,13 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
     from hydra.core.hydra_config import HydraConfig
     from lightning import seed_everything
 
-    from saunet.lit.assemble import assemble
-    from saunet.lit.callbacks import BestCheckpoint, SplitsRecorded
-    from saunet.lit.durable import way_on
-    from saunet.lit.run_record import recording
-    from saunet.lit.start import check_resume, check_unused, keep_rows, resume_path, warm_start
-    from saunet.lit.storage import AtomicCheckpointIO
     from saunet.registry import instantiate
+    from saunet.runs.run_record import recording
+    from saunet.runs.storage import AtomicCheckpointIO
+    from saunet.training.assemble import assemble
+    from saunet.training.callbacks import BestCheckpoint, SplitsRecorded
+    from saunet.training.resume import check_resume, check_unused, keep_rows, resume_path, warm_start
+    from saunet.training.stopping import way_on
 
     def check() -> None:
         config.check(cfg)

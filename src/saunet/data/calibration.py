@@ -1,7 +1,7 @@
 """KITTI's calibration files: true intrinsics of each camera and date, and where the laser scanner sits.
 
 The files count pixels from one, which is why the field's LiDAR maps lie one pixel up and left of u and v. Everywhere
-else integer coordinates are pixel centres counted from zero, so the principal point of `zero_based` is one pixel less
+else integer coordinates are pixel centers counted from zero, so the principal point of `zero_based` is one pixel less
 than the number in the file.
 """
 
@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.checks import DataError
 from saunet.data.intrinsics import check_intrinsics
+from saunet.errors import DataError
 
 Array = NDArray[np.float64]
 _CAMERA_KEYS = {
@@ -95,7 +95,7 @@ class KittiCalibration:
     """Laser scanner to unrectified camera 0, 4 x 4; None without ``calib_velo_to_cam.txt``."""
 
     def T_cam_cam(self, to: int, source: int) -> Array:  # noqa: N802 (frames in names)
-        """Return the motion between rectified cameras, 4 x 4, metres: a point of ``source`` times it is one of ``to``.
+        """Return the motion between rectified cameras, 4 x 4, meters: a point of ``source`` times it is one of ``to``.
 
         Raises:
             DataError: if the calibration does not know one of them, or its K cannot be right.

@@ -6,12 +6,12 @@ K: [1408.2, 1407.9, 958.7, 541.3]      # fx, fy, cx, cy in pixels; or three rows
 distortion: [-0.31, 0.12, 0, 0, -0.02] # OpenCV's k1 k2 p1 p2 k3 ...; leave it out for undistorted images
 model: pinhole                         # or fisheye (four numbers of distortion)
 fps: 30                                # of the frames; a video file's own rate goes before it
-camera_height: 1.42                    # metres above the road, for metric depth
+camera_height: 1.42                    # meters above the road, for metric depth
 condition: cloudy                      # free words, to choose and compare clips by
 crop: [0, 0.12, 0, 0]                  # share to cut off at the top, bottom, left, right: sky, bonnet
 ```
 
-With ``normalised: true`` K is in shares of the width and height, (0.5, 0.5) the middle of the image, and no size is
+With ``normalized: true`` K is in shares of the width and height, (0.5, 0.5) the middle of the image, and no size is
 needed.
 """
 
@@ -27,10 +27,10 @@ import torch
 import yaml
 from numpy.typing import NDArray
 
-from saunet.atomic import write_bytes
-from saunet.checks import DataError, SaunetError, suggest
 from saunet.data.intrinsics import check_intrinsics
+from saunet.errors import DataError, SaunetError, suggest
 from saunet.geometry.camera import crop_intrinsics, scale_intrinsics
+from saunet.io.atomic import write_bytes
 
 FILE_NAME = "camera.yaml"
 MODELS = ("pinhole", "fisheye")
@@ -38,7 +38,7 @@ _COUNTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (0, 4)}
 _KEYS = (
     "K",
     "image_size",
-    "normalised",
+    "normalized",
     "distortion",
     "model",
     "fps",
@@ -47,7 +47,7 @@ _KEYS = (
     "crop",
     "reprojection_error",
 )
-FIX = "is K in pixels of images of this size, or normalised (then set normalised: true)?"
+FIX = "is K in pixels of images of this size, or normalized (then set normalized: true)?"
 """What to look at where K cannot belong to the images."""
 _SAME_SHAPE = 0.02
 """Relative difference of the two aspect ratios up to which a frame is the calibrated image at another size."""
@@ -64,14 +64,14 @@ class CameraFile:
     path: Path
     """The file, for messages."""
     K: NDArray[np.float64]
-    """3 x 3; in pixels of `image_size` (integer coordinates are pixel centres), or normalised where that is None."""
+    """3 x 3; in pixels of `image_size` (integer coordinates are pixel centers), or normalized where that is None."""
     image_size: tuple[int, int] | None
-    """(height, width); None where K is normalised."""
+    """(height, width); None where K is normalized."""
     distortion: tuple[float, ...] = ()
     model: str = "pinhole"
     fps: float | None = None
     camera_height: float | None = None
-    """Metres above the road."""
+    """Meters above the road."""
     condition: str | None = None
     crop: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Shares of the image to cut off at the top, bottom, left and right."""
@@ -90,7 +90,7 @@ class CameraFile:
             DataError: if they have another shape, or K cannot be that of such an image.
         """
         given = torch.from_numpy(self.K)
-        if self.image_size is None:  # one pixel, whose centre is 0
+        if self.image_size is None:  # one pixel, whose center is 0
             scaled = scale_intrinsics(crop_intrinsics(given, 0.5, 0.5), width, height)
         else:
             rows, columns = self.image_size
@@ -130,13 +130,13 @@ def read_camera(path: str | Path) -> CameraFile:
 
 
 def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
-    normalised = plain.get("normalised", False)
-    if not isinstance(normalised, bool):
-        raise DataError(f"{path}: normalised is {normalised!r}; it must be true or false")
+    normalized = plain.get("normalized", False)
+    if not isinstance(normalized, bool):
+        raise DataError(f"{path}: normalized is {normalized!r}; it must be true or false")
     if "K" not in plain:
         raise DataError(f"{path} lacks K; expected 'K: [fx, fy, cx, cy]' or three rows of three numbers")
     size = None
-    if not normalised:
+    if not normalized:
         if "image_size" not in plain:
             raise DataError(
                 f"{path} lacks image_size; expected 'image_size: [width, height]' of the images that K belongs to"
@@ -166,7 +166,7 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
         check_intrinsics(camera.K, *size, f"{path}: K", FIX)
     elif not (0.1 < camera.K[0, 0] < 20 and 0 < camera.K[0, 2] < 1 and 0 < camera.K[1, 2] < 1):
         raise DataError(
-            f"{path}: normalised K has fx {camera.K[0, 0]:g} and centre {camera.K[0, 2]:g}, {camera.K[1, 2]:g}; "
+            f"{path}: normalized K has fx {camera.K[0, 0]:g} and center {camera.K[0, 2]:g}, {camera.K[1, 2]:g}; "
             "expected shares of the image, such as 0.58, 1.92, 0.5, 0.5"
         )
     return camera
@@ -235,7 +235,7 @@ def write_camera(path: str | Path, camera: CameraFile, note: str = "") -> None:
     """
     plain: dict[str, Any] = {}
     if camera.image_size is None:
-        plain["normalised"] = True
+        plain["normalized"] = True
     else:
         plain["image_size"] = [camera.image_size[1], camera.image_size[0]]
     K = camera.K

@@ -14,17 +14,17 @@ from saunet.data.clips import Clip, Recording
 from saunet.data.frame_size import common_size
 from saunet.data.lens import Lens
 from saunet.data.motion import Motion, even_steps
-from saunet.images import read_image
+from saunet.io.images import read_image
 
 LONGEST_STEP = 5.0
-"""Seconds between two frames beyond which they are no neighbours: too much has moved meanwhile."""
+"""Seconds between two frames beyond which they are no neighbors: too much has moved meanwhile."""
 
 
 class CampusDrive:
-    """A clip of any camera, a `saunet.data.sequences.Drive`.
+    """A clip of any camera, a `saunet.data.drive.Drive`.
 
     Frames are numbered anew from 0 in the order of time, without those that are left out; a number is skipped where
-    frames on both sides are no neighbours (a broken image or a long stop between them).
+    frames on both sides are no neighbors (a broken image or a long stop between them).
 
     Args:
         clip: Where it lies and what its camera is.
@@ -64,7 +64,7 @@ class CampusDrive:
 
     @property
     def camera_height(self) -> float | None:
-        """Metres of the camera above the road; None where the camera file does not say."""
+        """Meters of the camera above the road; None where the camera file does not say."""
         return self.clip.camera.camera_height
 
     @property
@@ -166,7 +166,7 @@ def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tup
 
 
 def _apart(recording: Recording, broken: NDArray[np.bool_], before: int, after: int) -> bool:
-    """Tell whether two places of a recording are no neighbours: a broken frame or a long time lies between."""
+    """Tell whether two places of a recording are no neighbors: a broken frame or a long time lies between."""
     if broken[before:after].any():
         return True
     frames = recording.numbers[after] - recording.numbers[before]

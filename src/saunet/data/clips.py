@@ -16,11 +16,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from saunet.atomic import write_json
-from saunet.checks import DataError
 from saunet.data.camera_file import FILE_NAME, CameraFile, read_camera
-from saunet.images import IMAGE_SUFFIXES, encode_jpeg, natural_order, resize
-from saunet.videos import VIDEO_SUFFIXES, VideoReader
+from saunet.errors import DataError
+from saunet.io.atomic import write_json
+from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, natural_order, resize
+from saunet.io.video import VIDEO_SUFFIXES, VideoReader
 
 QUALITY = 95
 """JPEG quality of cached frames."""

@@ -14,10 +14,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.atomic import write_json
-from saunet.checks import DataError, one_of
-from saunet.data.sequences import Drive
-from saunet.images import read_depth
+from saunet.data.drive import Drive
+from saunet.errors import DataError, one_of
+from saunet.io.atomic import write_json
+from saunet.io.images import read_depth
 
 MapKind = Literal["linear", "colorization", "teacher"]
 DENSE_KINDS = ("linear", "colorization")
@@ -37,7 +37,7 @@ class DepthMaps:
     """The maps of one kind.
 
     Args:
-        kind: ``linear`` or ``colorization`` (dense LiDAR, metres), or ``teacher`` (predicted, up to scale).
+        kind: ``linear`` or ``colorization`` (dense LiDAR, meters), or ``teacher`` (predicted, up to scale).
         folder: Where they are; None: beside each recording.
 
     Raises:

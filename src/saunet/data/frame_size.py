@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.checks import DataError
-from saunet.data.sequences import Drive
-from saunet.images import image_size
+from saunet.data.drive import Drive
+from saunet.errors import DataError
+from saunet.io.images import image_size
 
 LOOKED_AT = 5
 """Frames whose size is looked at: a broken or odd one among them decides nothing."""

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from saunet.checks import ConfigError, DataError, in_range, one_of, positive
 from saunet.data.depth_maps import place
-from saunet.data.sequences import Drive, MeasuredDrive, StereoDrive
+from saunet.data.drive import Drive, MeasuredDrive, StereoDrive
+from saunet.errors import ConfigError, DataError, in_range, one_of, positive
 from saunet.geometry.camera import scale_intrinsics
-from saunet.images import read_image
+from saunet.io.images import read_image
 
 VERSION = 1
 """Of the layout of the files; others are refused."""
@@ -216,7 +216,7 @@ class CachedDrive:
         return self._drive.pose(index)
 
     def distance(self, first: int, second: int) -> float | None:
-        """Return the metres travelled between two frames as the recording does; None where it does not know."""
+        """Return the meters traveled between two frames as the recording does; None where it does not know."""
         return self._drive.distance(first, second) if isinstance(self._drive, MeasuredDrive) else None
 
     def path(self, index: int) -> Path:
@@ -276,7 +276,7 @@ class CachedStereoDrive(CachedDrive):
 
     @property
     def T_partner_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
-        """Where the other camera is, 4 x 4, metres."""
+        """Where the other camera is, 4 x 4, meters."""
         return self._stereo.T_partner_cam
 
     @property

@@ -13,21 +13,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from saunet.checks import DataError, one_of
 from saunet.data.calibration import KittiCalibration, read_calibration
 from saunet.data.frame_size import common_size
 from saunet.data.intrinsics import check_intrinsics
 from saunet.data.lidar import lidar_depth, read_scan
 from saunet.data.static import oxts_speed
+from saunet.errors import DataError, one_of
 from saunet.geometry.camera import scale_intrinsics
-from saunet.images import read_depth, read_image
+from saunet.io.images import read_depth, read_image
 
 DepthKind = Literal["camera_z", "lidar_x", "improved"]
 DEPTH_KINDS = ("camera_z", "lidar_x", "improved")
 CAMERAS = {"left": (2, "l"), "right": (3, "r")}
 """Camera name -> its number on disk and its letter in names."""
 CAMERA_HEIGHT = 1.65
-"""Metres from the road to the cameras."""
+"""Meters from the road to the cameras."""
 FRAME_SECONDS = 0.1
 """Time between frames: the scanner turns ten times a second and triggers the cameras."""
 
@@ -37,12 +37,12 @@ _FRAME = re.compile(r"(\d+)\.(png|jpg|jpeg)", re.IGNORECASE)
 
 
 class KittiDrive:
-    """One camera of one KITTI raw drive, a `saunet.data.sequences.Drive`.
+    """One camera of one KITTI raw drive, a `saunet.data.drive.Drive`.
 
     Args:
         folder: The drive's folder, ``.../<date>/<date>_drive_NNNN_sync``; it may be absent: then it has no frames.
         calibration: Calibration of its date.
-        camera: ``left`` or ``right`` colour camera.
+        camera: ``left`` or ``right`` color camera.
         depth_kind: What `depth` returns: the scans by ``camera_z`` or ``lidar_x``, or the ``improved`` ground truth.
 
     Raises:
@@ -50,7 +50,7 @@ class KittiDrive:
     """
 
     camera_height = CAMERA_HEIGHT
-    """Metres from the road to the camera."""
+    """Meters from the road to the camera."""
     fps = 1 / FRAME_SECONDS
     """Frames a second."""
 
@@ -130,7 +130,7 @@ class KittiDrive:
         )
 
     def depth(self, index: int) -> NDArray[np.float32] | None:
-        """Return ground truth at the original image size, metres, 0 where unknown; None where there is none."""
+        """Return ground truth at the original image size, meters, 0 where unknown; None where there is none."""
         if not self.has_depth(index):
             return None
         if self.depth_kind == "improved":
@@ -160,7 +160,7 @@ class KittiDrive:
         return oxts_speed(record) if record.is_file() else None
 
     def distance(self, first: int, second: int) -> float | None:
-        """Return the metres travelled between two frames: OXTS speed times time; None where a record is missing."""
+        """Return the meters traveled between two frames: OXTS speed times time; None where a record is missing."""
         passed = range(min(first, second), max(first, second) + 1)
         speeds = [speed for speed in map(self.speed, passed) if speed is not None]
         if len(speeds) != len(passed):
@@ -168,7 +168,7 @@ class KittiDrive:
         return FRAME_SECONDS * (sum(speeds) - (speeds[0] + speeds[-1]) / 2)  # the trapezoidal rule
 
     def partner(self) -> KittiDrive:
-        """Return the other colour camera's recording; it has no frames where its images are missing."""
+        """Return the other color camera's recording; it has no frames where its images are missing."""
         return self._partner
 
     @functools.cached_property
@@ -178,7 +178,7 @@ class KittiDrive:
 
     @functools.cached_property
     def T_partner_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
-        """Where the other colour camera is, 4 x 4, metres, by the calibration of the date."""
+        """Where the other color camera is, 4 x 4, meters, by the calibration of the date."""
         return self.calibration.T_cam_cam(self._partner.number, self.number)
 
     def depth_file(self, index: int) -> Path:

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from saunet.checks import DataError
 from saunet.data.camera_file import FIX, CameraFile, check_crop
 from saunet.data.intrinsics import check_intrinsics
+from saunet.errors import DataError
 from saunet.geometry.camera import crop_intrinsics
 
 
@@ -28,7 +28,7 @@ class Lens:
         what: What has this size, for messages.
 
     Attributes:
-        K: Intrinsics of the images returned, 3 x 3, in pixels (integer coordinates are pixel centres).
+        K: Intrinsics of the images returned, 3 x 3, in pixels (integer coordinates are pixel centers).
         height: Height of the images returned.
         width: Width of the images returned.
 

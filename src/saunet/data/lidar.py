@@ -8,16 +8,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.checks import DataError, one_of
 from saunet.data.resize import nearest_map
-from saunet.images import read_bytes
+from saunet.errors import DataError, one_of
+from saunet.io.images import read_bytes
 
 LidarDepth = Literal["camera_z", "lidar_x"]
 KINDS = ("camera_z", "lidar_x")
 
 
 def read_scan(path: Path) -> NDArray[np.float32]:
-    """Return the points of a Velodyne scan, n x 3: x forward, y left, z up, in metres.
+    """Return the points of a Velodyne scan, n x 3: x forward, y left, z up, in meters.
 
     Raises:
         DataError: if the file is missing, empty, or not a whole number of points of four 32-bit numbers.
@@ -41,7 +41,7 @@ def lidar_depth(
     The calibration counts pixels from one, so a point lands on column round(u) - 1 and row round(v) - 1.
 
     Args:
-        points: n x 3, scanner frame, metres. Points behind the scanner (x < 0) or the camera (z <= 0) are dropped.
+        points: n x 3, scanner frame, meters. Points behind the scanner (x < 0) or the camera (z <= 0) are dropped.
         projection: P_rect of the camera, 3 x 4.
         rectification: R_rect_00, 3 x 3.
         T_cam_velo: Scanner to unrectified camera 0, 4 x 4.
@@ -49,7 +49,7 @@ def lidar_depth(
         kind: ``camera_z``: depth along the camera's axis; ``lidar_x``: the scanner's own x (the classic numbers).
 
     Returns:
-        Depth in metres, h x w, 0 where no point falls.
+        Depth in meters, h x w, 0 where no point falls.
 
     Raises:
         ConfigError: for an unknown kind.

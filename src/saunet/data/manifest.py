@@ -10,15 +10,15 @@ from typing import Any
 
 from lightning.pytorch.utilities import rank_zero_warn
 
-from saunet.atomic import write_json
-from saunet.checks import DataError
-from saunet.data.sequences import Drive
+from saunet.data.drive import Drive
 from saunet.data.windows import Selection
+from saunet.errors import DataError
+from saunet.io.atomic import write_json
 
 FORMAT = 1
 """Version of the file's layout."""
 UNREADABLE = "unreadable"
-"""The reason that also forbids a frame as a neighbour; all others only forbid it as a target."""
+"""The reason that also forbids a frame as a neighbor; all others only forbid it as a target."""
 
 LeaveOut = Mapping[str, Mapping[str, Sequence[int]]]
 """Drive -> reason -> frame numbers."""

@@ -15,17 +15,17 @@ from lightning.pytorch import LightningDataModule
 from lightning.pytorch.utilities import move_data_to_device, rank_zero_info
 from torch.utils.data import DataLoader
 
-from saunet.checks import ConfigError, DataError, in_range, one_of, positive
 from saunet.data.depth_maps import DepthMaps
+from saunet.data.drive import Drive
 from saunet.data.image_cache import CachedDrive, ImageCache, check_enlarged
 from saunet.data.manifest import read_manifest
 from saunet.data.partners import Odometer
 from saunet.data.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, evenly, share
-from saunet.data.sequences import Drive
 from saunet.data.transforms import Augment, Prepare
 from saunet.data.unreadable import SkippingWindows, readable
 from saunet.data.windows import Selection, Usage, WindowDataset, check_offsets, collate, find_windows
 from saunet.data.workers import processes
+from saunet.errors import ConfigError, DataError, in_range, one_of, positive
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
 
 STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("predict",)}
@@ -42,7 +42,7 @@ class DepthDataModule(LightningDataModule):
         workers: Loader processes a device, at most one a core.
         translate: Frames are loaded this much larger (0.1 = 10 %) and a random window is cut in training; K follows.
         flip: Probability of mirroring in training.
-        colour: Probability of colour jitter in training.
+        color: Probability of color jitter in training.
         seed: Decides order and augmentation.
         target_depth: Training batches carry the depth of the target, for losses that use it.
         with_pose: Batches carry the true motion.
@@ -57,7 +57,7 @@ class DepthDataModule(LightningDataModule):
         DataError: if the manifest or the cache cannot be read.
     """
 
-    neighbours: Sequence[str] = ("train", "val")
+    neighbors: Sequence[str] = ("train", "val")
     """Splits whose samples carry source frames."""
     protocol: str = "eigen_camera_z"
     """Name of the evaluation protocol that fits this data set's ground truth."""
@@ -76,7 +76,7 @@ class DepthDataModule(LightningDataModule):
         workers: int = 4,
         translate: float = 0.05,
         flip: float = 0.5,
-        colour: float = 0.5,
+        color: float = 0.5,
         seed: int = 0,
         target_depth: bool = False,
         with_pose: bool = False,
@@ -96,7 +96,7 @@ class DepthDataModule(LightningDataModule):
         self.target_depth, self.with_pose, self.stereo = target_depth, with_pose, stereo
         self.manifest = read_manifest(manifest) if manifest else None
         self.on_error = one_of("on_error", on_error, ("raise", "skip"))
-        self.augment = Augment(self.height, self.width, flip, colour)
+        self.augment = Augment(self.height, self.width, flip, color)
         self.prepare = Prepare(self.height, self.width)
         self.maps: dict[str, DepthMaps] = {}
         self.copies = ImageCache(cache) if cache else None
@@ -175,7 +175,7 @@ class DepthDataModule(LightningDataModule):
 
     def _usable(self, split: str, selection: Selection) -> Selection:
         """Leave out what the manifest names, and what cannot be read where that is to be skipped."""
-        offsets = self.offsets if split in self.neighbours else ()
+        offsets = self.offsets if split in self.neighbors else ()
         if self.manifest is not None and split in ("train", "val"):
             selection = self.manifest.apply(selection, offsets)
         if self.on_error == "skip" and split != "train":
@@ -183,12 +183,12 @@ class DepthDataModule(LightningDataModule):
         return selection
 
     def _dataset(self, split: str, selections: Sequence[Selection]) -> WindowDataset:
-        offsets = self.offsets if split in self.neighbours else ()
-        stereo = self.stereo and split in self.neighbours
+        offsets = self.offsets if split in self.neighbors else ()
+        stereo = self.stereo and split in self.neighbors
         windows, usage = find_windows(selections, offsets, stereo)
         if not windows:
             found = "; ".join(str(drive) for drive in usage[:3]) or "no drives"
-            needed = [f"neighbours at {list(offsets)}"] * bool(offsets) + ["a stereo partner"] * stereo
+            needed = [f"neighbors at {list(offsets)}"] * bool(offsets) + ["a stereo partner"] * stereo
             if needed:
                 advice = f"frames need {' and '.join(needed)}: check the data root, the split and the offsets"
             else:
@@ -204,11 +204,11 @@ class DepthDataModule(LightningDataModule):
             width=self.width,
             margin=self._margin(split),
             with_depth=split in ("val", "test"),
-            with_target_depth=self.target_depth and split in self.neighbours and "target_depth" not in self.maps,
-            with_pose=self.with_pose and split in self.neighbours,
+            with_target_depth=self.target_depth and split in self.neighbors and "target_depth" not in self.maps,
+            with_pose=self.with_pose and split in self.neighbors,
             stereo=stereo,
-            odometer=self.odometer if split in self.neighbours else None,
-            maps=self.maps if split in self.neighbours else {},
+            odometer=self.odometer if split in self.neighbors else None,
+            maps=self.maps if split in self.neighbors else {},
         )
 
     def _margin(self, split: str) -> tuple[int, int]:
@@ -256,7 +256,7 @@ class DepthDataModule(LightningDataModule):
             yield self.prepare(move_data_to_device(batch, torch.device(device)))
 
     def ground_truths(self, split: str, most: int = 500) -> Iterator[Float[torch.Tensor, "1 h w"]]:
-        """Yield the true depth of a split's frames at native size, metres, 0 where unknown; skips those without any.
+        """Yield the true depth of a split's frames at native size, meters, 0 where unknown; skips those without any.
 
         Args:
             split: ``train``, ``val`` or ``test``, set up.

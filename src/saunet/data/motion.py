@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.atomic import write_json
-from saunet.checks import DataError
 from saunet.data.clips import FramesCacheError
 from saunet.data.static import FLOW_WIDTH, MIN_FLOW, median_flow
-from saunet.images import read_image, resize
+from saunet.errors import DataError
+from saunet.io.atomic import write_json
+from saunet.io.images import read_image, resize
 
 SAME_PICTURE = 0.01
 """Mean difference over the picture's standard deviation under which two frames are the same picture twice."""

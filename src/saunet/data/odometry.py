@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.checks import DataError, one_of
 from saunet.data.calibration import read_matrices, zero_based
 from saunet.data.frame_size import common_size
 from saunet.data.intrinsics import check_intrinsics
 from saunet.data.kitti import CAMERA_HEIGHT, frame_files
 from saunet.data.partners import distance_between
-from saunet.images import read_image
-from saunet.trajectories import read_kitti
+from saunet.errors import DataError, one_of
+from saunet.io.images import read_image
+from saunet.io.trajectories import read_kitti
 
-CAMERAS = {"grey_left": (0, "l"), "grey_right": (1, "r"), "colour_left": (2, "l"), "colour_right": (3, "r")}
+CAMERAS = {"gray_left": (0, "l"), "gray_right": (1, "r"), "color_left": (2, "l"), "color_right": (3, "r")}
 """Camera name -> its number on disk and its letter in names."""
 
 
 class OdometrySequence:
-    """One camera of one sequence, a `saunet.data.sequences.Drive`.
+    """One camera of one sequence, a `saunet.data.drive.Drive`.
 
     Args:
         root: Folder that holds ``sequences`` and, where poses are known, ``poses``.
@@ -37,9 +37,9 @@ class OdometrySequence:
     """
 
     camera_height = CAMERA_HEIGHT
-    """Metres from the road to the camera."""
+    """Meters from the road to the camera."""
 
-    def __init__(self, root: Path, sequence: str, camera: str = "colour_left") -> None:
+    def __init__(self, root: Path, sequence: str, camera: str = "color_left") -> None:
         number, side = CAMERAS[one_of("camera", camera, CAMERAS)]
         self._given = (root, sequence, camera)
         folder = root / "sequences" / sequence
@@ -78,7 +78,7 @@ class OdometrySequence:
         return self._images / self._files[index]
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """Return the frame, h x w x 3, RGB; grey cameras give three equal channels."""
+        """Return the frame, h x w x 3, RGB; gray cameras give three equal channels."""
         return read_image(self.path(index))
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
@@ -100,19 +100,19 @@ class OdometrySequence:
         return 1 / step if step > 0 else None
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
-        """Return T_world_cam of this camera, 4 x 4, metres; None where the file of poses is missing or shorter."""
+        """Return T_world_cam of this camera, 4 x 4, meters; None where the file of poses is missing or shorter."""
         if self._poses is None or not 0 <= index < len(self._poses):
             return None
         pose: NDArray[np.float64] = self._poses[index] @ np.linalg.inv(self._T_cam_cam0)
         return pose
 
     def distance(self, first: int, second: int) -> float | None:
-        """Return the metres between the poses of two frames; None where one is unknown."""
+        """Return the meters between the poses of two frames; None where one is unknown."""
         poses = self.pose(first), self.pose(second)
         return None if poses[0] is None or poses[1] is None else distance_between(poses[0], poses[1])
 
     def partner(self) -> OdometrySequence:
-        """Return the other camera's recording of this sequence, of the same colour.
+        """Return the other camera's recording of this sequence, of the same color.
 
         Raises:
             DataError: if its images or its calibration are missing.
@@ -127,7 +127,7 @@ class OdometrySequence:
 
     @functools.cached_property
     def T_partner_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
-        """Where the partner is, 4 x 4, metres, by the sequence's calibration."""
+        """Where the partner is, 4 x 4, meters, by the sequence's calibration."""
         T: NDArray[np.float64] = self._partner._T_cam_cam0 @ np.linalg.inv(self._T_cam_cam0)
         return T
 

@@ -1,4 +1,4 @@
-"""What a recording knows beside its own frames: the stereo partner of each, and the way travelled between them."""
+"""What a recording knows beside its own frames: the stereo partner of each, and the way traveled between them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.checks import DataError
-from saunet.data.sequences import Drive, MeasuredDrive, StereoDrive
+from saunet.data.drive import Drive, MeasuredDrive, StereoDrive
+from saunet.errors import DataError
 
 Odometer = Callable[[Drive, int, int], float]
-"""Gives the metres travelled between two frames of a drive, NaN where unknown."""
+"""Gives the meters traveled between two frames of a drive, NaN where unknown."""
 
 _SAME_K = 0.5
 """Pixels by which the intrinsics of two cameras may differ and still be taken for one."""
@@ -42,7 +42,7 @@ def partner_frames(drive: Drive) -> frozenset[int]:
 
 
 def partner_image(drive: Drive, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Return the stereo partner's frame, h x w x 3, RGB, and T_partner_cam, 4 x 4, metres.
+    """Return the stereo partner's frame, h x w x 3, RGB, and T_partner_cam, 4 x 4, meters.
 
     Raises:
         DataError: if the drive has no partner, or the two cameras do not share their intrinsics.
@@ -59,13 +59,13 @@ def partner_image(drive: Drive, index: int) -> tuple[NDArray[np.uint8], NDArray[
 
 
 def measured_distance(drive: Drive, first: int, second: int) -> float:
-    """Return the metres travelled between two frames as the recording itself knows them; NaN where it does not."""
+    """Return the meters traveled between two frames as the recording itself knows them; NaN where it does not."""
     known = drive.distance(first, second) if isinstance(drive, MeasuredDrive) else None
     return math.nan if known is None else known
 
 
 def distance_between(T_world_first: NDArray[np.float64], T_world_second: NDArray[np.float64]) -> float:
-    """Return the straight way between two poses, 4 x 4, metres."""
+    """Return the straight way between two poses, 4 x 4, meters."""
     return float(np.linalg.norm(T_world_second[:3, 3] - T_world_first[:3, 3]))
 
 

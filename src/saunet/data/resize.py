@@ -1,4 +1,4 @@
-"""Depth maps at another size: measurements move or are sampled, never mixed (colours, which are: `saunet.images`)."""
+"""Depth maps at another size: measurements move or are sampled, never mixed (colors, which are: `saunet.io.images`)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ def resize_depth(depth: NDArray[np.float32], height: int, width: int) -> NDArray
     """Resize a depth map without mixing values.
 
     A sparse map (less than half of it known) moves each measurement to the pixel where it now falls, the nearest wins;
-    a dense map is sampled at the new pixel centres.
+    a dense map is sampled at the new pixel centers.
 
     Args:
-        depth: h x w, metres, 0 where unknown.
+        depth: h x w, meters, 0 where unknown.
         height: New height.
         width: New width.
     """
@@ -39,7 +39,7 @@ def nearest_map(
     Args:
         rows: Of each value, n.
         columns: Of each value, n.
-        values: n positive numbers, such as depths in metres.
+        values: n positive numbers, such as depths in meters.
         size: (height, width) of the map.
     """
     order = np.argsort(-values, kind="stable")

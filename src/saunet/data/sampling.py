@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
-from saunet.checks import ConfigError, SaunetError
 from saunet.data.windows import Item
+from saunet.errors import ConfigError, SaunetError
 
 
 class TrainBatches(DistributedSampler[Any]):

@@ -1,7 +1,7 @@
 """Which KITTI frames belong to which split: the published tables, a user's files, or a share held out.
 
 The published division of the Eigen-Zhou frames into training and validation is a random draw per frame that follows no
-rule, and most of its validation frames have a training neighbour. So the built-in default holds out whole drives
+rule, and most of its validation frames have a training neighbor. So the built-in default holds out whole drives
 (`eigen_zhou_by_drive`); `eigen_zhou_random` draws a seeded tenth of the frames; and the published lists themselves are
 read from files in Monodepth2's ``folder index side`` format.
 """
@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saunet.checks import ConfigError, DataError, one_of
+from saunet.errors import ConfigError, DataError, one_of
 
 VAL_DRIVES = (
     "2011_09_26/2011_09_26_drive_0005_sync",
@@ -99,7 +99,7 @@ def eigen_full() -> list[Frame]:
 
 
 def eigen_zhou() -> list[Frame]:
-    """Return the 44 234 frames of the training drives that have both neighbours and are not static, both cameras."""
+    """Return the 44 234 frames of the training drives that have both neighbors and are not static, both cameras."""
     frames = []
     for row in eigen_table()["eigen_train_drive"]:
         static = set(row.listed)
@@ -141,7 +141,7 @@ def hold_out_random(frames: Iterable[Frame], share: float, seed: int) -> Parts:
 def hold_out_tails(frames: Iterable[Frame], share: float, gap: int) -> Parts:
     """Put the last share of each drive into validation, and leave out ``gap`` frames before it.
 
-    With a gap as long as the farthest neighbours of both sides, no validation window shares a frame with a training
+    With a gap as long as the farthest neighbors of both sides, no validation window shares a frame with a training
     window.
     """
     train, val = [], []

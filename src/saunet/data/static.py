@@ -1,4 +1,4 @@
-"""Frames recorded while the car stood: they teach nothing, since nothing moves between neighbours."""
+"""Frames recorded while the car stood: they teach nothing, since nothing moves between neighbors."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.checks import DataError
+from saunet.data.drive import Drive
 from saunet.data.frame_size import check_frame
-from saunet.data.sequences import Drive
+from saunet.errors import DataError
 
 FLOW_WIDTH = 320
 """Images are made this wide before flow is measured, so that thresholds mean the same for every camera."""

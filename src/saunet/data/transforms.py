@@ -1,4 +1,4 @@
-"""From decoded bytes to network input, on the device: crop, flip and colour, with intrinsics and truth that follow.
+"""From decoded bytes to network input, on the device: crop, flip and color, with intrinsics and truth that follow.
 
 The random numbers come with the batch (``draws``), not from the device: the same sample is augmented the same way
 whatever the number of devices or workers, and nothing here waits for the device.
@@ -18,7 +18,7 @@ from kornia.enhance.adjust import (
 )
 from torch import Tensor, nn
 
-from saunet.checks import DataError, in_range
+from saunet.errors import DataError, in_range
 from saunet.geometry.camera import crop_intrinsics, flip_intrinsics
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
 
@@ -57,7 +57,7 @@ def flip_motion(T: Float[Tensor, "b s 4 4"], which: Bool[Tensor, " b"]) -> Float
     return torch.where(which[:, None, None, None], T * mirror[:, None] * mirror, T)
 
 
-def jitter_colour(
+def jitter_color(
     frames: Float[Tensor, "b n 3 h w"],
     which: Bool[Tensor, " b"],
     brightness: Float[Tensor, " b"],
@@ -65,9 +65,9 @@ def jitter_colour(
     saturation: Float[Tensor, " b"],
     hue: Float[Tensor, " b"],
 ) -> Float[Tensor, "b n 3 h w"]:
-    """Change the colours of the chosen samples; all frames of a sample change in the same way.
+    """Change the colors of the chosen samples; all frames of a sample change in the same way.
 
-    The frames of a sample are treated as one tall picture, so that they share even the mean grey that contrast turns
+    The frames of a sample are treated as one tall picture, so that they share even the mean gray that contrast turns
     around.
 
     Args:
@@ -76,7 +76,7 @@ def jitter_colour(
         brightness: Factor, 1 changes nothing.
         contrast: Factor, 1 changes nothing.
         saturation: Factor, 1 changes nothing.
-        hue: Turn of the colour circle in radians, 0 changes nothing.
+        hue: Turn of the color circle in radians, 0 changes nothing.
     """
     b, n, c, h, w = frames.shape
     tall = frames.transpose(1, 2).reshape(b, c, n * h, w)
@@ -89,17 +89,17 @@ def jitter_colour(
 
 
 class Augment(nn.Module):
-    """`FrameBatch` with ``draws`` -> `TrainBatch`: random window, flip, colours; one draw for all frames of a sample.
+    """`FrameBatch` with ``draws`` -> `TrainBatch`: random window, flip, colors; one draw for all frames of a sample.
 
     Args:
         height: Height of the images made; the frames may be larger, a random window is cut.
         width: Width of the images made.
         flip: Probability of mirroring.
-        colour: Probability of changing colours; the loss images keep theirs.
+        color: Probability of changing colors; the loss images keep theirs.
         brightness: Factors are drawn from 1 ± this.
         contrast: Factors are drawn from 1 ± this.
         saturation: Factors are drawn from 1 ± this.
-        hue: Part of the colour circle by which hue turns at most.
+        hue: Part of the color circle by which hue turns at most.
 
     Raises:
         ConfigError: if a probability or range is outside [0, 1].
@@ -110,7 +110,7 @@ class Augment(nn.Module):
         height: int,
         width: int,
         flip: float = 0.5,
-        colour: float = 0.5,
+        color: float = 0.5,
         brightness: float = 0.2,
         contrast: float = 0.2,
         saturation: float = 0.2,
@@ -119,7 +119,7 @@ class Augment(nn.Module):
         super().__init__()
         self.height, self.width = height, width
         self.flip = in_range("flip", flip, 0, 1)
-        self.colour = in_range("colour", colour, 0, 1)
+        self.color = in_range("color", color, 0, 1)
         self.brightness = in_range("brightness", brightness, 0, 1)
         self.contrast = in_range("contrast", contrast, 0, 1)
         self.saturation = in_range("saturation", saturation, 0, 1)
@@ -141,9 +141,9 @@ class Augment(nn.Module):
         K = crop_intrinsics(batch["K"], left.float(), top.float())
         K = torch.where(mirrored[:, None, None], flip_intrinsics(K, self.width), K)
         signed = 2 * draws[:, 4:8] - 1
-        seen = jitter_colour(
+        seen = jitter_color(
             frames,
-            draws[:, 3] < self.colour,
+            draws[:, 3] < self.color,
             1 + self.brightness * signed[:, 0],
             1 + self.contrast * signed[:, 1],
             1 + self.saturation * signed[:, 2],

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.atomic import replacing
-from saunet.checks import DataError
 from saunet.data.kitti import KittiDrive
+from saunet.errors import DataError
+from saunet.io.atomic import replacing
 
 FORMAT = 1
 """Part of every name; raised when the projection or the layout of the files changes."""

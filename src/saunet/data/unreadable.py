@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from saunet.checks import DataError
 from saunet.data.frame_size import check_frame
 from saunet.data.windows import Selection, WindowDataset
+from saunet.errors import DataError
 
 _PATIENCE = 100
 """Samples in a row that may be broken before it is the data set that is, not a file."""
@@ -49,11 +49,11 @@ class SkippingWindows(WindowDataset):
 
 
 def readable(selection: Selection, offsets: Sequence[int], with_depth: bool) -> Selection:
-    """Return a selection without the frames that cannot be read, themselves or a neighbour, each decoded once.
+    """Return a selection without the frames that cannot be read, themselves or a neighbor, each decoded once.
 
     Args:
         selection: Frames of one drive.
-        offsets: Time offsets of the neighbours.
+        offsets: Time offsets of the neighbors.
         with_depth: Also read the ground truth.
     """
     drive, existing = selection.drive, set(selection.drive.indices)

@@ -1,4 +1,4 @@
-"""Frame windows as samples: a target frame, its neighbours in time, and whatever truth the recording has.
+"""Frame windows as samples: a target frame, its neighbors in time, and whatever truth the recording has.
 
 A window is usable when the frames at all offsets exist. What is left out is counted, never silently dropped.
 """
@@ -16,15 +16,15 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from saunet.checks import ConfigError, DataError
 from saunet.data.depth_maps import DepthMaps
+from saunet.data.drive import Drive
 from saunet.data.frame_size import check_frame
 from saunet.data.partners import Odometer, partner_frames, partner_image
 from saunet.data.resize import resize_depth
-from saunet.data.sequences import Drive
+from saunet.errors import ConfigError, DataError
 from saunet.fingerprint import fingerprint
 from saunet.geometry.camera import scale_intrinsics
-from saunet.images import resize
+from saunet.io.images import resize
 from saunet.types import FrameBatch
 
 DRAWS = 8
@@ -66,7 +66,7 @@ class Usage:
 def find_windows(
     selections: Sequence[Selection], offsets: Sequence[int], stereo: bool = False
 ) -> tuple[list[tuple[int, int]], list[Usage]]:
-    """Find the frames whose neighbours at all offsets exist.
+    """Find the frames whose neighbors at all offsets exist.
 
     Args:
         selections: Drives with the frames wanted of each.
@@ -90,7 +90,7 @@ def find_windows(
             if frame not in existing:
                 left_out["missing"] = left_out.get("missing", 0) + 1
             elif any(frame + offset not in existing for offset in offsets):
-                left_out["without neighbour"] = left_out.get("without neighbour", 0) + 1
+                left_out["without neighbor"] = left_out.get("without neighbor", 0) + 1
             elif frame not in paired:
                 left_out["without stereo partner"] = left_out.get("without stereo partner", 0) + 1
             else:
@@ -118,7 +118,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         with_target_depth: Yield depth at the size of the frames (zeros where the drive has none).
         with_pose: Yield true motion; every drive must know it.
         stereo: Yield the stereo partner as the last source, and where it is.
-        odometer: Gives the distance travelled; None yields none.
+        odometer: Gives the distance traveled; None yields none.
         maps: Depth maps made beforehand, by the key under which they are yielded at the size of the frames.
 
     Raises:
@@ -186,7 +186,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
             if image.ndim != 3 or image.shape != native:
                 raise DataError(
                     f"{what} of '{drive.name}' has shape {tuple(image.shape)} "
-                    f"where its neighbour {frame} has {tuple(native)}; frames of a drive share one size"
+                    f"where its neighbor {frame} has {tuple(native)}; frames of a drive share one size"
                 )
         height, width = self.size
         frames = np.stack([resize(image, height, width).transpose(2, 0, 1) for image in images])
@@ -222,7 +222,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         T_world_tgt = drive.pose(frame)
         T_world_src = [drive.pose(frame + offset) for offset in self.offsets]
         if T_world_tgt is None or any(pose is None for pose in T_world_src):
-            raise DataError(f"'{drive.name}' has no pose at frame {frame} or its neighbours; load it without poses")
+            raise DataError(f"'{drive.name}' has no pose at frame {frame} or its neighbors; load it without poses")
         return np.array([np.linalg.inv(pose) @ T_world_tgt for pose in T_world_src if pose is not None]).reshape(
             -1, 4, 4
         )

@@ -1,4 +1,4 @@
-"""Scoring predictors against ground truth: running, summarising, comparing, writing."""
+"""Scoring predictors against ground truth: running, summarizing, comparing, writing."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from saunet.checks import ConfigError, positive
+from saunet.errors import ConfigError, positive
 from saunet.metrics.functional import error_terms, root_terms
 from saunet.metrics.protocols import Sample
 
@@ -35,7 +35,7 @@ class Buckets:
     """How pixels are sorted.
 
     Args:
-        distances: Limits of the distance ranges in metres, ascending.
+        distances: Limits of the distance ranges in meters, ascending.
         edge_radius: Pixels of the ground truth to the left and right that are looked at for a depth edge.
         edge_ratio: Depths that differ by more than this factor make an edge.
 
@@ -61,7 +61,7 @@ class Buckets:
         return (
             *(("distance", name) for name in ranges),
             *(("row", f"{name} third") for name in ("top", "middle", "bottom")),
-            *(("column", f"{name} third") for name in ("left", "centre", "right")),
+            *(("column", f"{name} third") for name in ("left", "center", "right")),
             ("edge", "near an edge"),
             ("edge", "elsewhere"),
         )
@@ -79,14 +79,14 @@ class Buckets:
 
 
 def near_edge(truth: Float[Tensor, "h w"], radius: int, ratio: float) -> Bool[Tensor, "h w"]:
-    """Find pixels whose measured neighbours in the same row differ in depth by more than a factor.
+    """Find pixels whose measured neighbors in the same row differ in depth by more than a factor.
 
     Only the row is looked at: along it a flat road keeps its depth, while upwards it recedes without any edge. Works
     for dense depth and for scan lines.
 
     Args:
-        truth: Depth in metres, 0 where unknown.
-        radius: Neighbours within this many pixels to the left and right.
+        truth: Depth in meters, 0 where unknown.
+        radius: Neighbors within this many pixels to the left and right.
         ratio: Farthest over nearest of them that makes an edge.
     """
     if truth.numel() == 0:

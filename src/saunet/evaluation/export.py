@@ -1,4 +1,4 @@
-"""Predictions as the KITTI benchmark wants them: 16-bit PNG, metres x 256, at the size of the original image."""
+"""Predictions as the KITTI benchmark wants them: 16-bit PNG, meters x 256, at the size of the original image."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from torch import Tensor
 
 from saunet.evaluation.foreign import file_stem
 from saunet.evaluation.runner import Predictor, truths_of
-from saunet.images import write_image
-from saunet.infer.colour import depth_to_png16
+from saunet.io.colormaps import depth_to_png16
+from saunet.io.images import write_image
 from saunet.metrics.protocols import Protocol, resize_disparity, sample_image
 from saunet.types import EvalBatch
 

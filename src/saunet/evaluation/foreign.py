@@ -13,8 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from saunet.checks import DataError, one_of
-from saunet.images import natural_order, read_depth
+from saunet.errors import DataError, one_of
+from saunet.io.images import natural_order, read_depth
 from saunet.types import EvalBatch
 
 SUFFIXES: tuple[str, ...] = (".npy", ".png")

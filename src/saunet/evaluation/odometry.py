@@ -16,9 +16,10 @@ from numpy import ndarray
 from rich.markup import escape
 from rich.table import Table
 
-from saunet.atomic import write_bytes, write_json
 from saunet.evaluation.tables import plain_table
 from saunet.evaluation.writers import without_nan
+from saunet.io.atomic import write_bytes, write_json
+from saunet.io.trajectories import write_kitti, write_tum
 from saunet.metrics.odometry import (
     KITTI_LENGTHS,
     Similarity,
@@ -28,7 +29,6 @@ from saunet.metrics.odometry import (
     snippet_ate,
     trajectory_ate,
 )
-from saunet.trajectories import write_kitti, write_tum
 
 PUBLISHED_SNIPPET = 5
 """Frames in a snippet of the published numbers."""
@@ -44,18 +44,18 @@ class PathErrors:
     predictor: str
     """`MODEL`, or `STRAIGHT`, which looks at no image."""
     frames: int
-    metres: float
+    meters: float
     """Length of the true path."""
     snippet: int
     """Frames in a snippet."""
     snippet_ate: float
-    """Mean error of snippets in metres, each with its own scale; of five frames as published (Zhou et al.)."""
+    """Mean error of snippets in meters, each with its own scale; of five frames as published (Zhou et al.)."""
     snippet_std: float
     """Its standard deviation over snippets."""
     ate: float
-    """Root mean square distance of positions in metres after 7-DoF alignment of the whole path."""
+    """Root mean square distance of positions in meters after 7-DoF alignment of the whole path."""
     scale: float
-    """Metres a unit of the prediction: the scale of that alignment."""
+    """Meters a unit of the prediction: the scale of that alignment."""
     turn: float
     """Degrees by which that alignment turned the path; see `Path3d.turn`."""
     t_rel: float
@@ -65,7 +65,7 @@ class PathErrors:
     segments: int
     """How many segments these are the mean of."""
     lengths: tuple[float, ...]
-    """Their lengths in metres; other than KITTI's where its shortest, 100 m, does not fit."""
+    """Their lengths in meters; other than KITTI's where its shortest, 100 m, does not fit."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Path3d:
     times: Float64[ndarray, " n"]
     """Seconds of each frame."""
     true: Float64[ndarray, "n 4 4"] | None = None
-    """``T_world_cam`` in metres."""
+    """``T_world_cam`` in meters."""
     predictor: str = MODEL
 
     @property
@@ -98,10 +98,10 @@ class Path3d:
         """
         if self.true is None:
             return 0.0
-        centred = self.predicted[:, :3, 3] - self.predicted[:, :3, 3].mean(0)
-        driven = centred @ (self.true[0, :3, :3] @ self.predicted[0, :3, :3].T).T
-        aligned = centred @ self.alignment.rotation.T
-        energy = float((centred**2).sum())
+        centerd = self.predicted[:, :3, 3] - self.predicted[:, :3, 3].mean(0)
+        driven = centerd @ (self.true[0, :3, :3] @ self.predicted[0, :3, :3].T).T
+        aligned = centerd @ self.alignment.rotation.T
+        energy = float((centerd**2).sum())
         return float(np.degrees(np.arccos(np.clip((driven * aligned).sum() / energy, -1, 1)))) if energy > 0 else 0.0
 
     @property
@@ -142,7 +142,7 @@ def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None 
     Args:
         path: The path.
         snippet: Frames in a snippet; published numbers use 5.
-        lengths: Segment lengths in metres for t_rel and r_rel; by default KITTI's 100 to 800 m, or 20 to 80 % of
+        lengths: Segment lengths in meters for t_rel and r_rel; by default KITTI's 100 to 800 m, or 20 to 80 % of
             the path where it is shorter than 100 m (such numbers compare with no published ones).
 
     Raises:
@@ -151,17 +151,17 @@ def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None 
     """
     true = path.true
     assert true is not None, "errors need the true path"
-    metres = float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum())
+    meters = float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum())
     chosen = tuple(float(length) for length in lengths or KITTI_LENGTHS)
-    if lengths is None and 0 < metres <= min(KITTI_LENGTHS):
-        chosen = tuple(round(share * metres, 1) for share in (0.2, 0.4, 0.6, 0.8))
+    if lengths is None and 0 < meters <= min(KITTI_LENGTHS):
+        chosen = tuple(round(share * meters, 1) for share in (0.2, 0.4, 0.6, 0.8))
     snippets = snippet_ate(relative_motions(path.predicted), relative_motions(true), snippet)
     relative = segment_errors(path.aligned, true, chosen, step=10 if len(true) > 100 else 1)
     return PathErrors(
         path.sequence,
         path.predictor,
         len(true),
-        metres,
+        meters,
         snippet,
         snippets.mean,
         snippets.std,
@@ -195,7 +195,7 @@ def path_table(errors: Sequence[PathErrors]) -> Table:
         trivial = row.predictor == STRAIGHT
         table.add_row(
             row.predictor if trivial else escape(row.sequence),
-            *(("", "") if trivial else (str(row.frames), f"{row.metres:.1f}")),
+            *(("", "") if trivial else (str(row.frames), f"{row.meters:.1f}")),
             f"{row.snippet_ate:.4f} ± {row.snippet_std:.4f}",
             f"{row.ate:.3f}",
             f"{row.scale:.3g}",
@@ -211,7 +211,7 @@ def path_table(errors: Sequence[PathErrors]) -> Table:
         notes.append(f"t_rel and r_rel over segments of {', '.join(sorted(set(lengths)))}")
     bare = {row.sequence: row for row in errors if not row.segments}
     notes += [
-        f"no segment of {min(row.lengths):g} m or more fits into the {row.metres:.1f} m of {escape(name)}"
+        f"no segment of {min(row.lengths):g} m or more fits into the {row.meters:.1f} m of {escape(name)}"
         for name, row in bare.items()
     ]
     table.caption = "; ".join(notes)

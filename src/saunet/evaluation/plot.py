@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from saunet.atomic import replacing
-from saunet.checks import require_matplotlib
+from saunet.errors import require_matplotlib
 from saunet.evaluation.odometry import Path3d, PathErrors
+from saunet.io.atomic import replacing
 
 
 def draw_path(path: Path3d, file: Path, errors: Sequence[PathErrors] = ()) -> None:
@@ -45,8 +45,8 @@ def draw_path(path: Path3d, file: Path, errors: Sequence[PathErrors] = ()) -> No
     above.plot(ours[0, 0], ours[0, 2], "o", color="tab:red", markersize=6, label="start")
     # Equal scales, and room to the sides of a straight road, which would otherwise be a line in a sliver.
     spots = ours if path.true is None else np.concatenate([ours, path.true[:, :3, 3]])
-    centre, reach = (spots.max(0) + spots.min(0)) / 2, max(np.ptp(spots[:, 0]), np.ptp(spots[:, 2]), 1e-6) * 0.55
-    above.set(xlim=(centre[0] - reach, centre[0] + reach), ylim=(centre[2] - reach, centre[2] + reach))
+    center, reach = (spots.max(0) + spots.min(0)) / 2, max(np.ptp(spots[:, 0]), np.ptp(spots[:, 2]), 1e-6) * 0.55
+    above.set(xlim=(center[0] - reach, center[0] + reach), ylim=(center[2] - reach, center[2] + reach))
     above.set(xlabel=f"x to the right ({unit})", ylabel=f"z forward ({unit})", aspect="equal")
     above.set_title(path.sequence, fontsize=10)
     if errors:

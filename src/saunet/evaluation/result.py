@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.checks import ConfigError, DataError, one_of
+from saunet.errors import ConfigError, DataError, one_of
 from saunet.evaluation.breakdown import BucketRow
 from saunet.fingerprint import fingerprint
 from saunet.metrics.protocols import Protocol
@@ -105,7 +105,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class ViewRow:
-    """How well a prediction explains the neighbouring frames of one image, where no depth is known."""
+    """How well a prediction explains the neighboring frames of one image, where no depth is known."""
 
     predictor: str
     protocol: str
@@ -113,13 +113,13 @@ class ViewRow:
     group: str
     """The condition or the recording that the image belongs to."""
     warped: float
-    """Photometric error after warping the neighbours by depth and motion, SAU-Net eqs. (8) to (10)."""
+    """Photometric error after warping the neighbors by depth and motion, SAU-Net eqs. (8) to (10)."""
     unwarped: float
     """The same without warping: what a network that has learnt nothing reaches."""
     explained: float
     """Share of pixels that warping brings closer, SAU-Net eq. (11)."""
     visible: float
-    """Share of pixels that any neighbour sees."""
+    """Share of pixels that any neighbor sees."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ class EvaluationResult:
         }
         for row in self.rows:
             groups[row.protocol, row.predictor].append(row)
-        return tuple(summarise(rows) for rows in groups.values() if rows)
+        return tuple(summarize(rows) for rows in groups.values() if rows)
 
     def joined(self, other: EvaluationResult) -> EvaluationResult:
         """Return both results as one: other protocols (another ground truth) or other predictors of the same images.
@@ -230,7 +230,7 @@ class EvaluationResult:
         )
 
 
-def summarise(rows: Iterable[ImageRow]) -> Summary:
+def summarize(rows: Iterable[ImageRow]) -> Summary:
     """Return the means of rows that share predictor and protocol.
 
     Raises:

@@ -8,17 +8,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError, DataError, one_of
+from saunet.errors import ConfigError, DataError, one_of
 from saunet.evaluation.breakdown import Buckets, BucketSums
 from saunet.evaluation.result import EvaluationResult, ImageRow
+from saunet.io.progress import bar
 from saunet.metrics.depth import native_depths
 from saunet.metrics.functional import flip_blend
 from saunet.metrics.protocols import GROUND_TRUTHS, Protocol, sample_errors, sample_image
-from saunet.progress import bar
 from saunet.types import DepthPyramid, EvalBatch
 
 Predictor = Callable[[EvalBatch], Tensor]
-"""Gives the disparity (1/metre up to scale) of a batch, b x 1 x any height x any width."""
+"""Gives the disparity (1/meter up to scale) of a batch, b x 1 x any height x any width."""
 
 
 class NetworkPredictor:
@@ -141,7 +141,7 @@ def _score_batch(
 
 
 def truths_of(batch: EvalBatch) -> list[Float[Tensor, "_ _"]]:
-    """Return the ground truth of each image at its native size, metres, 0 where unknown; one such pixel without any.
+    """Return the ground truth of each image at its native size, meters, 0 where unknown; one such pixel without any.
 
     Raises:
         DataError: if the batch has depth without its sizes, or they do not fit.

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from saunet.checks import DataError, in_range, positive
+from saunet.errors import DataError, in_range, positive
 from saunet.evaluation.result import Comparison, Difference, EvaluationResult, ImageRow, Spread
 from saunet.metrics.functional import ERROR_NAMES, HIGHER_IS_BETTER
 
@@ -79,7 +79,7 @@ def bootstrap_mean(
 ) -> Interval:
     """Compute a percentile-bootstrap interval of the mean of each column.
 
-    Neighbouring frames of a drive are alike, so resampling images makes intervals too narrow: give the drives as
+    Neighboring frames of a drive are alike, so resampling images makes intervals too narrow: give the drives as
     ``groups`` and whole drives are resampled.
 
     Args:

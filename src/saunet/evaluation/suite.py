@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from saunet.checks import ConfigError, one_of
+from saunet.errors import ConfigError, one_of
 from saunet.evaluation.breakdown import Buckets
 from saunet.evaluation.result import EvaluationResult, ImageRow
 from saunet.evaluation.runner import Predictor, evaluate
@@ -26,7 +26,7 @@ class EvaluationData(Protocol):
     """What an evaluation needs of a data module."""
 
     ground_truth: str
-    neighbours: Sequence[str]
+    neighbors: Sequence[str]
     datasets: Mapping[str, Any]
 
     @property
@@ -87,7 +87,7 @@ def evaluate_protocols(
         )
         first = None if data is first else first
         if kind == "none":
-            data.neighbours = (*data.neighbours, split)
+            data.neighbors = (*data.neighbors, split)
         data.setup(STAGES[split])
         predictors = predictors_for(data)
         batches, total = data.batches(split, device), len(data.datasets[split])

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from saunet.evaluation.breakdown import BucketRow
 from saunet.evaluation.result import Comparison, EvaluationResult, Spread, Summary, ViewRow
-from saunet.evaluation.views import summarise_views
+from saunet.evaluation.views import summarize_views
 from saunet.metrics.functional import ERROR_HEADINGS, HIGHER_IS_BETTER
 from saunet.metrics.protocols import Protocol
 
@@ -77,9 +77,9 @@ def view_table(protocol: Protocol, rows: Sequence[ViewRow]) -> Table:
     for heading in VIEW_HEADINGS:
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("images", justify="right", no_wrap=True)
-    for _, predictor, group, images, values in summarise_views(rows):
+    for _, predictor, group, images, values in summarize_views(rows):
         table.add_row(escape(predictor), escape(group), *(f"{value:.4f}" for value in values), f"{images:,}")
-    table.caption = "photometric errors of neighbours, warped and as they are; shares of pixels"
+    table.caption = "photometric errors of neighbors, warped and as they are; shares of pixels"
     return table
 
 
@@ -105,8 +105,8 @@ def comparison_table(comparison: Comparison) -> Table:
         sure = row.low > 0 or row.high < 0
         difference = f"{row.difference:+.4f}"
         if sure:
-            colour = "green" if (row.difference > 0) == up else "red"
-            difference = f"[bold {colour}]{difference}[/]"
+            color = "green" if (row.difference > 0) == up else "red"
+            difference = f"[bold {color}]{difference}[/]"
         table.add_row(
             heading,
             f"{row.first:.4f}",

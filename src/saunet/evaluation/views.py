@@ -1,4 +1,4 @@
-"""Scoring without ground truth: how well depth and motion explain the neighbouring frames, by condition."""
+"""Scoring without ground truth: how well depth and motion explain the neighboring frames, by condition."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError, DataError
+from saunet.errors import ConfigError, DataError
 from saunet.evaluation.result import EvaluationResult, ViewRow
 from saunet.evaluation.runner import Predictor
 from saunet.geometry.depth import disparity_to_depth
 from saunet.geometry.warp import synthesize
+from saunet.io.progress import bar
 from saunet.losses.functional import automask, combine_sources, photometric_error
 from saunet.metrics.protocols import Protocol
-from saunet.progress import bar
 from saunet.types import EvalBatch
 
 Motion: TypeAlias = Callable[[EvalBatch], Tensor]
@@ -51,14 +51,14 @@ def evaluate_views(
     total: int | None = None,
     progress: bool = True,
 ) -> EvaluationResult:
-    """Warp the neighbours of each image into it by predicted depth and motion, and compare.
+    """Warp the neighbors of each image into it by predicted depth and motion, and compare.
 
     A small error does not prove good depth (a flat wall is explained by any), but a model that does not beat the
-    neighbours as they are has learnt nothing, and conditions that are worse than others show.
+    neighbors as they are has learnt nothing, and conditions that are worse than others show.
 
     Args:
         predictors: Depth and motion by the name that tables show; both at one scale.
-        batches: Images with neighbours.
+        batches: Images with neighbors.
         protocol: One that needs no ground truth.
         group_of: The condition or the recording of an image, by its name.
         total: Number of images, for the progress bar.
@@ -66,7 +66,7 @@ def evaluate_views(
 
     Raises:
         ConfigError: if the protocol needs ground truth.
-        DataError: if there is no image, or a batch comes without neighbours.
+        DataError: if there is no image, or a batch comes without neighbors.
     """
     if protocol.ground_truth != "none":
         raise ConfigError(
@@ -78,7 +78,7 @@ def evaluate_views(
         task = shown.add_task(protocol.name, total=total)
         for batch in batches:
             if batch["sources"].shape[1] == 0:
-                raise DataError(f"image '{batch['name'][0]}' comes without neighbouring frames to compare with")
+                raise DataError(f"image '{batch['name'][0]}' comes without neighboring frames to compare with")
             for name, (depth, motion) in predictors.items():
                 rows += _score(name, depth(batch), motion(batch), batch, protocol, group_of)
             shown.advance(task, len(batch["name"]))
@@ -115,7 +115,7 @@ def _score(
     ]
 
 
-def summarise_views(rows: Sequence[ViewRow]) -> list[tuple[str, str, str, int, tuple[float, float, float, float]]]:
+def summarize_views(rows: Sequence[ViewRow]) -> list[tuple[str, str, str, int, tuple[float, float, float, float]]]:
     """Return (protocol, predictor, group, images, means of the four numbers), groups first and then ``all``."""
     found = []
     for protocol, predictor in dict.fromkeys((row.protocol, row.predictor) for row in rows):

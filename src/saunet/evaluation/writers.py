@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
-from saunet.atomic import replacing, write_json
-from saunet.checks import DataError
+from saunet.errors import DataError
 from saunet.evaluation.result import Comparison, EvaluationResult, ImageRow, Spread, Summary
 from saunet.evaluation.tables import VIEW_HEADINGS, images_note, spread_note
-from saunet.evaluation.views import summarise_views
+from saunet.evaluation.views import summarize_views
+from saunet.io.atomic import replacing, write_json
 from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
 
 _ROW_FIELDS = ("predictor", "protocol", "name", "pixels", "scale", *ERROR_NAMES)
@@ -49,7 +49,7 @@ def markdown(result: EvaluationResult) -> str:
                     ends = zip(spread.low, spread.high, strict=True)
                     table.append(_line("", *(f"{low:.3f} to {high:.3f}" for low, high in ends)))
             parts.append("\n".join(table))
-        views = summarise_views([row for row in result.views if row.protocol == protocol.name])
+        views = summarize_views([row for row in result.views if row.protocol == protocol.name])
         if views:
             table = [f"**{protocol.name}**: {protocol.summary}", "", *_header("predictor", "condition", *VIEW_HEADINGS)]
             table += [_line(who, group, *(f"{value:.4f}" for value in values)) for _, who, group, _, values in views]
@@ -130,7 +130,7 @@ def as_json(result: EvaluationResult) -> dict[str, object]:
         content["views"] = [
             {"protocol": rules, "predictor": who, "condition": group, "images": images}
             | dict(zip(_VIEW_FIELDS[4:], values, strict=True))
-            for rules, who, group, images, values in summarise_views(result.views)
+            for rules, who, group, images, values in summarize_views(result.views)
         ]
     if result.comparisons:
         content["comparisons"] = [dataclasses.asdict(comparison) for comparison in result.comparisons]

@@ -1,6 +1,6 @@
 """Pinhole intrinsics that follow what happens to an image: resize, crop, flip.
 
-All functions take K as ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in pixels; integer coordinates are pixel centres.
+All functions take K as ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in pixels; integer coordinates are pixel centers.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def flip_intrinsics(K: Float[Tensor, "*b 3 3"], width: Number) -> Float[Tensor, 
 
 @full_precision
 def invert_intrinsics(K: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Inverse of an upper triangular K in closed form: exact, and without the device synchronisation of a solver.
+    """Inverse of an upper triangular K in closed form: exact, and without the device synchronization of a solver.
 
     Args:
         K: Intrinsics in pixels.

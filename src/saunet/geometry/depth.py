@@ -15,11 +15,11 @@ def sigmoid_to_disparity(sigmoid: Float[Tensor, "*b"], min_depth: float, max_dep
 
     Args:
         sigmoid: The network's output.
-        min_depth: Depth at sigmoid 1, metres.
-        max_depth: Depth at sigmoid 0, metres.
+        min_depth: Depth at sigmoid 1, meters.
+        max_depth: Depth at sigmoid 0, meters.
 
     Returns:
-        Disparity (inverse depth), 1/metre.
+        Disparity (inverse depth), 1/meter.
     """
     low, high = 1 / max_depth, 1 / min_depth
     return low + (high - low) * sigmoid
@@ -27,7 +27,7 @@ def sigmoid_to_disparity(sigmoid: Float[Tensor, "*b"], min_depth: float, max_dep
 
 @full_precision
 def disparity_to_depth(disparity: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Depth in metres of a disparity in 1/metre: its reciprocal.
+    """Depth in meters of a disparity in 1/meter: its reciprocal.
 
     Args:
         disparity: Inverse depth; greater than 0.
@@ -49,7 +49,7 @@ def median_ratio(
 
     Args:
         prediction: Depth up to scale, greater than 0.
-        target: Depth in metres.
+        target: Depth in meters.
         mask: Pixels that count.
 
     Returns:

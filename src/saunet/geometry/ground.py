@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from saunet.checks import in_range, positive
+from saunet.errors import in_range, positive
 from saunet.geometry.precision import full_precision
 from saunet.geometry.warp import backproject
 

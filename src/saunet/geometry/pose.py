@@ -59,7 +59,7 @@ def pose_matrix(
 
     Args:
         axisangle: Axis times angle, radians.
-        translation: Metres (up to the scale ambiguity of monocular training).
+        translation: Meters (up to the scale ambiguity of monocular training).
         invert: Return the inverse motion instead.
 
     Returns:

@@ -1,7 +1,7 @@
 """View synthesis: resample source images into the target camera, given its depth and the motion between them.
 
-The pixel convention of the whole project lives here: integer coordinates are pixel centres, and a sampling grid is
-normalised by (W - 1, H - 1) with ``align_corners=True``. Everything is plain multiplication instead of matrix products,
+The pixel convention of the whole project lives here: integer coordinates are pixel centers, and a sampling grid is
+normalized by (W - 1, H - 1) with ``align_corners=True``. Everything is plain multiplication instead of matrix products,
 because a float32 matrix product may run in TF32 on a GPU, where the coordinate of a pixel is good to half a pixel only.
 """
 
@@ -16,11 +16,11 @@ from saunet.geometry.precision import full_precision
 from saunet.types import View
 
 MIN_Z = 1e-3
-"""Metres in front of a camera from where a point counts as visible; nearer, 1/z and its gradient explode."""
+"""Meters in front of a camera from where a point counts as visible; nearer, 1/z and its gradient explode."""
 FAR = 1e6
-"""Metres that stand for infinity: no parallax is left, and 0 * infinity does not occur."""
+"""Meters that stand for infinity: no parallax is left, and 0 * infinity does not occur."""
 BORDER = 1e-2
-"""Pixels beyond the outermost pixel centres still inside: more than float32 rounding, too little to see."""
+"""Pixels beyond the outermost pixel centers still inside: more than float32 rounding, too little to see."""
 _BEHIND = -2.0
 
 
@@ -29,11 +29,11 @@ def backproject(depth: Float[Tensor, "b 1 h w"], K: Float[Tensor, "b 3 3"]) -> F
     """3-D points of every pixel in its camera's frame: D(p) K^-1 p, the inner part of SAU-Net eq. (7).
 
     Args:
-        depth: Depth along the optical axis, metres.
+        depth: Depth along the optical axis, meters.
         K: Intrinsics, pixels.
 
     Returns:
-        Points (x right, y down, z forward), metres.
+        Points (x right, y down, z forward), meters.
     """
     height, width = depth.shape[-2:]
     u = torch.arange(width, dtype=depth.dtype, device=depth.device)
@@ -51,7 +51,7 @@ def project(
     """Pixels where points are seen by another camera: K T p, the outer part of SAU-Net eq. (7).
 
     Args:
-        points: Points in the target camera's frame, metres.
+        points: Points in the target camera's frame, meters.
         K: Intrinsics of the source camera, pixels.
         T: ``T_src_tgt``: a target point times it is a source point.
 
@@ -70,7 +70,7 @@ def project_each(
     """Do what `project` does, for several source cameras with the same intrinsics.
 
     Args:
-        points: Points in the target camera's frame, metres.
+        points: Points in the target camera's frame, meters.
         K: Intrinsics of the source cameras, pixels.
         T_src_tgt: One motion a source.
 
@@ -114,7 +114,7 @@ def visible(pixels: Float[Tensor, "*b 2"], z: Float[Tensor, "*b"], height: int, 
 
     Args:
         pixels: Pixels (u, v) of `project`.
-        z: Depth in the camera, metres.
+        z: Depth in the camera, meters.
         height: Height of the image.
         width: Width of the image.
     """
@@ -132,11 +132,11 @@ def synthesize(
 ) -> View:
     """Resample the sources into the target camera: H_{t'->t} of SAU-Net eq. (7).
 
-    Bilinear, with the border colour outside the picture. Infinite depth is a point that only rotation moves.
+    Bilinear, with the border color outside the picture. Infinite depth is a point that only rotation moves.
 
     Args:
         sources: Source images.
-        depth: Depth of the target, metres.
+        depth: Depth of the target, meters.
         K: Intrinsics of target and sources, pixels.
         T_src_tgt: Motion: a target point times it is a source point.
 

@@ -9,7 +9,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError, positive
+from saunet.errors import ConfigError, positive
 from saunet.registry import terms as registered_terms
 from saunet.types import DepthPyramid, LossTerms, TrainBatch, View
 

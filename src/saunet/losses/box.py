@@ -13,7 +13,7 @@ from torch import Tensor
 def box_mean(x: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     """3x3 mean with reflection padding over the last two dimensions (each at least 2)."""
     if x.device.type == "cpu":
-        # Pooling is a scalar loop on CPUs, and the largest part of a training step's loss; shifted sums are vectorised.
+        # Pooling is a scalar loop on CPUs, and the largest part of a training step's loss; shifted sums are vectorized.
         mean: Tensor = _ShiftedSums.apply(x)  # type: ignore[no-untyped-call]
         return mean
     flat = F.pad(x.reshape(-1, 1, *x.shape[-2:]), (1, 1, 1, 1), mode="reflect")
@@ -33,7 +33,7 @@ class _ShiftedSums(torch.autograd.Function):
 
 
 def _sum_of_three(x: Tensor, dim: int, adjoint: bool = False) -> Tensor:
-    """Sum each element with its two neighbours; the first counts the second twice, and likewise at the end."""
+    """Sum each element with its two neighbors; the first counts the second twice, and likewise at the end."""
     size = x.shape[dim]
     total = x.clone(memory_format=torch.contiguous_format)
     total.narrow(dim, 1, size - 1).add_(x.narrow(dim, 0, size - 1))

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from saunet.checks import one_of
+from saunet.errors import one_of
 from saunet.geometry.precision import full_precision
 from saunet.losses.box import box_mean
 
@@ -121,31 +121,31 @@ def masked_mean(values: Float[Tensor, "*n"], mask: Bool[Tensor, "*#n"] | Float[T
 
 @full_precision
 def smoothness_loss(disparity: Float[Tensor, "b 1 h w"], image: Float[Tensor, "b c h w"]) -> Float[Tensor, ""]:
-    """Edge-aware smoothness of the mean-normalised disparity (Monodepth2 eq. (3)).
+    """Edge-aware smoothness of the mean-normalized disparity (Monodepth2 eq. (3)).
 
     Args:
         disparity: Disparity at any scale of the values.
         image: The image at the same size; where it has an edge, so may the disparity.
 
     Returns:
-        Mean over horizontal plus mean over vertical neighbour pairs.
+        Mean over horizontal plus mean over vertical neighbor pairs.
     """
-    normalised = disparity / (disparity.mean((2, 3), keepdim=True) + 1e-7)
+    normalized = disparity / (disparity.mean((2, 3), keepdim=True) + 1e-7)
     total = image.new_zeros(())
-    for step, edge in zip(forward_differences(normalised), forward_differences(image), strict=True):
+    for step, edge in zip(forward_differences(normalized), forward_differences(image), strict=True):
         total = total + (step.abs() * torch.exp(-edge.abs().mean(1, keepdim=True))).mean()
     return total
 
 
 @full_precision
 def forward_differences(x: Float[Tensor, "b c h w"]) -> tuple[Float[Tensor, "b c h w-1"], Float[Tensor, "b c h-1 w"]]:
-    """Differences to the right and to the lower neighbour, the g of SAU-Net eq. (13); the border has no partner."""
+    """Differences to the right and to the lower neighbor, the g of SAU-Net eq. (13); the border has no partner."""
     return x[..., :, 1:] - x[..., :, :-1], x[..., 1:, :] - x[..., :-1, :]
 
 
 @full_precision
 def sobel(x: Float[Tensor, "b c h w"], padding: str = "replicate") -> tuple[Float[Tensor, "b c h w"], ...]:
-    """Un-normalised 3x3 Sobel gradients (x: left minus right, y: top minus bottom), as LapDepth uses them.
+    """Un-normalized 3x3 Sobel gradients (x: left minus right, y: top minus bottom), as LapDepth uses them.
 
     Args:
         x: Maps.

@@ -7,14 +7,14 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from saunet.checks import DataError, positive
+from saunet.errors import DataError, positive
 
 
 class ConstantDepth(nn.Module):
     """The same depth everywhere; under median scaling, the best that no information gives.
 
     Args:
-        depth: Metres.
+        depth: Meters.
 
     Raises:
         ConfigError: if the depth is not positive.
@@ -25,7 +25,7 @@ class ConstantDepth(nn.Module):
         self.depth = positive("depth", depth)
 
     def forward(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return the disparity (1/metre) for images, at their size."""
+        """Return the disparity (1/meter) for images, at their size."""
         return image.new_full((image.shape[0], 1, *image.shape[-2:]), 1 / self.depth, dtype=torch.float32)
 
 
@@ -38,7 +38,7 @@ class MeanDepthMap(nn.Module):
     Args:
         height: Rows of the grid; sparse ground truth wants a coarse one.
         width: Columns of the grid.
-        max_depth: Measurements at or beyond this many metres are left out, as the protocols do.
+        max_depth: Measurements at or beyond this many meters are left out, as the protocols do.
 
     Raises:
         ConfigError: if a size or the limit is not positive.
@@ -59,7 +59,7 @@ class MeanDepthMap(nn.Module):
         """Add the ground truths of a batch.
 
         Args:
-            depth: Metres, 0 where unknown, padded to a common size.
+            depth: Meters, 0 where unknown, padded to a common size.
             depth_size: Native (height, width) of each inside the padding; (0, 0) for an image without any.
         """
         height, width = self.depth_sum.shape
@@ -68,14 +68,14 @@ class MeanDepthMap(nn.Module):
             truth = padded[:rows, :columns]
             known = (truth > 0) & (truth < self.max_depth)
             row, column = known.nonzero(as_tuple=True)
-            # The cell whose area holds the pixel's centre, (u + 0.5) * s.
+            # The cell whose area holds the pixel's center, (u + 0.5) * s.
             cell = ((2 * row + 1) * height // (2 * rows), (2 * column + 1) * width // (2 * columns))
             values = truth[known]
             self.depth_sum.index_put_(cell, values, accumulate=True)
             self.count.index_put_(cell, torch.ones_like(values), accumulate=True)
 
     def depth_map(self) -> Float[Tensor, "h w"]:
-        """Return the mean depth on the grid in metres, every cell filled.
+        """Return the mean depth on the grid in meters, every cell filled.
 
         Raises:
             DataError: if no ground truth was added.
@@ -92,7 +92,7 @@ class MeanDepthMap(nn.Module):
         return torch.where(seen, mean, row_mean[:, None]).float()
 
     def forward(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return the disparity (1/metre) for images, at their size.
+        """Return the disparity (1/meter) for images, at their size.
 
         Raises:
             DataError: if no ground truth was added.

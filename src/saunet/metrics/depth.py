@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torchmetrics import Metric
 
-from saunet.checks import DataError
+from saunet.errors import DataError
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import Protocol, evaluate_image
 from saunet.metrics.protocols import protocol as named_protocol
@@ -54,7 +54,7 @@ class DepthMetrics(Metric):
 
         Args:
             disparity: Predicted inverse depth at network size.
-            depth: Ground truth in metres, 0 where unknown, padded to a common size.
+            depth: Ground truth in meters, 0 where unknown, padded to a common size.
             depth_size: Native (height, width) of each ground truth inside the padding; (0, 0) for an image without any.
 
         Raises:

@@ -31,8 +31,8 @@ def depth_errors(
     max(d/D*, D*/d) below 1.25, 1.25², 1.25³. Computed in double precision, without waiting for the device.
 
     Args:
-        prediction: Depth in metres, positive where ``mask`` is set.
-        target: True depth in metres, positive where ``mask`` is set.
+        prediction: Depth in meters, positive where ``mask`` is set.
+        target: True depth in meters, positive where ``mask`` is set.
         mask: The pixels that count.
 
     Returns:
@@ -48,8 +48,8 @@ def error_terms(prediction: Float[Tensor, " *shape"], target: Float[Tensor, " *s
     """Compute what each pixel adds to the seven errors, float64; RMSE and RMSE log still squared (see `root_terms`).
 
     Args:
-        prediction: Depth in metres, positive.
-        target: True depth in metres, positive.
+        prediction: Depth in meters, positive.
+        target: True depth in meters, positive.
     """
     d, truth = prediction.double(), target.double()
     quotient, off = d / truth, (d - truth).abs()

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, Float64, Int
 from numpy import ndarray
 
-from saunet.checks import ConfigError, DataError, one_of, positive
+from saunet.errors import ConfigError, DataError, one_of, positive
 
 KITTI_LENGTHS: tuple[float, ...] = (100, 200, 300, 400, 500, 600, 700, 800)
-"""Segment lengths in metres that KITTI averages over."""
+"""Segment lengths in meters that KITTI averages over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,7 @@ class SnippetErrors:
     """Errors of short pieces of a trajectory, each with its own scale."""
 
     errors: Float64[ndarray, " n"]
-    """Metres, one a snippet."""
+    """Meters, one a snippet."""
     points: Int[ndarray, " n"]
     """Positions in each; the last snippets of a sequence are shorter."""
 
@@ -64,7 +64,7 @@ class SegmentErrors:
     t_rel: float
     """Translation error in percent of the distance driven; NaN if no segment fits."""
     r_rel: float
-    """Rotation error in degrees per 100 metres; NaN if no segment fits."""
+    """Rotation error in degrees per 100 meters; NaN if no segment fits."""
     segments: int
     """How many segments were averaged."""
 
@@ -83,7 +83,7 @@ def check_lengths(lengths: Sequence[float | int]) -> None:
     """Check the lengths of segments.
 
     Raises:
-        ConfigError: if one is not a finite number of metres above 0.
+        ConfigError: if one is not a finite number of meters above 0.
     """
     for length in lengths:
         positive("lengths", length)
@@ -146,13 +146,13 @@ def umeyama(source: Float64[ndarray, "p 3"], target: Float64[ndarray, "n 3"], *,
     """
     _same_length(source, target, "positions", at_least=2)
     source_mean, target_mean = source.mean(0), target.mean(0)
-    centred, goal = source - source_mean, target - target_mean
-    U, singular, Vt = np.linalg.svd(goal.T @ centred / len(source))
+    centerd, goal = source - source_mean, target - target_mean
+    U, singular, Vt = np.linalg.svd(goal.T @ centerd / len(source))
     sign = np.ones(3)
     if np.linalg.det(U) * np.linalg.det(Vt) < 0:
         sign[2] = -1  # a rotation, not a reflection
     rotation = (U * sign) @ Vt
-    variance = float((centred**2).sum() / len(source))
+    variance = float((centerd**2).sum() / len(source))
     scale = float((singular * sign).sum()) / variance if with_scale and variance > 0 else 1.0
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 
@@ -166,7 +166,7 @@ def align_trajectory(
 
     Args:
         predicted: ``T_world_cam`` in any world, up to scale.
-        true: ``T_world_cam`` in metres.
+        true: ``T_world_cam`` in meters.
         mode: ``sim3`` rotation, translation and scale; ``se3`` without scale; ``scale`` first poses coincide and one
             scale is fitted; ``none`` first poses coincide.
 
@@ -191,7 +191,7 @@ def trajectory_ate(
     true: Float64[ndarray, "n 4 4"],
     mode: Literal["sim3", "se3", "scale", "none"] = "sim3",
 ) -> float:
-    """Compute the root mean square distance of positions in metres after alignment; arguments as `align_trajectory`."""
+    """Compute the root mean square distance of positions in meters after alignment; arguments as `align_trajectory`."""
     aligned = align_trajectory(predicted, true, mode).positions(predicted[:, :3, 3])
     return float(np.sqrt(((aligned - true[:, :3, 3]) ** 2).sum(1).mean()))
 
@@ -207,9 +207,9 @@ def segment_errors(
     Monocular predictions need their scale first: pass ``align_trajectory(predicted, true).poses(predicted)``.
 
     Args:
-        predicted: ``T_world_cam`` in metres, in any world.
-        true: ``T_world_cam`` in metres.
-        lengths: Segment lengths in metres along the true path; a short sequence wants shorter ones than KITTI's.
+        predicted: ``T_world_cam`` in meters, in any world.
+        true: ``T_world_cam`` in meters.
+        lengths: Segment lengths in meters along the true path; a short sequence wants shorter ones than KITTI's.
         step: A segment of each length starts at every ``step``-th frame.
 
     Raises:

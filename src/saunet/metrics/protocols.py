@@ -11,13 +11,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from saunet.checks import ConfigError, one_of, positive
+from saunet.errors import ConfigError, one_of, positive
 from saunet.metrics.functional import error_terms, garg_crop, median, root_terms
 
 GROUND_TRUTHS: tuple[str, ...] = ("lidar_x", "camera_z", "improved", "exact", "none")
 """The LiDAR's own forward coordinate; the camera's z of the same points; KITTI's accumulated maps; a renderer's; none.
 
-Without depth, predictions are scored by how well they explain the neighbouring frames (`saunet.evaluation.views`)."""
+Without depth, predictions are scored by how well they explain the neighboring frames (`saunet.evaluation.views`)."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Protocol:
         name: The name that results carry.
         summary: One line for tables and help.
         ground_truth: Which depth it compares with, one of `GROUND_TRUTHS`.
-        min_depth: Lower limit of the prediction in metres, applied after scaling.
-        max_depth: Upper limit of the prediction in metres.
+        min_depth: Lower limit of the prediction in meters, applied after scaling.
+        max_depth: Upper limit of the prediction in meters.
         capped: Only ground truth strictly between the limits counts; otherwise all of it above zero.
         crop: ``garg`` keeps the part of the image where the LiDAR reaches; ``none`` keeps all.
-        scaling: ``median`` scales each image by median(truth)/median(prediction); ``none`` takes metres as predicted.
+        scaling: ``median`` scales each image by median(truth)/median(prediction); ``none`` takes meters as predicted.
         factor: Fixed factor on the predicted depth, before any median scaling (5.4 for stereo-trained Monodepth2).
 
     Raises:
@@ -82,11 +82,11 @@ _PROTOCOLS = (
     Protocol(
         "eigen_improved", "KITTI's accumulated ground truth, all of it, no crop", "improved", capped=False, crop="none"
     ),
-    Protocol("metric", "camera z, Garg crop, metres as predicted: no scaling", "camera_z", scaling="none"),
+    Protocol("metric", "camera z, Garg crop, meters as predicted: no scaling", "camera_z", scaling="none"),
     Protocol("synthetic", "a renderer's dense depth, whole image, 0.1 to 80 m", "exact", min_depth=0.1, crop="none"),
     Protocol(
         "campus",
-        "no ground truth: how well depth and motion explain the neighbours",
+        "no ground truth: how well depth and motion explain the neighbors",
         "none",
         crop="none",
         scaling="none",
@@ -110,9 +110,9 @@ class Sample:
     """The pixels of one image that a protocol compares, scaled and clamped."""
 
     prediction: Float[Tensor, " n"]
-    """Predicted depth in metres, float64."""
+    """Predicted depth in meters, float64."""
     target: Float[Tensor, " n"]
-    """True depth in metres, float64."""
+    """True depth in meters, float64."""
     mask: Bool[Tensor, "h w"]
     """Where they lie in the ground truth, row by row: ``some_map[mask]`` follows the same order."""
     ratio: Float[Tensor, ""]
@@ -135,8 +135,8 @@ def sample_image(disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "h
     """Bring a prediction to the pixels that a protocol compares.
 
     Args:
-        disparity: Inverse depth at any size; resized bilinearly with half-pixel centres; 0 and below is far away.
-        ground_truth: Depth in metres at its native size, 0 where unknown; 0 x 0 for an image without any.
+        disparity: Inverse depth at any size; resized bilinearly with half-pixel centers; 0 and below is far away.
+        ground_truth: Depth in meters at its native size, 0 where unknown; 0 x 0 for an image without any.
         protocol: The rules.
 
     Returns:
@@ -155,14 +155,14 @@ def sample_image(disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "h
 
 
 def resize_disparity(disparity: Float[Tensor, "h w"], size: tuple[int, int]) -> Float[Tensor, "_ _"]:
-    """Resize a disparity map bilinearly with half-pixel centres, in single precision or better, and keep it positive.
+    """Resize a disparity map bilinearly with half-pixel centers, in single precision or better, and keep it positive.
 
     Args:
         disparity: Inverse depth.
         size: (height, width).
     """
     single = disparity.to(torch.promote_types(disparity.dtype, torch.float32))[None, None]
-    # The floor lies far below any real disparity (a billion metres): it keeps medians and products finite.
+    # The floor lies far below any real disparity (a billion meters): it keeps medians and products finite.
     return interpolate(single, size=size, mode="bilinear", align_corners=False)[0, 0].clamp(min=1e-9)
 
 

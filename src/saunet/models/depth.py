@@ -1,4 +1,4 @@
-"""The depth network: any encoder, any decoder, and the step from sigmoid disparity to metres."""
+"""The depth network: any encoder, any decoder, and the step from sigmoid disparity to meters."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError, divisible
+from saunet.errors import ConfigError, divisible
 from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
-from saunet.layers.conv import channels_last_weights
+from saunet.models.layers.conv import channels_last_weights
 from saunet.types import DepthPyramid
 
 torch.export.register_dataclass(DepthPyramid)  # so that a depth network can be exported with its result as it is

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from saunet.checks import CheckpointError
+from saunet.errors import CheckpointError
 from saunet.models.pretrained_files import PUBLIC_WEIGHTS, locate, read_state
 from saunet.models.pretrained_keys import resample_bias_table, tile_frames, to_our_names
 

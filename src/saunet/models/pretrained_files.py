@@ -16,8 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from saunet.checks import CheckpointError, suggest
-from saunet.torch_files import read_plain
+from saunet.errors import CheckpointError, suggest
+from saunet.io.torch_files import read_plain
 
 _TORCHVISION = "https://download.pytorch.org/models"
 _MICROSOFT = "https://github.com/SwinTransformer/storage/releases/download/v1.0.0"

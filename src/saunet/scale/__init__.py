@@ -1,4 +1,4 @@
-"""Metric scale without ground truth: what turns relative depth into metres, measured over many frames."""
+"""Metric scale without ground truth: what turns relative depth into meters, measured over many frames."""
 
 from __future__ import annotations
 

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from saunet.checks import DataError
-from saunet.images import network_input
+from saunet.errors import DataError
+from saunet.io.images import network_input
 from saunet.types import TrainBatch
 
 Image = UInt8[np.ndarray, "_ _ 3"]
@@ -31,17 +31,17 @@ def clip_batches(
     count: int | None = None,
     most: int = 100,
 ) -> Iterator[TrainBatch]:
-    """Yield frames of a clip one by one as a network wants them, with neighbours, intrinsics and partner as asked for.
+    """Yield frames of a clip one by one as a network wants them, with neighbors, intrinsics and partner as asked for.
 
     Args:
         frames: RGB bytes in the order of time.
         height: Height of the network's input.
         width: Width of the network's input.
         offsets: Time offsets of the sources.
-        distance: Gives the metres travelled between two frames by their numbers, NaN where unknown.
+        distance: Gives the meters traveled between two frames by their numbers, NaN where unknown.
         intrinsics: Gives K, 3 x 3, in pixels of an image of the given height and width.
         partner: The other camera's frames, one for each.
-        baseline: Metres from the camera to its partner, positive if that is the right one.
+        baseline: Meters from the camera to its partner, positive if that is the right one.
         count: How many frames there are, where known.
         most: Of more frames, only so many are used, evenly spread if ``count`` is known.
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from saunet.checks import ConfigError, DataError, one_of, positive
-from saunet.record import Scale
+from saunet.errors import ConfigError, DataError, one_of, positive
+from saunet.runs.record import Scale
 from saunet.scale.factors import height_factors, speed_factors, stereo_factors
 from saunet.types import TrainBatch
 
@@ -35,7 +35,7 @@ _WHY_NOT = {
 
 @dataclass(frozen=True, slots=True)
 class ScaleEstimate:
-    """The factor to metres that many frames agree on, and how well they do."""
+    """The factor to meters that many frames agree on, and how well they do."""
 
     method: str
     """One of `METHODS`."""
@@ -107,7 +107,7 @@ def estimate_scale(
         batches: The frames.
         depth: The depth network.
         motion: The pose network, for ``speed``.
-        camera_height: Metres above the road, for ``camera_height``.
+        camera_height: Meters above the road, for ``camera_height``.
 
     Raises:
         ConfigError: for an unknown method, or if what it needs is not given.
@@ -135,7 +135,7 @@ def _measurement(
     if method == "camera_height":
         if camera_height is None:
             raise ConfigError(
-                "scale.method=camera_height needs scale.camera_height, the metres from the road up to the camera "
+                "scale.method=camera_height needs scale.camera_height, the meters from the road up to the camera "
                 "(KITTI: 1.65)"
             )
         height = positive("scale.camera_height", float(camera_height))

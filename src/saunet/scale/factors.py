@@ -1,4 +1,4 @@
-"""One factor a frame, from what is known in metres: the camera's height, the way travelled, the stereo baseline."""
+"""One factor a frame, from what is known in meters: the camera's height, the way traveled, the stereo baseline."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from saunet.geometry.ground import fit_ground
 MIN_SUPPORT = 0.4
 """Share of the road region that must lie on the plane; with less, a frame's plane is not taken for the road."""
 MIN_DISTANCE = 0.1
-"""Metres travelled below which a frame says nothing about scale: the motion drowns in its error."""
+"""Meters traveled below which a frame says nothing about scale: the motion drowns in its error."""
 MIN_MATCHES = 100
 """Pixels of a stereo pair that must be matched."""
 _MIN_DISPARITY = 1.5  # pixels; an eighth of a pixel of matching error is then 8 % of depth at most
@@ -26,28 +26,28 @@ _LARGEST_DISPARITY = 0.15  # of the image's width
 def height_factors(
     depth: Float[Tensor, "b 1 h w"], K: Float[Tensor, "b 3 3"], camera_height: float
 ) -> Float[Tensor, " b"]:
-    """Camera height in metres over its height above the road in the predicted depth; NaN where no road is found.
+    """Camera height in meters over its height above the road in the predicted depth; NaN where no road is found.
 
     Args:
         depth: Predicted depth.
         K: Intrinsics, pixels of ``depth``.
-        camera_height: Metres.
+        camera_height: Meters.
     """
     plane = fit_ground(depth, K)
     return torch.where(plane.support >= MIN_SUPPORT, camera_height / plane.height, math.nan)
 
 
 def speed_factors(T_src_tgt: Float[Tensor, "b s 4 4"], distance: Float[Tensor, "b s"]) -> Float[Tensor, " b"]:
-    """Metres travelled over the predicted motion, all sources of a frame together; NaN where unknown or standing.
+    """Meters traveled over the predicted motion, all sources of a frame together; NaN where unknown or standing.
 
     Args:
         T_src_tgt: Predicted motion.
-        distance: Metres travelled between target and source, NaN where unknown.
+        distance: Meters traveled between target and source, NaN where unknown.
     """
     predicted = torch.linalg.vector_norm(T_src_tgt[..., :3, 3].double(), dim=-1)
     counts = distance.isfinite() & (distance >= MIN_DISTANCE)
-    metres, length = (torch.where(counts, values, 0.0).sum(1) for values in (distance.double(), predicted))
-    return torch.where((metres > 0) & (length > 0), metres / length, math.nan).to(distance)
+    meters, length = (torch.where(counts, values, 0.0).sum(1) for values in (distance.double(), predicted))
+    return torch.where((meters > 0) & (length > 0), meters / length, math.nan).to(distance)
 
 
 def stereo_factors(
@@ -64,12 +64,12 @@ def stereo_factors(
         image: RGB in [0, 1].
         partner: The other camera's image.
         K: Intrinsics of both, pixels.
-        T_stereo_tgt: Where the partner is, metres.
+        T_stereo_tgt: Where the partner is, meters.
     """
     factors = []
     for i in range(len(depth)):
         across = float(T_stereo_tgt[i, 0, 3])
-        disparity = _match(_grey(image[i]), _grey(partner[i]), partner_is_left=across > 0)
+        disparity = _match(_gray(image[i]), _gray(partner[i]), partner_is_left=across > 0)
         found = disparity >= _MIN_DISPARITY
         predicted = depth[i, 0].detach().double().cpu().numpy()
         ratios = (float(K[i, 0, 0]) * abs(across) / disparity[found]) / predicted[found]
@@ -98,6 +98,6 @@ def _match(image: NDArray[np.uint8], partner: NDArray[np.uint8], partner_is_left
     return np.asarray(disparity, np.float64) / 16
 
 
-def _grey(image: Float[Tensor, "3 h w"]) -> NDArray[np.uint8]:
+def _gray(image: Float[Tensor, "3 h w"]) -> NDArray[np.uint8]:
     picture = (image.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)

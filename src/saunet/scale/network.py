@@ -1,4 +1,4 @@
-"""Networks whose answers are in metres."""
+"""Networks whose answers are in meters."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.record import Scale
+from saunet.runs.record import Scale
 from saunet.types import DepthPyramid
 
 
 class MetricDepth(nn.Module):
-    """A depth network with its scale applied: image to disparity in 1/metre.
+    """A depth network with its scale applied: image to disparity in 1/meter.
 
     Args:
         network: Takes images and returns a `DepthPyramid`.
-        scale: The factor to metres.
+        scale: The factor to meters.
     """
 
     def __init__(self, network: nn.Module, scale: Scale) -> None:
@@ -23,17 +23,17 @@ class MetricDepth(nn.Module):
         self.network, self.scale = network, scale
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return disparity at full resolution, 1/metre."""
+        """Return disparity at full resolution, 1/meter."""
         pyramid: DepthPyramid = self.network(image)
         return pyramid.disparity[0] / self.scale.factor
 
 
 class MetricMotion(nn.Module):
-    """A pose network with the scale of its depth network applied: frames to motion in metres.
+    """A pose network with the scale of its depth network applied: frames to motion in meters.
 
     Args:
         network: Takes targets and sources and returns T_src_tgt.
-        scale: The factor to metres.
+        scale: The factor to meters.
     """
 
     def __init__(self, network: nn.Module, scale: Scale) -> None:
@@ -43,7 +43,7 @@ class MetricMotion(nn.Module):
     def forward(
         self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b s 3 h w"]
     ) -> Float[Tensor, "b s 4 4"]:
-        """Return T_src_tgt of each source, metres."""
+        """Return T_src_tgt of each source, meters."""
         T: Tensor = self.network(target, sources)
         factors = torch.ones_like(T)
         factors[..., :3, 3] = self.scale.factor

@@ -12,10 +12,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.checks import DataError, positive
+from saunet.errors import DataError, positive
 
 _FORMAT = (
-    "expected columns 'time' (seconds) or 'frame' (number), 'speed' (metres per second), and for several drives 'drive'"
+    "expected columns 'time' (seconds) or 'frame' (number), 'speed' (meters per second), and for several drives 'drive'"
 )
 
 
@@ -27,7 +27,7 @@ class SpeedTable:
         path: The file that it was read from, for messages.
         unit: What ticks count, seconds (``time``) or frames (``frame``); of both, 0 is the first frame.
         ticks: Ascending, of each drive; the drive ``""`` stands for all.
-        speeds: Metres a second at each tick.
+        speeds: Meters a second at each tick.
     """
 
     path: Path
@@ -36,7 +36,7 @@ class SpeedTable:
     speeds: Mapping[str, NDArray[np.float64]]
 
     def distance(self, drive: str, first: int, second: int, fps: float | int) -> float:
-        """Return the metres travelled between two frames, speed being linear in between; NaN outside the table.
+        """Return the meters traveled between two frames, speed being linear in between; NaN outside the table.
 
         Args:
             drive: Name of the drive.
@@ -83,7 +83,7 @@ def read_speeds(path: str | Path) -> SpeedTable:
 
     Args:
         path: Columns ``time`` (seconds since frame 0) or ``frame`` (its number, 0 for the first of a folder or video),
-            and ``speed`` (metres per second); with a column ``drive`` it may hold several drives by their names.
+            and ``speed`` (meters per second); with a column ``drive`` it may hold several drives by their names.
 
     Raises:
         DataError: if the file cannot be read, lacks a column, holds a line that is not numbers, or one moment twice.

@@ -10,7 +10,6 @@ from typing import Literal
 
 from rich.progress import Progress
 
-from saunet.checks import ConfigError, DataError, in_range, one_of, positive
 from saunet.data.camera_file import check_crop
 from saunet.data.campus import CampusDrive
 from saunet.data.clips import Clip, FramesCacheError, default_cache, find_clips, read_clip
@@ -18,7 +17,8 @@ from saunet.data.module import DepthDataModule
 from saunet.data.motion import measure
 from saunet.data.splits import Frame, hold_out
 from saunet.data.windows import Selection, reach
-from saunet.progress import bar
+from saunet.errors import ConfigError, DataError, in_range, one_of, positive
+from saunet.io.progress import bar
 from saunet.registry import datamodules
 
 
@@ -52,7 +52,7 @@ class CampusDataModule(DepthDataModule):
         workers: Loader processes a device, at most one a core.
         translate: Frames are loaded this much larger in training (0.1 = 10 %) and a random window is cut.
         flip: Probability of mirroring in training.
-        colour: Probability of colour jitter in training.
+        color: Probability of color jitter in training.
         seed: Decides order, augmentation, and what is held out.
         cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
         manifest: Frames to leave out, as ``saunet-doctor`` wrote them.
@@ -62,7 +62,7 @@ class CampusDataModule(DepthDataModule):
         ConfigError: if a parameter is out of range or a word unknown.
     """
 
-    neighbours = ("train", "val", "test")
+    neighbors = ("train", "val", "test")
     protocol = "campus"
     ground_truth = "none"
 
@@ -88,7 +88,7 @@ class CampusDataModule(DepthDataModule):
         workers: int = 4,
         translate: float = 0.05,
         flip: float = 0.5,
-        colour: float = 0.5,
+        color: float = 0.5,
         seed: int = 0,
         cache: str | None = None,
         manifest: str | None = None,
@@ -102,7 +102,7 @@ class CampusDataModule(DepthDataModule):
             workers=workers,
             translate=translate,
             flip=flip,
-            colour=colour,
+            color=color,
             seed=seed,
             cache=cache,
             manifest=manifest,
@@ -147,7 +147,7 @@ class CampusDataModule(DepthDataModule):
 
     @property
     def camera_height(self) -> float | None:
-        """Metres of the camera above the road, where all clips agree; else None."""
+        """Meters of the camera above the road, where all clips agree; else None."""
         heights = {drive.camera_height for drive in self.drives()}
         return heights.pop() if len(heights) == 1 else None
 

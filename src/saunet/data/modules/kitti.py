@@ -7,15 +7,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from saunet.checks import ConfigError, DataError, in_range, one_of, suggest
 from saunet.data import splits
 from saunet.data.depth_maps import DENSE_KINDS, DepthMaps
 from saunet.data.kitti import CAMERA_HEIGHT, CAMERAS, DEPTH_KINDS, DepthKind, KittiRaw
 from saunet.data.module import DepthDataModule
 from saunet.data.partners import measured_distance
 from saunet.data.splits import Frame
-from saunet.data.standing import has_speed, moving
+from saunet.data.static_frames import has_speed, moving
 from saunet.data.windows import Selection, reach
+from saunet.errors import ConfigError, DataError, in_range, one_of, suggest
 from saunet.registry import datamodules
 
 _PROTOCOLS = {"camera_z": "eigen_camera_z", "lidar_x": "eigen_lidar_x", "improved": "eigen_improved"}
@@ -48,7 +48,7 @@ class KittiDataModule(DepthDataModule):
         workers: Loader processes a device, at most one a core.
         translate: Frames are loaded this much larger in training (0.1 = 10 %) and a random window is cut.
         flip: Probability of mirroring in training.
-        colour: Probability of colour jitter in training.
+        color: Probability of color jitter in training.
         seed: Decides order, augmentation, and what is held out at random.
         target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
         dense: Dense depth maps as that target in place of the sparse scan: ``linear`` or ``colorization``, made
@@ -58,7 +58,7 @@ class KittiDataModule(DepthDataModule):
         cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
         stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
             ``offsets: []`` it is the only one.
-        with_speed: Batches carry the way travelled, from OXTS, for the velocity term; unknown where a record lacks.
+        with_speed: Batches carry the way traveled, from OXTS, for the velocity term; unknown where a record lacks.
         manifest: Frames to leave out of training and validation, as ``saunet-doctor`` wrote them.
         on_error: A file that cannot be read: ``raise`` stops and names it, ``skip`` names, counts and passes it over.
 
@@ -86,7 +86,7 @@ class KittiDataModule(DepthDataModule):
         workers: int = 4,
         translate: float = 0.05,
         flip: float = 0.5,
-        colour: float = 0.5,
+        color: float = 0.5,
         seed: int = 0,
         target_depth: bool = False,
         dense: Literal["none", "linear", "colorization"] = "none",
@@ -106,7 +106,7 @@ class KittiDataModule(DepthDataModule):
             workers=workers,
             translate=translate,
             flip=flip,
-            colour=colour,
+            color=color,
             seed=seed,
             target_depth=target_depth or dense != "none",
             stereo=stereo,

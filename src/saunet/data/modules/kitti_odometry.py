@@ -6,25 +6,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from saunet.checks import in_range, one_of
 from saunet.data.kitti import CAMERA_HEIGHT
 from saunet.data.module import DepthDataModule
 from saunet.data.odometry import CAMERAS, OdometrySequence, find_root
 from saunet.data.splits import Frame, hold_out_tails
 from saunet.data.windows import Selection, reach
+from saunet.errors import in_range, one_of
 from saunet.registry import datamodules
 
 
 @datamodules.register("kitti_odometry")
 class KittiOdometryDataModule(DepthDataModule):
-    """KITTI odometry sequences with true camera motion: colour or grey, standard or chosen sequences.
+    """KITTI odometry sequences with true camera motion: color or gray, standard or chosen sequences.
 
     Args:
         root: Folder that holds ``sequences`` and ``poses``.
         train_sequences: Sequences to train on.
         test_sequences: Sequences to test and predict.
         val_share: Share of each training sequence, its end, that validates.
-        camera: ``colour_left``, ``colour_right``, ``grey_left`` or ``grey_right``.
+        camera: ``color_left``, ``color_right``, ``gray_left`` or ``gray_right``.
         height: Image height in pixels.
         width: Image width in pixels.
         offsets: Time offsets of the source frames.
@@ -32,7 +32,7 @@ class KittiOdometryDataModule(DepthDataModule):
         workers: Loader processes a device, at most one a core.
         translate: Frames are loaded this much larger in training (0.1 = 10 %) and a random window is cut.
         flip: Probability of mirroring in training.
-        colour: Probability of colour jitter in training.
+        color: Probability of color jitter in training.
         seed: Decides order and augmentation.
         with_pose: Batches carry the true motion.
         stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
@@ -45,7 +45,7 @@ class KittiOdometryDataModule(DepthDataModule):
         ConfigError: if a parameter is out of range or a word unknown.
     """
 
-    neighbours = ("train", "val", "test")
+    neighbors = ("train", "val", "test")
     camera_height = CAMERA_HEIGHT
 
     def __init__(
@@ -55,7 +55,7 @@ class KittiOdometryDataModule(DepthDataModule):
         train_sequences: Sequence[str] = ("00", "01", "02", "03", "04", "05", "06", "07", "08"),
         test_sequences: Sequence[str] = ("09", "10"),
         val_share: float = 0.05,
-        camera: Literal["colour_left", "colour_right", "grey_left", "grey_right"] = "colour_left",
+        camera: Literal["color_left", "color_right", "gray_left", "gray_right"] = "color_left",
         height: int = 192,
         width: int = 640,
         offsets: Sequence[int] = (-1, 1),
@@ -63,7 +63,7 @@ class KittiOdometryDataModule(DepthDataModule):
         workers: int = 4,
         translate: float = 0.05,
         flip: float = 0.5,
-        colour: float = 0.5,
+        color: float = 0.5,
         seed: int = 0,
         with_pose: bool = False,
         stereo: bool = False,
@@ -79,7 +79,7 @@ class KittiOdometryDataModule(DepthDataModule):
             workers=workers,
             translate=translate,
             flip=flip,
-            colour=colour,
+            color=color,
             seed=seed,
             with_pose=with_pose,
             stereo=stereo,
@@ -113,7 +113,7 @@ class KittiOdometryDataModule(DepthDataModule):
                 frames = [frame.number for frame in parts[split == "val"]]
                 if not frames:
                     continue
-            if self.with_pose and split in self.neighbours:
+            if self.with_pose and split in self.neighbors:
                 known = self._with_motion(drive, frames)
                 left_out["without pose"] = len(frames) - len(known)
                 frames = known
@@ -121,6 +121,6 @@ class KittiOdometryDataModule(DepthDataModule):
         return selections
 
     def _with_motion(self, drive: OdometrySequence, frames: Sequence[int]) -> list[int]:
-        """Drop the frames of which a pose is missing, their own or that of a neighbour that exists."""
+        """Drop the frames of which a pose is missing, their own or that of a neighbor that exists."""
         unknown = {index for index in drive.indices if drive.pose(index) is None}
         return [index for index in frames if not any(index + offset in unknown for offset in (0, *self.offsets))]

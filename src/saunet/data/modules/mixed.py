@@ -9,11 +9,11 @@ from collections.abc import Mapping, Sequence, Set
 from functools import partial
 from typing import Any, Literal
 
-from saunet.checks import ConfigError
+from saunet.data.drive import Drive
 from saunet.data.module import DepthDataModule
 from saunet.data.partners import measured_distance
-from saunet.data.sequences import Drive
 from saunet.data.windows import Selection
+from saunet.errors import ConfigError
 from saunet.registry import datamodules
 
 SHARED = (
@@ -30,7 +30,7 @@ SHARED = (
     "on_error",
 )
 """Settings that belong to the mixture; its sources take them over."""
-AUGMENTATION = ("flip", "colour")
+AUGMENTATION = ("flip", "color")
 """Settings that only the mixture's own augmentation reads."""
 
 
@@ -40,7 +40,7 @@ class MixedDataModule(DepthDataModule):
 
     On the command line: ``data=mixed +data@data.sources.town=kitti +data@data.sources.campus=campus`` and then
     ``data.sources.town.root=...``. What every data set has (size, offsets, batch, augmentation) is set for the mixture.
-    With a source's ``with_speed`` its batches carry the way travelled, and those of other sources say it is unknown.
+    With a source's ``with_speed`` its batches carry the way traveled, and those of other sources say it is unknown.
 
     Args:
         sources: Name -> data module; names start the names of samples.
@@ -53,7 +53,7 @@ class MixedDataModule(DepthDataModule):
         workers: Loader processes a device, at most one a core.
         translate: Frames are loaded this much larger in training (0.1 = 10 %) and a random window is cut.
         flip: Probability of mirroring in training.
-        colour: Probability of colour jitter in training.
+        color: Probability of color jitter in training.
         seed: Decides order, augmentation, and what the sources hold out at random.
         target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
         manifest: Frames to leave out of training and validation, as ``saunet-doctor`` wrote them for the mixture.
@@ -79,7 +79,7 @@ class MixedDataModule(DepthDataModule):
         workers: int = 4,
         translate: float = 0.05,
         flip: float = 0.5,
-        colour: float = 0.5,
+        color: float = 0.5,
         seed: int = 0,
         target_depth: bool = False,
         manifest: str | None = None,
@@ -93,7 +93,7 @@ class MixedDataModule(DepthDataModule):
             workers=workers,
             translate=translate,
             flip=flip,
-            colour=colour,
+            color=color,
             seed=seed,
             target_depth=target_depth,
             manifest=manifest,
@@ -119,7 +119,7 @@ class MixedDataModule(DepthDataModule):
 
     @property
     def camera_height(self) -> float | None:
-        """Metres from the road to the camera, where all sources in use agree; else None."""
+        """Meters from the road to the camera, where all sources in use agree; else None."""
         names = {*self._names["train"], *self._names["test"]}
         heights = {getattr(self.sources[name], "camera_height", None) for name in names}
         return heights.pop() if len(heights) == 1 else None
@@ -144,7 +144,7 @@ class MixedDataModule(DepthDataModule):
             for each in source.select(split):
                 selection = Selection(*each)
                 if source.manifest is not None and split in ("train", "val"):
-                    selection = source.manifest.apply(selection, self.offsets if split in self.neighbours else ())
+                    selection = source.manifest.apply(selection, self.offsets if split in self.neighbors else ())
                 drive = copy.copy(selection.drive)
                 drive.name = f"{name}/{selection.drive.name}"
                 selections.append(selection._replace(drive=drive))
@@ -185,7 +185,7 @@ def _as_kept(value: Any) -> Any:
 
 
 def _distance(with_speed: frozenset[str], drive: Drive, first: int, second: int) -> float:
-    """Return the metres travelled where the drive's source was asked for them, else NaN."""
+    """Return the meters traveled where the drive's source was asked for them, else NaN."""
     return measured_distance(drive, first, second) if drive.name.partition("/")[0] in with_speed else math.nan
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from saunet.checks import ConfigError, positive
 from saunet.data.module import DepthDataModule
-from saunet.data.synthetic import SyntheticDrive
 from saunet.data.windows import Selection
-from saunet.progress import bar
+from saunet.errors import ConfigError, positive
+from saunet.io.progress import bar
 from saunet.registry import datamodules
+from saunet.synthetic import SyntheticDrive
 
 _SEEDS_A_SPLIT = 10_000
 _SPLITS = ("train", "val", "test")
@@ -31,7 +31,7 @@ class SyntheticDataModule(DepthDataModule):
         workers: Loader processes a device, at most one a core.
         translate: Training frames are rendered this much larger (0.1 = 10 %) and a random window is cut; K follows.
         flip: Probability of mirroring in training.
-        colour: Probability of colour jitter in training.
+        color: Probability of color jitter in training.
         seed: Decides the streets, the order and the augmentation.
         target_depth: Training batches carry the depth of the target, for losses that use it.
         with_pose: Batches carry the true motion.
@@ -40,7 +40,7 @@ class SyntheticDataModule(DepthDataModule):
         test_drives: Number of drives to test on.
         frames_per_drive: Length of each drive, at 10 frames a second.
         moving_cars: Cars that move in each drive, by turns ahead and oncoming.
-        camera_height: Metres above the road.
+        camera_height: Meters above the road.
         cache: Folder in which rendered drives are kept between runs; None renders them each time.
         stereo: Batches carry the right camera's image, 0.54 m to the right, as one more source; with ``offsets: []`` it
             is the only one.
@@ -63,7 +63,7 @@ class SyntheticDataModule(DepthDataModule):
         workers: int = 0,
         translate: float = 0.05,
         flip: float = 0.5,
-        colour: float = 0.5,
+        color: float = 0.5,
         seed: int = 0,
         target_depth: bool = False,
         with_pose: bool = False,
@@ -85,7 +85,7 @@ class SyntheticDataModule(DepthDataModule):
             workers=workers,
             translate=translate,
             flip=flip,
-            colour=colour,
+            color=color,
             seed=seed,
             target_depth=target_depth,
             with_pose=with_pose,
@@ -121,7 +121,7 @@ class SyntheticDataModule(DepthDataModule):
                 )
                 for number in range(self.counts[name])
             ]
-            pairs = [drive.partner() for drive in self._drives[name]] if self.stereo and name in self.neighbours else []
+            pairs = [drive.partner() for drive in self._drives[name]] if self.stereo and name in self.neighbors else []
             _render([*self._drives[name], *pairs], name, show=self._place()[0] == 0)
         return self._drives[name]
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from saunet.checks import ConfigError, one_of
+from saunet.errors import ConfigError, one_of
 from saunet.geometry.depth import median_ratio
 from saunet.losses.base import Term, TermResult, require
 from saunet.losses.functional import gradient_loss, pool_known
@@ -28,17 +28,17 @@ class Gradient(Term):
     """Gradient loss, SAU-Net eq. (13), against a target g* that can be swapped, averaged over scales.
 
     Every scale is compared at its own size (a target pixel is the mean of the known pixels it covers) and weighted by
-    1/2**scale, which makes a difference between neighbours one per pixel of the image. Only gradients between known
+    1/2**scale, which makes a difference between neighbors one per pixel of the image. Only gradients between known
     pixels count, so the target may be sparse.
 
     Args:
-        target: ``image``: no ground truth, edge-aware smoothness of the mean-normalised disparity (of the other
-            parameters only ``scales`` applies); ``lidar``: depth measured by a scanner, metres; ``teacher``: depth
+        target: ``image``: no ground truth, edge-aware smoothness of the mean-normalized disparity (of the other
+            parameters only ``scales`` applies); ``lidar``: depth measured by a scanner, meters; ``teacher``: depth
             predicted by another model.
         domain: What is compared: ``depth`` as printed (metric, so it sets the scale of the network); ``log_depth`` and
             ``aligned`` (prediction times the median ratio, which does not learn), which leave the scale free;
             ``disparity``.
-        operator: ``forward`` differences as printed, or ``sobel`` (LapDepth's, un-normalised).
+        operator: ``forward`` differences as printed, or ``sobel`` (LapDepth's, un-normalized).
         padding: Of ``sobel``: ``replicate``, or ``zero`` (LapDepth's), which supervises values at the border.
         scales: Which scales to compare; all if None. LapDepth's is ``[0]``.
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from saunet.checks import in_range, one_of, positive
+from saunet.errors import in_range, one_of, positive
 from saunet.losses.base import Term, TermResult
 from saunet.losses.functional import automask, combine_sources, masked_mean, photometric_error
 from saunet.registry import terms
@@ -30,7 +30,7 @@ class Photometric(Term):
         reduction: Mean over the pixels that teach (``masked``), or over all with the smaller of the warped and unwarped
             error (``all``, Monodepth2's code).
         use_validity: Ignore a source where the point leaves its image or lies behind its camera. Without it such pixels
-            compare with the border colour, as Monodepth2 does.
+            compare with the border color, as Monodepth2 does.
         noise: Standard deviation of the noise that decides ties of the auto-mask while training.
 
     Raises:
@@ -94,7 +94,7 @@ class Photometric(Term):
 
 @terms.register("photometric_monodepth2")
 class Monodepth2Photometric(Photometric):
-    """The photometric term with Monodepth2's choices: mean over all pixels, border colour outside the picture.
+    """The photometric term with Monodepth2's choices: mean over all pixels, border color outside the picture.
 
     Args:
         sources: See `Photometric`.

@@ -17,7 +17,7 @@ from saunet.types import DepthPyramid, TrainBatch, View
 
 @terms.register("smoothness")
 class Smoothness(Term):
-    """Edge-aware smoothness of the mean-normalised disparity (Monodepth2 eq. (3)), averaged over scales.
+    """Edge-aware smoothness of the mean-normalized disparity (Monodepth2 eq. (3)), averaged over scales.
 
     Each scale is compared at its own size with the image reduced to it, and weighted by 1/2**scale. As in Monodepth2 it
     takes the network's relative disparity (its sigmoid).

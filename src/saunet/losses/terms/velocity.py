@@ -1,4 +1,4 @@
-"""Metric scale from speed: the predicted motion is as long as the way travelled."""
+"""Metric scale from speed: the predicted motion is as long as the way traveled."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.losses.base import Term, TermResult, require
 from saunet.losses.functional import masked_mean
 from saunet.registry import terms
@@ -17,7 +17,7 @@ from saunet.types import DepthPyramid, TrainBatch, View
 
 @terms.register("velocity")
 class Velocity(Term):
-    """Difference between predicted and true distance travelled, | ||t|| - speed * dt |, in metres (PackNet).
+    """Difference between predicted and true distance traveled, | ||t|| - speed * dt |, in meters (PackNet).
 
     The distance comes from ``batch["distance"]`` (NaN where unknown) or, where that is missing, from the true motion
     ``batch["T_src_tgt"]``. It makes depth metric; PackNet's weight is 0.1. A stereo partner, whose motion is known,
@@ -40,7 +40,7 @@ class Velocity(Term):
         """Return the mean over samples and sources whose distance is known.
 
         Raises:
-            ConfigError: if no motion is predicted, or the batch does not say how far the camera travelled.
+            ConfigError: if no motion is predicted, or the batch does not say how far the camera traveled.
         """
         predictions = poses.shape[1] - ("T_stereo_tgt" in batch)
         if predictions == 0:

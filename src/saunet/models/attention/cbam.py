@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError, positive
+from saunet.errors import ConfigError, positive
 from saunet.registry import attentions
 
 

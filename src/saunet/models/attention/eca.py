@@ -1,4 +1,4 @@
-"""Efficient channel attention: neighbouring channels weigh each other."""
+"""Efficient channel attention: neighboring channels weigh each other."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import positive
+from saunet.errors import positive
 from saunet.registry import attentions
 
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import positive
+from saunet.errors import positive
 from saunet.registry import attentions
 
 
@@ -14,7 +14,7 @@ from saunet.registry import attentions
 class GCT(nn.Module):
     """Gated channel transformation (Yang et al., CVPR 2020, eqs. (2)–(5)): 3·C parameters.
 
-    Embedding s_c = α_c·‖x_c‖₂, channel normalisation ŝ_c = √C·s_c/‖s‖₂, gate x_c·(1 + tanh(γ_c·ŝ_c + β_c)). It starts
+    Embedding s_c = α_c·‖x_c‖₂, channel normalization ŝ_c = √C·s_c/‖s‖₂, gate x_c·(1 + tanh(γ_c·ŝ_c + β_c)). It starts
     as the identity (α = 1, γ = β = 0). The norms are taken in float32: a sum of squares over a map overflows float16.
 
     Args:
@@ -35,6 +35,6 @@ class GCT(nn.Module):
         """Return ``x`` with each channel scaled by its gate in (0, 2)."""
         embedding = self.alpha * (x.float().square().sum((2, 3), keepdim=True) + self.eps).sqrt()
         # √C·s/‖s‖₂ is s over its root mean square
-        normalised = embedding * (embedding.square().mean(1, keepdim=True) + self.eps).rsqrt()
-        gate = 1 + torch.tanh(self.gamma * normalised + self.beta)
+        normalized = embedding * (embedding.square().mean(1, keepdim=True) + self.eps).rsqrt()
+        gate = 1 + torch.tanh(self.gamma * normalized + self.beta)
         return x * gate.to(x.dtype)

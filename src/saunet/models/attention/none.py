@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import positive
+from saunet.errors import positive
 from saunet.registry import attentions
 
 

@@ -8,9 +8,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import positive
-from saunet.layers.conv import DisparityHead, sum_of, upsample
+from saunet.errors import positive
 from saunet.models.decoders.base import by_level, check_scales
+from saunet.models.layers.conv import DisparityHead, sum_of, upsample
 from saunet.registry import attentions, decoders
 from saunet.types import FeatureSpec
 

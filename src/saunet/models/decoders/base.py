@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.types import FeatureSpec
 
 

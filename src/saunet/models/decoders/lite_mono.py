@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError
-from saunet.layers.conv import ConvELU, DisparityHead, upsample
+from saunet.errors import ConfigError
 from saunet.models.decoders.base import by_level, check_scales
+from saunet.models.layers.conv import ConvELU, DisparityHead, upsample
 from saunet.registry import decoders
 from saunet.types import FeatureSpec
 

@@ -8,10 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError
-from saunet.layers.conv import DisparityHead
-from saunet.layers.packing import GROUPS, ConvNormELU, Unpacking, initialise
+from saunet.errors import ConfigError
 from saunet.models.decoders.base import by_level, check_scales
+from saunet.models.layers.conv import DisparityHead
+from saunet.models.layers.packing import GROUPS, ConvNormELU, Unpacking, initialize
 from saunet.registry import decoders
 from saunet.types import FeatureSpec
 
@@ -52,7 +52,7 @@ class PackNetDecoder(nn.Module):
             inputs = channels[level]
         self.unpackings = nn.ModuleList(unpackings)
         self.joins = nn.ModuleList(joins)
-        initialise(self)
+        initialize(self)
         self.heads = nn.ModuleList([DisparityHead(channels[scale]) for scale in self.scales])
 
     def forward(self, features: Sequence[Tensor]) -> tuple[Tensor, ...]:

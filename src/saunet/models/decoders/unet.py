@@ -8,9 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError
-from saunet.layers.conv import ConvELU, DisparityHead
+from saunet.errors import ConfigError
 from saunet.models.decoders.base import by_level, check_scales
+from saunet.models.layers.conv import ConvELU, DisparityHead
 from saunet.registry import decoders
 from saunet.types import FeatureSpec
 

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError, positive
+from saunet.errors import ConfigError, positive
 from saunet.models.pretrained import load_pretrained
 from saunet.registry import encoders
 from saunet.types import FeatureSpec

@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError, in_range
-from saunet.layers.drop_path import DropPath
-from saunet.layers.xca import CrossCovarianceAttention, FourierPosition
+from saunet.errors import ConfigError, in_range
+from saunet.models.layers.drop_path import DropPath
+from saunet.models.layers.xca import CrossCovarianceAttention, FourierPosition
 from saunet.registry import encoders
 from saunet.types import FeatureSpec
 

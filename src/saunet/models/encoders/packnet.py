@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError
-from saunet.layers.packing import GROUPS, ConvNormELU, Packing, ResidualConv, initialise
+from saunet.errors import ConfigError
+from saunet.models.layers.packing import GROUPS, ConvNormELU, Packing, ResidualConv, initialize
 from saunet.registry import encoders
 from saunet.types import FeatureSpec
 
@@ -51,7 +51,7 @@ class PackNetEncoder(nn.Module):
         self.packings = nn.ModuleList([Packing(c, kernel=3 if i else 5) for i, c in enumerate(channels)])
         self.features = tuple(FeatureSpec(c, 2**i) for i, c in enumerate((channels[0], *channels)))
         self.size_divisor = 32
-        initialise(self)
+        initialize(self)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
         """Return the six feature maps, b c h/s w/s, finest first.
@@ -68,12 +68,12 @@ class PackNetEncoder(nn.Module):
 
 
 def check_channels(channels: Sequence[int]) -> None:
-    """Check that every number of channels divides into PackNet's normalisation groups.
+    """Check that every number of channels divides into PackNet's normalization groups.
 
     Raises:
         ConfigError: if one does not.
     """
     if any(c < 1 or c % GROUPS for c in channels):
         raise ConfigError(
-            f"channels is {tuple(channels)}; PackNet normalises over {GROUPS} groups, give multiples of {GROUPS}"
+            f"channels is {tuple(channels)}; PackNet normalizes over {GROUPS} groups, give multiples of {GROUPS}"
         )

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError, positive
+from saunet.errors import ConfigError, positive
 from saunet.models.pretrained import load_pretrained
 from saunet.registry import encoders
 from saunet.types import FeatureSpec
@@ -139,7 +139,7 @@ class ResNet(nn.Module):
         outputs = (64, *(width * kind.expansion for width in _WIDTHS))
         self.features = tuple(FeatureSpec(channels, 2 ** (i + 1)) for i, channels in enumerate(outputs))
         self.size_divisor = 32
-        _initialise(self)
+        _initialize(self)
         if weights is not None:
             load_pretrained(self, weights)
 
@@ -164,7 +164,7 @@ def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Sequential | None:
     return nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
 
 
-def _initialise(network: nn.Module) -> None:
+def _initialize(network: nn.Module) -> None:
     """Draw convolutions from He et al.'s normal distribution (fan out), as torchvision does."""
     for module in network.modules():
         if isinstance(module, nn.Conv2d):

@@ -19,7 +19,7 @@ class StratifiedTransformer(WindowEncoder):
     """SAU-Net's stratified transformer, section III.B: a convolution, then four stages of eqs. (1)-(4) at 1/2 ... 1/16.
 
     The stem is a 3x3 convolution with stride 2 and a LayerNorm; each pixel of its output is a token. Between stages the
-    2x2 neighbours are concatenated (4C) and projected to 2C, as in Swin, whose public weights fit all but the stem.
+    2x2 neighbors are concatenated (4C) and projected to 2C, as in Swin, whose public weights fit all but the stem.
 
     Args:
         dim: Channels of the first stage; they double from stage to stage.
@@ -62,5 +62,5 @@ class StratifiedTransformer(WindowEncoder):
             load_pretrained(self, weights)
 
     def tokens(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h2 w2 c"]:
-        """Turn a normalised image into tokens at half its size."""
+        """Turn a normalized image into tokens at half its size."""
         return self.stem["norm"](self.stem["conv"](image).permute(0, 2, 3, 1))  # type: ignore[no-any-return]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet import checks
+from saunet import errors
 from saunet.models.pretrained import load_pretrained
 from saunet.models.window_encoder import WindowEncoder
 from saunet.registry import encoders
@@ -55,7 +55,7 @@ class SwinTransformer(WindowEncoder):
         checkpointing: bool = False,
         weights: str | None = None,
     ) -> None:
-        checks.positive("patch", patch)
+        errors.positive("patch", patch)
         super().__init__(patch, dim, depths, heads, window, mlp_ratio, drop_path, mask_padding, checkpointing)
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, dim, patch, stride=patch), "norm": nn.LayerNorm(dim)})
         self._init_weights()
@@ -63,5 +63,5 @@ class SwinTransformer(WindowEncoder):
             load_pretrained(self, weights)
 
     def tokens(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h4 w4 c"]:
-        """Turn a normalised image into one token per patch."""
+        """Turn a normalized image into one token per patch."""
         return self.patch_embed["norm"](self.patch_embed["proj"](image).permute(0, 2, 3, 1))  # type: ignore[no-any-return]

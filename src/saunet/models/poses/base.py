@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from saunet.checks import ConfigError
+from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
 
 MOTION_SCALE = 0.01

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.layers.conv import channels_last_weights
+from saunet.models.layers.conv import channels_last_weights
 from saunet.models.poses.base import check_offsets, check_sources, motions_to_sources, ordered_pairs
 from saunet.registry import poses
 
@@ -21,7 +21,7 @@ class PoseCNN(nn.Module):
 
     About 1.6 M parameters and no size that it cannot take. Pairs are ordered in time as in `ResNetPose`.
 
-    Weights start from He et al.'s normal distribution, biases at zero. Nothing is normalised on the way: with PyTorch's
+    Weights start from He et al.'s normal distribution, biases at zero. Nothing is normalized on the way: with PyTorch's
     default the signal would shrink by 0.4 from layer to layer, all pairs would look alike behind the seventh, and the
     network would long learn a constant motion and little else.
 

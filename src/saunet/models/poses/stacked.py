@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.checks import ConfigError, divisible, one_of
-from saunet.layers.conv import channels_last_weights
+from saunet.errors import ConfigError, divisible, one_of
+from saunet.models.layers.conv import channels_last_weights
 from saunet.models.poses.base import check_offsets, check_sources, motions_to_sources, ordered_pairs
 
 

@@ -1,0 +1,227 @@
+"""A trained model as a folder to deploy or share: exported files, each checked against the network, and a card."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from saunet.errors import CheckpointError, ConfigError, DataError, one_of
+from saunet.exporting import exporters
+from saunet.exporting.card import model_card
+from saunet.exporting.folder import CONFIG, WEIGHTS, read_model, restored
+from saunet.exporting.parity import Parity, Run, compare, timed
+from saunet.io.atomic import replacing, write_bytes, write_json
+from saunet.io.images import network_input, read_image
+from saunet.io.progress import bar
+from saunet.models.depth import DepthNet
+from saunet.prediction.sources import image_paths
+from saunet.runs.record import ModelRecord
+
+FORMATS: tuple[str, ...] = ("onnx", "program", "compiled", "safetensors")
+"""``onnx``: for onnxruntime, TensorRT and others. ``program`` (torch.export): for torch without saunet. ``compiled``
+(AOTInductor): machine code, for torch or C++. ``safetensors``: the weights, for saunet and the hub."""
+DEFAULT_FORMATS: tuple[str, ...] = ("onnx", "program", "safetensors")
+TOLERANCE = 1e-4
+"""Largest difference to the original network that passes, as a share of the range of disparity."""
+FILES = {"onnx": "model.onnx", "program": "model.pt2", "compiled": "model.aoti.pt2", "safetensors": WEIGHTS}
+REPORT, CARD = "report.json", "README.md"
+
+_REAL_AT_MOST = 8
+_PLACES = ("root", "cache")
+"""Where the training data lay: nobody's business but the trainer's, and it says nothing about them."""
+
+
+def export_model(
+    checkpoint: str | Path,
+    output_dir: str | Path,
+    formats: Sequence[str] = DEFAULT_FORMATS,
+    *,
+    images: str | Path | Sequence[str | Path] = (),
+    batch: str = "auto",
+    evaluation: str | Path | None = None,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> list[Parity]:
+    """Export a trained model's depth network into a folder, with its config, a parity report and a model card.
+
+    Args:
+        checkpoint: A checkpoint written by ``saunet-train``, or a folder written by this function.
+        output_dir: Where the files of `FILES`, ``config.json``, ``report.json`` and ``README.md`` go.
+        formats: Which files to write; see `FORMATS`.
+        images: Real images to compare on, besides random ones: files, folders or patterns; at most eight are taken,
+            evenly.
+        batch: How many images the files take at once; see `saunet.exporting.exporters.BATCHES`.
+        evaluation: A ``metrics.json`` of ``saunet-evaluate``, or the folder that holds it; goes into the card.
+        overwrite: Replace what an earlier export left in the folder.
+        progress: Show a progress bar on a terminal.
+
+    Returns:
+        One comparison a format.
+
+    Raises:
+        ConfigError: for an unknown format, a package that is missing, a network that cannot be exported this way, or a
+            folder that holds another export.
+        CheckpointError: if the checkpoint cannot be read, or a file would differ from the original.
+        DataError: if an image or the evaluation cannot be read, or the system refuses to write.
+    """
+    for name in formats:
+        one_of("formats", name, FORMATS)
+    if not formats:
+        raise ConfigError(f"formats is empty; allowed: {', '.join(FORMATS)}")
+    one_of("batch", batch, exporters.BATCHES)
+    read = read_model(checkpoint)
+    folder = Path(output_dir)
+    if read.path.name == WEIGHTS and read.path.resolve().parent == folder.resolve():
+        raise ConfigError(f"the output folder {folder} holds the model itself; choose another")
+    metrics = read_metrics(evaluation) if evaluation is not None else None
+    splits = _splits(read.path)
+    network, pose = read.networks()
+    record = replace(read.record, data={key: value for key, value in read.record.data.items() if key not in _PLACES})
+    _check_finite(record)
+    network.eval()
+    random, real = _random(record), _real(record, images)
+    _clear(folder, overwrite)
+    eager, span = exporters.run_eager(network), 1 / record.min_depth - 1 / record.max_depth
+    reports, runs = list[Parity](), list[Run]()
+    with bar(progress) as shown:
+        task = shown.add_task("exporting", total=len(dict.fromkeys(formats)))
+        for name in dict.fromkeys(formats):
+            path = folder / FILES[name]
+            with replacing(path) as temporary:
+                takes = "any"
+                if name == "safetensors":
+                    parts = {"depth": network} if pose is None else {"depth": network, "pose": pose}
+                    exporters.write_safetensors(_state(parts), temporary)
+                else:
+                    takes = _EXPORTERS[name](network, record, temporary, batch)
+                size = temporary.stat().st_size / 2**20
+                run = _RUNNERS[name](temporary, record)
+                report = compare(path.name, eager, run, random, real, span, takes, size)
+                if math.isnan(report.difference):
+                    raise CheckpointError(
+                        f"the exported {path.name} gives NaN where the network gives disparity, so it is not written; "
+                        "report encoder and decoder"
+                    )
+                if not report.difference <= TOLERANCE:
+                    raise CheckpointError(
+                        f"the exported {path.name} differs from the network by {report.difference:.2g} of the "
+                        f"disparity range, more than {TOLERANCE:g}, so it is not written; report encoder and decoder"
+                    )
+            reports.append(report)
+            runs.append(run)
+            shown.advance(task)
+    reports = timed(reports, eager, runs, random[0])
+    about = {"threads": torch.get_num_threads(), "machine": platform.machine(), "versions": _versions()}
+    content = {"tolerance": TOLERANCE, **about, "files": [asdict(report) for report in reports]}
+    write_json(folder / REPORT, content)
+    write_bytes(folder / CARD, model_card(record, reports, metrics, splits).encode())
+    write_json(folder / CONFIG, record.to_plain())  # last: with it, the folder is a model
+    return reports
+
+
+def read_metrics(path: str | Path) -> Mapping[str, Any]:
+    """Read the ``metrics.json`` of an evaluation.
+
+    Raises:
+        DataError: if it is missing or is not one.
+    """
+    path = Path(path)
+    path = path / "metrics.json" if path.is_dir() else path
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if [row for row in content["results"] if not isinstance(row["predictor"], str)]:
+            raise ValueError("a row without predictor")
+    except OSError as reason:
+        raise DataError(f"cannot read {path}: {reason.strerror}; give the folder of a saunet-evaluate run") from reason
+    except (ValueError, TypeError, KeyError) as reason:
+        raise DataError(f"{path} is not an evaluation ({reason}); give the metrics.json of saunet-evaluate") from reason
+    return content  # type: ignore[no-any-return]
+
+
+def _splits(checkpoint: Path) -> Mapping[str, str]:
+    """Return the fingerprints of the frames that a model was trained on, where its run's folder still has them."""
+    path = checkpoint.parent.parent / "run.json"
+    if not path.is_file():
+        return {}
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")).get("splits") or {})
+    except (OSError, ValueError, AttributeError, TypeError) as reason:
+        raise DataError(f"{path} cannot be read ({reason}); it belongs to the run, or move the checkpoint") from reason
+
+
+def _clear(folder: Path, overwrite: bool) -> None:
+    """Remove an earlier export, its config first: what is left of it must not be taken for the new model."""
+    names = (CONFIG, *FILES.values(), REPORT, CARD)
+    present = [name for name in names if (folder / name).exists()]
+    if present and not overwrite:
+        raise ConfigError(f"{folder} holds {present[0]} already; choose another output folder, or set overwrite=true")
+    for name in present:
+        try:
+            (folder / name).unlink()
+        except OSError as reason:
+            raise DataError(f"cannot replace {folder / name}: {reason.strerror or reason}") from reason
+
+
+def _check_finite(record: ModelRecord) -> None:
+    """Check that ``config.json`` can hold the record, before anything is written.
+
+    Raises:
+        ConfigError: if a number in it is NaN or infinite.
+    """
+    try:
+        json.dumps(record.to_plain(), allow_nan=False)
+    except ValueError as reason:
+        raise ConfigError(f"{CONFIG} cannot hold the model's settings ({reason}); give finite numbers") from reason
+
+
+def _random(record: ModelRecord) -> list[NDArray[np.float32]]:
+    images = np.random.default_rng(0).random((2, 1, 3, record.height, record.width), dtype=np.float32)
+    return list(images)
+
+
+def _real(record: ModelRecord, images: str | Path | Sequence[str | Path]) -> list[NDArray[np.float32]]:
+    several = [images] if isinstance(images, str | Path) else list(images)
+    paths = [path for item in several for path in image_paths(item)]
+    chosen = [paths[index] for index in np.linspace(0, len(paths) - 1, min(len(paths), _REAL_AT_MOST)).astype(int)]
+    return [network_input(read_image(path), record.height, record.width)[None] for path in chosen]
+
+
+def _state(parts: Mapping[str, torch.nn.Module]) -> dict[str, torch.Tensor]:
+    return {f"{part}.{name}": value for part, module in parts.items() for name, value in module.state_dict().items()}
+
+
+def _run_weights(path: Path, record: ModelRecord) -> Run:
+    return exporters.run_eager(restored(path, record).networks()[0].eval())
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for package in ("saunet", "torch", "onnx", "onnxruntime", "onnxscript", "safetensors"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+_EXPORTERS: dict[str, Callable[[DepthNet, ModelRecord, Path, str], str]] = {
+    "onnx": exporters.export_onnx,
+    "program": exporters.export_program,
+    "compiled": exporters.export_compiled,
+}
+_RUNNERS: dict[str, Callable[[Path, ModelRecord], Run]] = {
+    "onnx": lambda path, record: exporters.run_onnx(path),
+    "program": lambda path, record: exporters.run_program(path),
+    "compiled": lambda path, record: exporters.run_compiled(path),
+    "safetensors": _run_weights,
+}

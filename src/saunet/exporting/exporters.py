@@ -1,0 +1,212 @@
+"""A depth network written as one file: ONNX, a torch.export program, an AOTInductor package, or plain weights."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import json
+import logging
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch._dynamo.exc import UserError
+from torch.nn.attention import SDPBackend, sdpa_kernel
+
+from saunet.errors import ConfigError, one_of
+from saunet.exporting.onnx import INPUT, METADATA, OUTPUT, open_session
+from saunet.exporting.parity import Run
+from saunet.models.depth import DepthNet
+from saunet.runs.record import ModelRecord
+
+BATCHES: tuple[str, ...] = ("auto", "any", "one")
+"""``any``: any number of images at once. ``one``: exactly one. ``auto``: any where the network allows it, else one."""
+Batch = Literal["any", "one"]
+
+_LARGEST_BATCH = 256
+_TRACING_ERRORS = (UserError, RuntimeError, ValueError)
+
+
+class FinestDisparity(nn.Module):
+    """A depth network that returns only its full-resolution disparity: what is exported.
+
+    Args:
+        network: The depth network.
+    """
+
+    def __init__(self, network: DepthNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Return disparity in 1/meter (up to scale) of RGB in [0, 1]."""
+        return self.network(image).disparity[0]  # type: ignore[no-any-return]
+
+
+def export_onnx(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> Batch:
+    """Write a depth network as ONNX, with its record inside, so that one file is enough to predict from.
+
+    Args:
+        network: The network.
+        record: Its record; gives the input size and goes into the file.
+        path: The file to write.
+        batch: How many images it takes at once; see `BATCHES`.
+
+    Returns:
+        How many images the file takes at once.
+
+    Raises:
+        ConfigError: if the packages are missing, or the network cannot be exported this way.
+    """
+    for package in ("onnx", "onnxscript"):
+        if importlib.util.find_spec(package) is None:
+            raise ConfigError(f"ONNX export needs the package {package}; run: pip install 'saunet[export]'")
+    # Attention in its plain form: what the fused kernel returns has strides that the exporter's own run of it has not.
+    with sdpa_kernel(SDPBackend.MATH):
+        program, takes = _program(network, record, batch)
+    try:
+        with _quiet():
+            exported: Any = torch.onnx.export(
+                program, input_names=[INPUT], output_names=[OUTPUT], dynamo=True, verbose=False
+            )
+    except torch.onnx.OnnxExporterError as reason:
+        names = f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
+        raise ConfigError(f"{names} cannot be exported to ONNX; export the format 'program'") from reason
+    exported.model.metadata_props[METADATA] = json.dumps(record.to_plain())
+    exported.save(str(path))
+    return takes
+
+
+def export_program(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> Batch:
+    """Write a depth network as a torch.export program: ``torch.export.load(path).module()(image)`` needs no saunet.
+
+    See `export_onnx` for the arguments.
+
+    Raises:
+        ConfigError: if the network cannot be exported this way.
+    """
+    program, takes = _program(network, record, batch)
+    content = io.BytesIO()  # torch's own writer, on a full disk, cannot even be closed and ends the process
+    torch.export.save(program, content, extra_files={METADATA: json.dumps(record.to_plain())})
+    Path(path).write_bytes(content.getbuffer())
+    return takes
+
+
+def export_compiled(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> Batch:
+    """Write a depth network as an AOTInductor package: machine code for this kind of processor, minutes to make.
+
+    ``torch._inductor.aoti_load_package(path)(image)`` runs it, and so does C++ with libtorch, without Python. See
+    `export_onnx` for the arguments.
+
+    Raises:
+        ConfigError: if there is no C++ compiler, or the network cannot be compiled this way.
+    """
+    if shutil.which("g++") is None and shutil.which("clang++") is None and shutil.which("cl") is None:
+        raise ConfigError("the format 'compiled' needs a C++ compiler and found none; install g++, or leave it out")
+    program, takes = _program(network, record, batch)
+    content = io.BytesIO()
+    try:
+        with torch.no_grad():
+            torch._inductor.aoti_compile_and_package(program, package_path=content)
+    except RuntimeError as reason:
+        raise ConfigError(f"compiling failed: {str(reason).strip().splitlines()[0]}; export 'program'") from reason
+    Path(path).write_bytes(content.getbuffer())
+    return takes
+
+
+def write_safetensors(state: dict[str, Tensor], path: str | Path) -> None:
+    """Write named tensors as safetensors.
+
+    Raises:
+        ConfigError: if the package is missing.
+    """
+    try:
+        from safetensors.torch import save
+    except ImportError as missing:
+        raise ConfigError("safetensors needs the package safetensors; run: pip install 'saunet[export]'") from missing
+    plain = {name: value.detach().cpu().contiguous() for name, value in state.items()}
+    Path(path).write_bytes(save(plain, {"format": "pt"}))  # save_file would let its owner alone read the file
+
+
+def run_eager(network: DepthNet) -> Run:
+    """Return the network as a function of arrays."""
+
+    def run(image: NDArray[np.float32]) -> NDArray[np.float32]:
+        with torch.inference_mode():
+            return network(torch.from_numpy(image)).disparity[0].numpy()  # type: ignore[no-any-return]
+
+    return run
+
+
+def run_onnx(path: Path) -> Run:
+    """Return an ONNX file as a function of arrays, with as many threads as torch uses.
+
+    They do not spin, else they would hold the cores while the network that it is compared with is timed.
+    """
+    session = open_session(path, threads=torch.get_num_threads(), spinning=False)
+    return lambda image: session.run([OUTPUT], {INPUT: image})[0]
+
+
+def run_program(path: Path) -> Run:
+    """Return a torch.export program as a function of arrays."""
+    return _run_module(torch.export.load(path).module())
+
+
+def run_compiled(path: Path) -> Run:
+    """Return an AOTInductor package as a function of arrays."""
+    return _run_module(torch._inductor.aoti_load_package(str(path)))
+
+
+def _run_module(module: Callable[[Tensor], Tensor]) -> Run:
+    def run(image: NDArray[np.float32]) -> NDArray[np.float32]:
+        with torch.no_grad():
+            return module(torch.from_numpy(image)).numpy()
+
+    return run
+
+
+def _program(network: DepthNet, record: ModelRecord, batch: str) -> tuple[torch.export.ExportedProgram, Batch]:
+    one_of("batch", batch, BATCHES)
+    module = FinestDisparity(network).eval()
+    names = f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
+    if batch != "one":
+        try:
+            return _trace(module, torch.zeros(2, 3, record.height, record.width), dynamic=True), "any"
+        except _TRACING_ERRORS as reason:
+            if batch == "any":
+                raise ConfigError(
+                    f"{names} fixes its batch size when it is exported; export with batch=one"
+                ) from reason
+    try:
+        return _trace(module, torch.zeros(1, 3, record.height, record.width), dynamic=False), "one"
+    except _TRACING_ERRORS as reason:
+        raise ConfigError(f"{names} cannot be exported: {str(reason).splitlines()[0]}") from reason
+
+
+def _trace(module: nn.Module, image: Tensor, dynamic: bool) -> torch.export.ExportedProgram:
+    shapes = {"image": {0: torch.export.Dim("batch", min=1, max=_LARGEST_BATCH)}} if dynamic else None
+    with torch.no_grad(), _quiet():
+        program: torch.export.ExportedProgram = torch.export.export(module, (image,), dynamic_shapes=shapes)
+        # decomposing into nothing new inlines autocast regions, which cannot be saved
+        return program.run_decompositions({})  # type: ignore[no-any-return]
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence the exporter's notes about packages that saunet does not use."""
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

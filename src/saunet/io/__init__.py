@@ -1,0 +1,1 @@
+"""Files read and written: images, video, camera paths, atomic files, color maps."""

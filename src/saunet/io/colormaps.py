@@ -1,0 +1,103 @@
+"""Numbers as pictures: disparity in colors, errors in colors, and depth as KITTI's 16-bit PNG."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Shaped, UInt8, UInt16
+
+from saunet.errors import ConfigError, in_range, one_of
+
+COLORMAPS: tuple[str, ...] = ("magma", "inferno", "viridis", "turbo", "gray")
+"""Names of the color maps."""
+
+_MAPS = {
+    "magma": cv2.COLORMAP_MAGMA,
+    "inferno": cv2.COLORMAP_INFERNO,
+    "viridis": cv2.COLORMAP_VIRIDIS,
+    "turbo": cv2.COLORMAP_TURBO,
+}
+_DEPTH_STEPS_PER_METRE = 256
+
+
+def value_range(values: Float[np.ndarray, "..."], low: float = 0.5, high: float = 98.0) -> tuple[float, float]:
+    """Return the percentiles ``low`` and ``high`` of the finite values: a range that a few outliers cannot stretch.
+
+    Returns:
+        Two different numbers, also for a constant map; (0, 1) where nothing is finite.
+    """
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return 0.0, 1.0
+    bottom, top = (float(value) for value in np.percentile(finite, [low, high]))
+    return (bottom, top) if top > bottom else (bottom, bottom + max(abs(bottom), 1.0) * 1e-3)
+
+
+class RunningRange:
+    """Color limits that follow a clip slowly: an exponential mean of each frame's range.
+
+    Args:
+        memory: Weight of the past in [0, 1); 0 takes each frame's own range.
+    """
+
+    def __init__(self, memory: float = 0.95) -> None:
+        self.memory = in_range("memory", memory, 0.0, 0.999999)
+        self._limits: tuple[float, float] | None = None
+
+    def update(self, values: Float[np.ndarray, "h w"]) -> tuple[float, float]:
+        """Return the limits after seeing one more frame; the first frame sets them."""
+        low, high = value_range(values)
+        if self._limits is not None:
+            low = self.memory * self._limits[0] + (1 - self.memory) * low
+            high = self.memory * self._limits[1] + (1 - self.memory) * high
+        self._limits = (low, high)
+        return self._limits
+
+
+def colorize(
+    values: Float[np.ndarray, "h w"],
+    limits: tuple[float, float] | None = None,
+    colormap: str = "magma",
+    mask: Bool[np.ndarray, "h w"] | None = None,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Paint a map of numbers; disparity comes out bright where it is near.
+
+    Args:
+        values: What to paint. Values that are not finite come out black.
+        limits: Values of the darkest and the brightest color; the map's own `value_range` by default.
+        colormap: Color map.
+        mask: Where given, everything outside comes out black.
+
+    Raises:
+        ConfigError: if the limits are not ascending or the colormap is unknown.
+    """
+    one_of("colormap", colormap, COLORMAPS)
+    shown = np.isfinite(values) if mask is None else np.isfinite(values) & mask
+    if limits is None:
+        limits = value_range(values[shown])
+    low, high = limits
+    if not low < high:
+        raise ConfigError(f"color limits are {low} to {high}; the first must be below the second")
+    filled = np.where(shown, values, low)
+    levels = np.round(np.clip((filled - low) / (high - low), 0, 1) * 255).astype(np.uint8)
+    if colormap == "gray":
+        painted = cv2.cvtColor(levels, cv2.COLOR_GRAY2RGB)
+    else:
+        painted = cv2.cvtColor(cv2.applyColorMap(levels, _MAPS[colormap]), cv2.COLOR_BGR2RGB)
+    painted[~shown] = 0
+    return painted
+
+
+def depth_to_png16(depth: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
+    """Return depth as 16-bit integers, meters x 256, KITTI's format: 0 means unknown, 65535 is 255.996 m or more.
+
+    A valid depth never becomes 0; values that are not finite or not positive do.
+    """
+    valid = np.isfinite(depth) & (depth > 0)
+    steps = np.round(np.where(valid, depth, 0).astype(np.float64) * _DEPTH_STEPS_PER_METRE)
+    return np.where(valid, np.clip(steps, 1, 65535), 0).astype(np.uint16)
+
+
+def png16_to_depth(values: Shaped[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Return depth in meters from KITTI's 16-bit integers, 0 where unknown."""
+    return values.astype(np.float32) / np.float32(_DEPTH_STEPS_PER_METRE)

@@ -1,0 +1,191 @@
+"""Images from and to disk, for training and prediction alike.
+
+Whatever a camera or a user hands over becomes RGB bytes, a broken file is named and never passed on, and files are
+written whole. There is one reader and one resize, so that a model sees in use what it saw in training.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Shaped, UInt8
+from numpy.typing import NDArray
+
+from saunet.errors import DataError, UnreadableError, one_of
+from saunet.io.atomic import write_bytes
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
+"""File name endings that are taken for images when a folder is read."""
+
+
+def natural_order(name: str | Path) -> tuple[list[tuple[int, int, str]], str]:
+    """Return the key that sorts names of files by the numbers in them: ``frame_2`` before ``frame_10``."""
+    text = str(name)
+    parts = [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", text)]
+    return parts, text  # frame_1 and frame_01 are equal as numbers
+
+
+def read_bytes(path: str | Path) -> UInt8[np.ndarray, " n"]:
+    """Return the content of a file that should not be empty.
+
+    Raises:
+        DataError: if it is missing, a folder, empty or not readable.
+    """
+    path = Path(path)
+    try:
+        data = np.fromfile(path, np.uint8)  # also for images: imread cannot open every unicode path on every system
+    except FileNotFoundError as reason:
+        raise DataError(f"no file at {path}; check the path or copy the file again") from reason
+    except IsADirectoryError as reason:
+        raise DataError(f"{path} is a folder where a file is needed") from reason
+    except OSError as reason:
+        raise UnreadableError(f"cannot read {path}: {reason.strerror or reason}") from reason
+    if data.size == 0:
+        raise UnreadableError(f"{path} is empty (0 bytes); copy the file again")
+    return data
+
+
+def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
+    """Read an image file as RGB bytes.
+
+    Gray images get three equal channels, 16-bit ones are scaled so that white stays white, transparency is dropped,
+    and the camera's EXIF rotation is applied.
+
+    Raises:
+        DataError: naming the file, if it is missing, empty, truncated, broken or not an image.
+    """
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    return as_rgb_bytes(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), str(path))
+
+
+def read_depth(path: str | Path) -> Float32[np.ndarray, "h w"]:
+    """Return a depth map stored as KITTI does: 16-bit PNG, 256 a meter, 0 where unknown.
+
+    Raises:
+        DataError: if it is missing, broken or not a 16-bit image.
+    """
+    stored = _decode(path, cv2.IMREAD_UNCHANGED)
+    if stored.dtype != np.uint16 or stored.ndim != 2:
+        raise DataError(
+            f"{path} holds {stored.dtype} of shape {stored.shape}; a depth map is one channel of 16-bit numbers"
+        )
+    return np.asarray(stored / np.float32(256), dtype=np.float32)
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """Return (height, width) of an image as `read_image` gives it; a PNG is not decoded for that, unless it is turned.
+
+    Raises:
+        DataError: if it is missing, empty or not an image.
+    """
+    data = read_bytes(path).tobytes()
+    # A PNG's EXIF rotation may stand before or after the picture.
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and data[12:16] == b"IHDR" and len(data) >= 24 and b"eXIf" not in data:
+        return int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
+    shape = _decode(path, cv2.IMREAD_GRAYSCALE).shape
+    return shape[0], shape[1]
+
+
+def as_rgb_bytes(image: Shaped[np.ndarray, "..."], name: str = "the image") -> UInt8[np.ndarray, "h w 3"]:
+    """Return an image array as h x w x 3 bytes: gray is repeated, a fourth channel dropped, 16 bits scaled down.
+
+    Raises:
+        DataError: for another shape, an empty image, or numbers that are neither 8 nor 16 bits.
+    """
+    if image.ndim == 2:
+        image = image[:, :, None]
+    if image.ndim != 3 or image.shape[2] not in (1, 3, 4) or image.size == 0:
+        raise DataError(f"{name} has shape {image.shape}; it must be h x w, h x w x 1, h x w x 3 (RGB) or h x w x 4")
+    image = image[:, :, :3] if image.shape[2] > 1 else np.repeat(image, 3, axis=2)
+    if image.dtype == np.uint16:
+        image = np.round(image / 257.0).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise DataError(
+            f"{name} has numbers of type {image.dtype}; it must be 8-bit or 16-bit unsigned (0 to 255 or 65535)"
+        )
+    return np.ascontiguousarray(image)
+
+
+def resize(array: NDArray[Any], height: int, width: int) -> NDArray[Any]:
+    """Resize h x w or h x w x c, averaging areas when it shrinks and interpolating linearly when it grows.
+
+    Pixel u moves to (u + 0.5) * s - 0.5. An array that has the size already is returned itself.
+
+    Args:
+        array: h x w or h x w x c, of a type that OpenCV resizes.
+        height: New height.
+        width: New width.
+    """
+    if array.shape[:2] == (height, width):
+        return array
+    shrinks = height <= array.shape[0] and width <= array.shape[1]
+    return cv2.resize(array, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+
+
+def network_input(
+    image: UInt8[np.ndarray, "_ _ 3"], height: int, width: int
+) -> Float32[np.ndarray, "3 {height} {width}"]:
+    """Resize an RGB image to a network's input size and return it as channels of floats in [0, 1]."""
+    resized = resize(image, height, width).astype(np.float32)
+    return np.ascontiguousarray(resized.transpose(2, 0, 1) / np.float32(255))
+
+
+def encode_jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int = 95) -> bytes:
+    """Return an RGB image as the bytes of a JPEG file; quality 1 to 100."""
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done, "an image in memory of a size that JPEG holds"
+    return bytes(data.tobytes())
+
+
+def write_image(path: str | Path, image: Shaped[np.ndarray, "..."]) -> None:
+    """Write RGB or gray bytes, or 16-bit gray, in the format of the path's suffix, whole or not at all.
+
+    Raises:
+        ConfigError: if the suffix is not that of an image format.
+        DataError: if the format cannot hold the numbers or the system refuses to write.
+    """
+    path = Path(path)
+    one_of(f"the suffix of {path.name}", path.suffix.lower(), sorted(IMAGE_SUFFIXES))
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    try:
+        done, data = cv2.imencode(path.suffix.lower(), bgr)
+    except cv2.error as reason:
+        raise DataError(f"cannot encode {path}: {str(reason).strip().splitlines()[-1]}") from reason
+    if not done:
+        raise DataError(f"cannot encode {path}: {path.suffix} does not hold {image.dtype} of shape {image.shape}")
+    write_bytes(path, data.tobytes())
+
+
+def _decode(path: str | Path, flags: int) -> NDArray[Any]:
+    """Read and decode an image file with OpenCV's flags, refusing what is not whole."""
+    data = read_bytes(path)
+    if not _complete(data.tobytes()):
+        raise UnreadableError(
+            f"{path} is truncated ({data.size} bytes, the end of the image is missing); copy it again"
+        )
+    try:
+        image = cv2.imdecode(data, flags)
+    except cv2.error as reason:
+        raise UnreadableError(f"{path} cannot be decoded: {str(reason).strip().splitlines()[-1]}") from reason
+    if image is None:
+        raise UnreadableError(
+            f"{path} is not an image that OpenCV can read, or is damaged ({data.size} bytes); "
+            "copy it again or convert it to PNG or JPEG"
+        )
+    return np.asarray(image)
+
+
+def _complete(data: bytes) -> bool:
+    """Return False for a PNG or JPEG whose end is missing; decoders paint the rest gray, some without a word.
+
+    The end is looked for from behind and anywhere: cameras and editors append data of their own after it.
+    """
+    if data.startswith(b"\x89PNG"):
+        return data.rfind(b"IEND") >= 0
+    if data.startswith(b"\xff\xd8"):
+        return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
+    return True

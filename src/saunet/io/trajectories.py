@@ -1,0 +1,93 @@
+"""The one reader and writer of trajectories, in the two formats that other tools read: KITTI's pose files and TUM's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from saunet.errors import DataError
+from saunet.io.atomic import write_bytes
+
+
+def write_kitti(path: Path, T_world_cam: Float64[ndarray, "n 4 4"]) -> None:
+    """Write a trajectory as KITTI does: a line a frame, the upper 3 x 4 of the camera-to-world matrix row by row.
+
+    Raises:
+        DataError: if the file cannot be written.
+    """
+    _write(path, T_world_cam[:, :3].reshape(-1, 12))
+
+
+def write_tum(path: Path, T_world_cam: Float64[ndarray, "n 4 4"], times: Float64[ndarray, " t"]) -> None:
+    """Write a trajectory as TUM does: ``time x y z qx qy qz qw`` a line.
+
+    Args:
+        path: The file.
+        T_world_cam: Camera-to-world poses.
+        times: Seconds.
+
+    Raises:
+        DataError: if there is not one time a pose, or the file cannot be written.
+    """
+    if len(times) != len(T_world_cam):
+        raise DataError(f"{len(T_world_cam)} poses come with {len(times)} times; give one for each")
+    quaternions = Rotation.from_matrix(T_world_cam[:, :3, :3]).as_quat()
+    _write(path, np.column_stack((times, T_world_cam[:, :3, 3], quaternions)))
+
+
+def read_kitti(path: Path) -> Float64[ndarray, "n 4 4"]:
+    """Read camera-to-world poses from a KITTI pose file.
+
+    Raises:
+        DataError: if the file is missing, holds no pose, or a line is not twelve numbers; names the line.
+    """
+    table = _read(path, 12, "a 3 x 4 pose, row by row")
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3] = table.reshape(-1, 3, 4)
+    return poses
+
+
+def read_tum(path: Path) -> tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, " n"]]:
+    """Read camera-to-world poses and their times from a TUM trajectory.
+
+    Raises:
+        DataError: if the file is missing, holds no pose, or a line is not eight numbers with a proper quaternion.
+    """
+    table = _read(path, 8, "time x y z qx qy qz qw", comments=True)
+    if not np.linalg.norm(table[:, 4:], axis=1).all():
+        raise DataError(f"{path} holds a quaternion of length 0; each must be a rotation")
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
+    poses[:, :3, 3] = table[:, 1:4]
+    return poses, table[:, 0]
+
+
+def _write(path: Path, table: Float64[ndarray, "n k"]) -> None:
+    lines = (" ".join(f"{value:.17g}" for value in row) for row in table)
+    write_bytes(path, ("\n".join(lines) + "\n").encode())
+
+
+def _read(path: Path, columns: int, meaning: str, comments: bool = False) -> Float64[ndarray, "n k"]:
+    expected = f"{columns} finite numbers ({meaning})"
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"cannot read {path} as text ({error}); expected lines of {expected}") from error
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or (comments and line.startswith("#")):
+            continue
+        try:
+            row = [float(word) for word in line.split()]
+        except ValueError:
+            row = []
+        if len(row) != columns or not np.isfinite(row).all():
+            raise DataError(f"{path}, line {number}: expected {expected}, got '{line.strip()[:60]}'")
+        rows.append(row)
+    if not rows:
+        raise DataError(f"{path} holds no pose; expected lines of {expected}; copy the file again")
+    return np.array(rows, dtype=np.float64)

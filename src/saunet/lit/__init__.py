@@ -1,1 +1,0 @@
-"""Training: the LightningModule, its optimiser recipe and callbacks."""

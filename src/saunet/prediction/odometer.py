@@ -1,0 +1,179 @@
+"""The path of a camera from a pose network: each motion between neighboring frames predicted once, then chained."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64, UInt8
+from torch import Tensor, nn
+
+from saunet.errors import CheckpointError, ConfigError, DataError, positive
+from saunet.exporting.folder import read_model
+from saunet.io.images import network_input
+from saunet.io.progress import bar
+from saunet.metrics.odometry import chain_motions
+from saunet.runs.record import Scale
+
+
+class Odometer:
+    """Follows the camera through a clip, frame by frame; memory does not grow but by one pose a frame.
+
+    A network that sees both neighbors gives two motions at once, so it is asked at every second frame only.
+
+    Args:
+        pose: A pose network, which knows the offsets of its sources.
+        height: Height of its input in pixels.
+        width: Width of its input in pixels.
+        scale: Factor to meters; None leaves the trajectory in the unknown unit of the depth.
+        device: Where to run.
+        batch_size: Frames that the network is asked at together.
+
+    Raises:
+        ConfigError: if the network was not trained on neighboring frames.
+    """
+
+    def __init__(
+        self,
+        pose: nn.Module,
+        height: int,
+        width: int,
+        scale: Scale | None = None,
+        device: str | torch.device = "cpu",
+        batch_size: int = 1,
+    ) -> None:
+        positive("batch_size", batch_size)
+        self._offsets: tuple[int, ...] = tuple(pose.offsets)  # type: ignore[arg-type]
+        if not {-1, 1} & set(self._offsets):
+            raise ConfigError(
+                f"the pose network was trained on offsets {list(self._offsets)}; a path needs the motion between "
+                "neighboring frames, so use a model trained with offset 1 or -1"
+            )
+        self.scale = scale
+        self._pose, self._size, self._device = pose.to(device).eval(), (height, width), torch.device(device)
+        self._batch_size = batch_size
+        self._reach = max(abs(offset) for offset in self._offsets)
+        self._stride = 2 if {-1, 1} <= set(self._offsets) else 1
+        self._next = 1 if -1 in self._offsets else 0  # the first frame that has a neighbor on the side we look at
+        self._count = 0
+        self._images: dict[int, Tensor] = {}
+        self._waiting: list[int] = []
+        self._motions: dict[int, Float64[np.ndarray, "4 4"]] = {}  # frame i -> T_next_cam
+
+    @classmethod
+    def from_model(
+        cls, path: str | Path, scale: Scale | None = None, device: str = "cpu", batch_size: int = 1
+    ) -> Odometer:
+        """Load the pose network of a checkpoint or exported folder; nothing in it is run.
+
+        Args:
+            path: The checkpoint or folder.
+            scale: Factor to meters; the model's own by default.
+            device: Where to run.
+            batch_size: Frames that the network is asked at together.
+
+        Raises:
+            ConfigError: if it has none, or the network was not trained on neighboring frames.
+            CheckpointError: if it cannot be read.
+        """
+        if Path(path).suffix.lower() == ".onnx":
+            raise ConfigError(f"{path} has no pose network, which a path needs; give the checkpoint")
+        model = read_model(path)
+        pose = model.networks()[1]
+        if pose is None:
+            raise ConfigError(
+                f"{path} has no pose network (it was trained on stereo pairs), which a path needs; give a model "
+                "trained on video, or ask for no trajectory"
+            )
+        return cls(pose, model.record.height, model.record.width, scale or model.record.scale, device, batch_size)
+
+    def restart(self) -> Odometer:
+        """Return an odometer with the same network that stands before the first frame of another clip."""
+        return Odometer(self._pose, *self._size, self.scale, self._device, self._batch_size)
+
+    def add(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Take the next frame."""
+        self._images[self._count] = torch.from_numpy(network_input(image, *self._size)).to(self._device)
+        self._count += 1
+        while self._next + self._reach < self._count:
+            self._ask_at(self._next)
+            self._next += self._stride
+
+    def trajectory(self) -> Float64[np.ndarray, "n 4 4"]:
+        """Return the camera-to-world pose of every frame so far; the world is the first camera.
+
+        Raises:
+            DataError: if there are fewer than two frames.
+            CheckpointError: if the network's output is not finite.
+        """
+        if self._count < 2:
+            raise DataError(f"a path needs at least 2 frames, got {self._count}")
+        last = self._count - 1
+        for center in range(self._next, last + (1 not in self._offsets), self._stride):
+            self._ask_at(center)
+        self._answer()
+        if last - 1 not in self._motions:  # both neighbors are asked for in pairs; this motion has no partner
+            self._ask_at(last - 1)
+            self._answer()
+        motions = np.stack([self._motions[index] for index in range(last)])
+        if not np.isfinite(motions).all():
+            raise CheckpointError("the pose network's output is not finite; the weights are damaged")
+        motions[:, :3, 3] *= self.scale.factor if self.scale else 1.0
+        return chain_motions(motions)
+
+    def _ask_at(self, center: int) -> None:
+        self._waiting.append(center)
+        if len(self._waiting) == self._batch_size:
+            self._answer()
+
+    @torch.inference_mode()
+    def _answer(self) -> None:
+        """Ask the network at the waiting frames; sources beyond the ends of the clip stop at its ends."""
+        if not self._waiting:
+            return
+        last = self._count - 1
+        near = [[min(max(center + offset, 0), last) for offset in self._offsets] for center in self._waiting]
+        target = torch.stack([self._images[center] for center in self._waiting])
+        sources = torch.stack([torch.stack([self._images[index] for index in row]) for row in near])
+        # as Python numbers: an array of torch's would hold on to its memory for the whole clip
+        answers = np.array(self._pose(target, sources).tolist(), dtype=np.float64)
+        for center, row in zip(self._waiting, answers, strict=True):
+            for offset, T_src_tgt in zip(self._offsets, row, strict=True):
+                if offset == 1 and center < last:
+                    self._motions[center] = T_src_tgt
+                elif offset == -1 and center > 0:
+                    self._motions[center - 1] = np.linalg.inv(T_src_tgt)
+        self._waiting.clear()
+        oldest = self._count - 2 - 2 * self._reach
+        self._images = {index: image for index, image in self._images.items() if index > oldest}
+
+
+def follow(odometer: Odometer, drive: Any, progress: bool = True) -> Float64[np.ndarray, "n 4 4"]:
+    """Follow the camera through all frames of a recording.
+
+    Args:
+        odometer: The network; it may have followed other recordings before.
+        drive: A `saunet.data.drive.Drive`.
+        progress: Show a progress bar on a terminal or in a notebook.
+
+    Returns:
+        ``T_world_cam`` of each frame; the world is the first camera.
+
+    Raises:
+        DataError: if there are fewer than two frames, or some are missing in between.
+        CheckpointError: if the network's output is not finite.
+    """
+    numbers = list(drive.indices)
+    gaps = [a for a, b in itertools.pairwise(numbers) if b != a + 1]
+    if gaps:
+        raise DataError(f"'{drive.name}' has no frame {gaps[0] + 1}; a path needs all frames from first to last")
+    odometer = odometer.restart()
+    with bar(progress, "images", taken=True) as shown:
+        task = shown.add_task(drive.name, total=len(numbers))
+        for number in numbers:
+            odometer.add(drive.image(number))
+            shown.advance(task)
+    return odometer.trajectory()

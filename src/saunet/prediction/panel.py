@@ -1,0 +1,124 @@
+"""Pictures side by side with their names: what the demo, the training log and reports show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from saunet.errors import ConfigError, positive
+from saunet.io.colormaps import colorize, value_range
+from saunet.io.images import resize
+
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_INK, _PAPER = (245, 245, 245), (24, 24, 24)
+
+
+def panel(
+    tiles: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], columns: int = 1, tile_width: int = 640, gap: int = 4
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Arrange named RGB pictures in a grid, row by row, each under its name.
+
+    Args:
+        tiles: Pictures by name. All are scaled to ``tile_width`` and to the aspect ratio of the first.
+        columns: Pictures a row.
+        tile_width: Width of each picture in pixels.
+        gap: Pixels between pictures.
+
+    Raises:
+        ConfigError: if there is no picture or a size is not positive.
+    """
+    if not tiles:
+        raise ConfigError("a panel needs at least one picture, got none")
+    positive("columns", columns)
+    positive("tile_width", tile_width)
+    first = next(iter(tiles.values()))
+    height = max(1, round(tile_width * first.shape[0] / first.shape[1]))
+    strip = label_height(tile_width)
+    rows = math.ceil(len(tiles) / columns)
+    columns = min(columns, len(tiles))
+    canvas = np.full(
+        (rows * (height + strip) + (rows + 1) * gap, columns * tile_width + (columns + 1) * gap, 3), _PAPER, np.uint8
+    )
+    for index, (name, picture) in enumerate(tiles.items()):
+        row, column = divmod(index, columns)
+        top, left = gap + row * (height + strip + gap), gap + column * (tile_width + gap)
+        canvas[top : top + strip, left : left + tile_width] = label(name, tile_width)
+        canvas[top + strip : top + strip + height, left : left + tile_width] = fit(picture, height, tile_width)
+    return canvas
+
+
+def depth_panel(
+    image: UInt8[np.ndarray, "h w 3"],
+    disparity: Float[np.ndarray, "hd wd"],
+    truth: Float[np.ndarray, "hg wg"] | None = None,
+    *,
+    columns: int = 1,
+    tile_width: int = 640,
+    colormap: str = "magma",
+    note: str = "",
+) -> UInt8[np.ndarray, "hp wp 3"]:
+    """Show an image, its disparity, and, where the true depth is known, the truth and the relative error.
+
+    The prediction is scaled to the truth by the ratio of medians before the comparison, as in evaluation, and both are
+    painted with the truth's colors.
+
+    Args:
+        image: RGB.
+        disparity: Prediction, at the image's size or another.
+        truth: Depth in meters, 0 where unknown; sparse LiDAR points are drawn larger than they are.
+        columns: Pictures a row.
+        tile_width: Width of each picture in pixels.
+        colormap: Color map of disparity.
+        note: Added to the prediction's name.
+    """
+    height, width = image.shape[:2]
+    tiles = {"input": image}
+    shown = resize(np.asarray(disparity, dtype=np.float32), height, width)
+    name = f"disparity{' ' + note if note else ''}"
+    if truth is None or not (truth > 0).any():
+        tiles[name] = colorize(shown, colormap=colormap)
+        return panel(tiles, columns, tile_width)
+    known = truth > 0
+    true_disparity = np.zeros(truth.shape, np.float32)
+    true_disparity[known] = 1 / truth[known]
+    predicted = resize(shown, *truth.shape)
+    predicted = predicted * (np.median(1 / predicted[known]) / np.median(truth[known]))
+    limits = value_range(true_disparity[known])
+    error = np.where(known, np.abs(1 / predicted - truth) / np.where(known, truth, 1), 0).astype(np.float32)
+    dot = max(1, round(truth.shape[1] / tile_width * 3)) if known.mean() < 0.3 else 1
+    tiles[name] = colorize(predicted, limits, colormap)
+    tiles["ground truth"] = _dots(colorize(true_disparity, limits, colormap, known), dot)
+    tiles["relative error: dark 0, bright 30 % or more"] = _dots(colorize(error, (0.0, 0.3), "inferno", known), dot)
+    return panel(tiles, columns, tile_width)
+
+
+def label_height(width: int) -> int:
+    """Return the height in pixels of a name strip above a picture of this width."""
+    return max(14, min(28, round(width / 20)))
+
+
+def label(text: str, width: int) -> UInt8[np.ndarray, "_ {width} 3"]:
+    """Return a strip with a name in it, made smaller where it would not fit."""
+    height = label_height(width)
+    size = height / 34
+    (length, _), _ = cv2.getTextSize(text, _FONT, size, 1)
+    if length > width - 8:
+        size *= max(1, width - 8) / length
+    strip = np.full((height, width, 3), _PAPER, np.uint8)
+    return cv2.putText(strip, text, (4, round(height * 0.72)), _FONT, size, _INK, 1, cv2.LINE_AA)
+
+
+def fit(picture: UInt8[np.ndarray, "_ _ 3"], height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+    """Return a picture at exactly this size: smooth when it shrinks, sharp pixels when it grows much."""
+    if height >= 3 * picture.shape[0] and width >= 3 * picture.shape[1]:
+        return cv2.resize(picture, (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(resize(picture, height, width))
+
+
+def _dots(picture: UInt8[np.ndarray, "h w 3"], size: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Spread single bright pixels over ``size`` x ``size``, so that they survive being made smaller."""
+    return cv2.dilate(picture, np.ones((size, size), np.uint8)) if size > 1 else picture

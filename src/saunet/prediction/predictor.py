@@ -1,0 +1,90 @@
+"""Prediction with PyTorch: ``Predictor.from_checkpoint("last.ckpt").predict("road.png").depth``."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from saunet.errors import usable_device
+from saunet.exporting.folder import read_model
+from saunet.metrics.functional import flip_blend
+from saunet.models.depth import DepthNet
+from saunet.prediction.pipeline import ImagePredictor
+from saunet.runs.record import Scale
+
+
+class Predictor(ImagePredictor):
+    """Predicts depth with a depth network; the network is moved to ``device`` and set to evaluation.
+
+    Args:
+        depth_net: The network.
+        height: Height of the network's input in pixels.
+        width: Width of the network's input in pixels.
+        device: Where to run, such as ``"cpu"`` or ``"cuda"``.
+        scale: Factor to meters; None leaves depth relative.
+        flip: Average with the prediction of the mirrored image (twice the time, a little less error).
+        keep_aspect: Feed each image at its own aspect ratio, with about height x width pixels, not exactly that size.
+    """
+
+    def __init__(
+        self,
+        depth_net: DepthNet,
+        height: int,
+        width: int,
+        device: str | torch.device = "cpu",
+        scale: Scale | None = None,
+        flip: bool = False,
+        keep_aspect: bool = False,
+    ) -> None:
+        super().__init__(height, width, scale, keep_aspect, depth_net.size_divisor)
+        self.device = usable_device(device)
+        self.network = depth_net.to(self.device).eval()
+        self.flip = flip
+        self._fingerprint: str | None = None
+
+    @classmethod
+    def from_checkpoint(
+        cls, path: str | Path, device: str | torch.device = "cpu", flip: bool = False, keep_aspect: bool = False
+    ) -> Predictor:
+        """Load a trained model, a checkpoint or an exported folder; nothing in the file is run.
+
+        Args:
+            path: A checkpoint file, or a folder that ``saunet-export`` wrote.
+            device: Where the network runs.
+            flip: Also predict the mirrored image and blend: slower and a little better.
+            keep_aspect: Keep the shape of images instead of stretching them to the size of the training.
+
+        Raises:
+            CheckpointError: if the file is missing, broken, or not a saunet checkpoint.
+            ConfigError: if the device does not exist.
+        """
+        checkpoint = read_model(path)
+        depth, _ = checkpoint.networks()
+        record = checkpoint.record
+        return cls(depth, record.height, record.width, device, record.scale, flip, keep_aspect)
+
+    def disparity(self, images: Float32[np.ndarray, "b 3 h w"]) -> Float32[np.ndarray, "b h w"]:
+        """Run the network: RGB in [0, 1] to disparity at the same size, before any scale."""
+        with torch.inference_mode():
+            batch = torch.from_numpy(images).to(self.device)
+            disparity = self.network(batch).disparity[0].float()
+            if self.flip:
+                disparity = flip_blend(disparity, self.network(batch.flip(-1)).disparity[0].float())
+            return np.asarray(disparity[:, 0].cpu().numpy())
+
+    @property
+    def fingerprint(self) -> str:
+        """A short hash of the weights and of the settings that change results."""
+        if self._fingerprint is None:
+            digest = hashlib.sha256()
+            for name, value in sorted(self.network.state_dict().items()):
+                digest.update(name.encode())
+                digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+            factor = self.scale.factor if self.scale else None
+            digest.update(repr((self.height, self.width, self.flip, self.keep_aspect, factor)).encode())
+            self._fingerprint = digest.hexdigest()[:16]
+        return self._fingerprint

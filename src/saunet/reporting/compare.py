@@ -1,0 +1,219 @@
+"""Two or more runs against each other: differing settings, scores side by side, and a paired comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from rich.box import HORIZONTALS
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from saunet.errors import ConfigError, DataError
+from saunet.evaluation.result import Comparison, ImageRow
+from saunet.evaluation.statistics import compare as paired
+from saunet.evaluation.writers import read_rows
+from saunet.reporting.document import Column, Row, Table
+from saunet.reporting.evaluations import read_evaluation
+from saunet.reporting.groups import Groups
+from saunet.reporting.inputs import Inputs
+from saunet.reporting.tables import ERRORS
+from saunet.runs.settings import differing, labels, values
+from saunet.runs.summary import SUBJECTS, Run
+
+
+def settings_table(runs: Mapping[str, Run]) -> Table:
+    """Return the settings in which runs differ, a column a run."""
+    members = list(runs.values())
+    told = {name: values(run, differing(members)) for name, run in runs.items()}
+    rows = [Row((key, *(told[name][index] for name in runs))) for index, key in enumerate(differing(members))]
+    rows.append(Row(("status", *(f"{run.status}{f': {run.error}' if run.error else ''}" for run in members))))
+    commits = [(run.record.get("git") or {}).get("commit") for run in members]
+    if len(set(commits)) > 1:
+        rows.append(Row(("code", *(str(commit or "unknown")[:12] for commit in commits))))
+    return Table("settings", "Settings that differ", (Column("key"), *map(Column, runs)), tuple(rows))
+
+
+def scores_table(runs: Mapping[str, Run]) -> Table:
+    """Return the scores of runs side by side, grouped by what they were measured on."""
+    scored = dict.fromkeys((name, score) for name, run in runs.items() for score in run.scores if not score.trivial)
+    group = Groups(score for _, score in scored)
+    rows = [Row((name, *score.errors), "measured", group(score)) for name, score in scored]
+    rows.sort(key=lambda row: row.group)
+    return Table("scores", "Scores", (Column("run"), *ERRORS), tuple(rows))
+
+
+@dataclass(frozen=True)
+class Scored:
+    """One run's errors on each image under one protocol, from one evaluation."""
+
+    rows: tuple[ImageRow, ...]
+    data: str
+    """What the images are, such as ``kitti, test split``."""
+    how: str
+    """Settings that change the numbers; empty for none."""
+    foreign: bool
+    """Of another system: how it was predicted is not known."""
+
+    @property
+    def images(self) -> frozenset[str]:
+        """The names of the images."""
+        return frozenset(row.name for row in self.rows)
+
+    def pairs(self, other: Scored) -> bool:
+        """Tell whether both are of the same images, predicted with the same settings."""
+        return self.images == other.images and (self.how == other.how or self.foreign or other.foreign)
+
+
+def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
+    """Compare each run with the first one, image by image, wherever both were evaluated alike.
+
+    Among all evaluations of two runs under a protocol, those of the same images and settings are paired.
+
+    Returns:
+        A table for each comparison, and a sentence for each that could not be made.
+    """
+    names = list(runs)
+    found = {name: _scored(run) for name, run in runs.items()}
+    tables, left_out = [], []
+    for other in names[1:]:
+        both = [protocol for protocol in found[names[0]] if protocol in found[other]]
+        if not both:
+            left_out.append(
+                f"{names[0]} and {other} were not both evaluated under one protocol, so nothing is paired; "
+                "run saunet-evaluate on both with the same data"
+            )
+        for protocol in both:
+            ours, theirs = found[names[0]][protocol], found[other][protocol]
+            pairs = [(one, two) for one in ours for two in theirs if one.pairs(two)]
+            try:
+                for one, two in pairs:
+                    comparison = paired(one.rows, two.rows, names=(names[0], other))
+                    tables.append(comparison_table(comparison, _told(one, two)))
+                if not pairs:
+                    left_out.append(f"{names[0]} and {other} under {protocol}: {_apart(ours, theirs)}")
+            except DataError as reason:
+                left_out.append(f"{names[0]} and {other} under {protocol}: {reason}")
+    return tables, left_out
+
+
+def comparison_table(comparison: Comparison, what: str) -> Table:
+    """Return one paired comparison as a table.
+
+    Args:
+        comparison: The comparison.
+        what: Which images, and how they were predicted.
+    """
+    columns = (
+        Column("error"),
+        Column(comparison.first, 4),
+        Column(comparison.second, 4),
+        Column("difference", 4),
+        Column(f"{comparison.level:.0%} low", 4),
+        Column(f"{comparison.level:.0%} high", 4),
+        Column("second better", None),
+        Column("p", 4),
+    )
+    rows = tuple(
+        Row(
+            (column.heading, one.first, one.second, one.difference, one.low, one.high, f"{one.better:.0%}", one.p_value)
+        )
+        for column, one in zip(ERRORS, comparison.differences, strict=True)
+    )
+    pair = f"{comparison.second} minus {comparison.first}"
+    title = f"Paired on {comparison.images} images under {comparison.protocol}: {pair}"
+    notes = (f"{what};", f"resampled: {comparison.groups} {comparison.by}s")
+    return Table("paired", title, columns, rows, notes)
+
+
+def print_table(table: Table, console: Console) -> None:
+    """Print a table of a report on the terminal."""
+    shown = RichTable(
+        title=f"[bold]{escape(table.title)}[/bold]", box=HORIZONTALS, show_edge=False, title_justify="left"
+    )
+    shown.title_style, shown.caption_justify = "", "left"
+    for index, column in enumerate(table.columns):
+        number = any(isinstance(row.cells[index], int | float) for row in table.rows)
+        arrow = {-1: " ↓", 0: "", 1: " ↑"}[column.better]
+        shown.add_column(escape(column.heading) + arrow, justify="right" if number else "left", overflow="fold")
+    group = ""
+    for row in table.rows:
+        if row.group != group:
+            group = row.group
+            shown.add_row(f"[italic]{escape(group)}[/italic]")
+        cells = [escape(table.text(row, index)) for index in range(len(row.cells))]
+        shown.add_row(*(f"[bold]{cell}[/bold]" if table.best(row, index) else cell for index, cell in enumerate(cells)))
+    if table.notes:
+        shown.caption = escape(" ".join(table.notes))
+    console.print(shown, "")
+
+
+def _scored(run: Run) -> dict[str, list[Scored]]:
+    """Return a run's evaluations by protocol; of several with the same images and settings, the last."""
+    found: dict[str, dict[tuple[frozenset[str], str], Scored]] = {}
+    for folder in run.evaluations:
+        if not (folder / "per_image.csv").is_file():
+            continue
+        evaluation = read_evaluation(folder)
+        table: dict[str, list[ImageRow]] = {}
+        for row in read_rows(folder / "per_image.csv"):
+            if row.predictor in SUBJECTS:
+                table.setdefault(row.protocol, []).append(row)
+        for protocol, rows in table.items():
+            scored = Scored(tuple(rows), evaluation.data, evaluation.how, evaluation.predictions is not None)
+            found.setdefault(protocol, {})[scored.images, scored.how] = scored
+    return {protocol: list(members.values()) for protocol, members in found.items()}
+
+
+def _told(one: Scored, two: Scored) -> str:
+    """Say what two paired evaluations are of: the settings once where they are equal."""
+    if one.how == two.how:
+        return ", ".join(filter(None, (one.data, one.how)))
+    first, second = (each.how or ("as predicted elsewhere" if each.foreign else "plain") for each in (one, two))
+    return f"{one.data}; the first {first}, the second {second}"
+
+
+def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
+    """Say why no evaluation of one run pairs with any of the other."""
+    for one in ours:
+        for two in theirs:
+            if one.images == two.images:
+                return (
+                    f"the first was evaluated with {one.how or 'no flip or scale'} and the second with "
+                    f"{two.how or 'no flip or scale'}; run saunet-evaluate on both with the same settings"
+                )
+    counts = [", ".join(f"{len(one.images)} of {one.data}" for one in each) for each in (ours, theirs)]
+    return (
+        f"the images do not pair up ({counts[0]} against {counts[1]}, by their names not the same); "
+        "run saunet-evaluate on both with the same data"
+    )
+
+
+def print_comparison(inputs: Inputs, wanted: Sequence[str], console: Console) -> None:
+    """Print everything that this file can say about the runs.
+
+    Args:
+        inputs: The runs.
+        wanted: Their names; made from what sets them apart if empty.
+        console: Where.
+
+    Raises:
+        ConfigError: if there are not as many names as runs.
+        DataError: if there are fewer than two runs.
+    """
+    members = inputs.all_runs
+    if len(members) < 2:
+        raise DataError(f"{len(members)} run is not enough to compare; name two or more: saunet-report compare A B")
+    if wanted and len(set(wanted)) != len(members):
+        raise ConfigError(f"labels holds {len(set(wanted))} names for {len(members)} runs; give each its own")
+    runs = dict(zip(wanted or labels([members])[0], members, strict=True))
+    print_table(settings_table(runs), console)
+    scores = scores_table(runs)
+    if scores.rows:
+        print_table(scores, console)
+    found, left_out = comparisons(runs)
+    for table in found:
+        print_table(table, console)
+    for sentence in left_out:
+        console.print(f"left out: {escape(sentence)}")

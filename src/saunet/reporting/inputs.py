@@ -1,0 +1,167 @@
+"""What a user names on the command line: runs, sweeps, checkpoints, evaluations, benchmarks, or folders of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from saunet.errors import DataError, one_of
+from saunet.reporting.evaluations import Evaluation, belongs, read_evaluation
+from saunet.reporting.files import read_mapping
+from saunet.runs.summary import Run, Status, began, home, read_run, split_overrides
+
+Jobs = Callable[[Path], "list[list[str]] | None"]
+"""Returns the overrides of every job that a sweep folder was to hold; None where that cannot be told."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The jobs of one multirun folder, in order, those included that left nothing behind."""
+
+    path: Path
+    name: str
+    runs: tuple[Run, ...]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Everything that a report is made from."""
+
+    runs: tuple[Run, ...]
+    """Single runs; those of sweeps are in ``sweeps``."""
+    sweeps: tuple[Sweep, ...]
+    benchmarks: tuple[Path, ...]
+
+    @property
+    def all_runs(self) -> tuple[Run, ...]:
+        """Every run, single ones first."""
+        return (*self.runs, *(run for sweep in self.sweeps for run in sweep.runs))
+
+
+def collect(
+    paths: Sequence[str | Path], checkpoint: str = "best", jobs: Jobs | None = None, *, strangers: bool = True
+) -> Inputs:
+    """Read everything that the paths name.
+
+    Args:
+        paths: Folders of runs, sweeps, evaluations and benchmarks, folders that hold such folders, checkpoint files.
+        checkpoint: Which checkpoint of a run is meant, ``best`` or ``last``.
+        jobs: Tells which jobs a sweep should have, so that those without a folder are not forgotten.
+        strangers: An evaluation of a run that is not named stands for that run; otherwise it does so only where fewer
+            than two runs are named. One of another system's predictions always stands for that system.
+
+    Raises:
+        ConfigError: if the checkpoint is neither.
+        DataError: if a path does not exist or holds nothing of the kind.
+    """
+    one_of("checkpoint", checkpoint, ("best", "last"))
+    if not paths:
+        raise DataError("no run given; name folders of runs or sweeps, or checkpoints: saunet-report outputs/train/...")
+    runs: dict[Path, Run] = {}
+    sweeps: dict[Path, Sweep] = {}
+    evaluations: dict[Path, Evaluation] = {}
+    benchmarks: dict[Path, None] = {}
+    for path in map(Path, paths):
+        found = _find(path)
+        if not found:
+            raise DataError(f"no run, sweep, checkpoint, evaluation or benchmark in {path}; check the path")
+        for kind, place in found:
+            place = place.resolve()
+            if kind == "sweep":
+                sweeps[place] = _read_sweep(place, checkpoint, jobs)
+            elif kind == "evaluation":
+                evaluations[place] = read_evaluation(place)
+            elif kind == "benchmark":
+                benchmarks[place] = None
+            elif kind == "checkpoint":
+                runs[place] = _read_checkpoint(place)
+            else:
+                runs[place] = read_run(place, checkpoint)
+    known = [*runs.values(), *(run for sweep in sweeps.values() for run in sweep.runs)]
+    for run in known:  # evaluations written into the run's own folder
+        for file in sorted(run.path.rglob("metrics.json")) if run.path.is_dir() else ():
+            evaluations.setdefault(file.parent, read_evaluation(file.parent))
+    take = strangers or len(known) < 2
+    for evaluation in evaluations.values():
+        foreign = evaluation.predictions is not None  # of no run at all, so it was named for its own sake
+        if (take or foreign) and not any(belongs(evaluation, run) for run in known):
+            origin = evaluation.checkpoint
+            if origin and origin.is_file() and not foreign:
+                orphan = _read_checkpoint(origin)
+            else:
+                orphan = Run(evaluation.folder, name=evaluation.name)
+            runs[orphan.path] = orphan
+            known.append(orphan)
+
+    def scored(run: Run) -> Run:
+        mine = [evaluation for evaluation in evaluations.values() if belongs(evaluation, run)]
+        scores = (*(score for evaluation in mine for score in evaluation.scores), *run.scores)
+        explained = tuple(row for evaluation in mine for row in evaluation.explained)
+        folders = tuple(evaluation.folder for evaluation in mine)
+        return dataclasses.replace(run, scores=scores, explained=explained, evaluations=folders)
+
+    return Inputs(
+        tuple(scored(run) for run in runs.values()),
+        tuple(dataclasses.replace(sweep, runs=tuple(map(scored, sweep.runs))) for sweep in sweeps.values()),
+        tuple(benchmarks),
+    )
+
+
+def _find(path: Path, depth: int = 3) -> list[tuple[str, Path]]:
+    """Return (kind, place) of everything at or below a path, sorted by name."""
+    if path.is_file():
+        kinds = {".ckpt": "checkpoint", ".json": "benchmark" if path.stem == "benchmark" else "evaluation"}
+        kind = kinds.get(path.suffix, "")
+        return [(kind, path.parent if path.suffix == ".json" else path)] if kind else []
+    if not path.is_dir():
+        raise DataError(f"there is nothing at {path}; check the path")
+    if (path / "multirun.yaml").is_file():
+        return [("sweep", path)]
+    if began(path):
+        return [("run", path)]
+    if (path / "benchmark.json").is_file():
+        return [("benchmark", path)]
+    if (path / "metrics.json").is_file():
+        return [("evaluation", path)]
+    if "optim" in read_mapping(path / ".hydra" / "config.yaml"):
+        place = home(path)
+        return [("run", place)] if began(place) or place == path.resolve() else []
+    below = sorted(child for child in path.iterdir() if child.is_dir() and not child.name.startswith("."))
+    return [found for child in below for found in _find(child, depth - 1)] if depth else []
+
+
+def _read_sweep(folder: Path, checkpoint: str, jobs: Jobs | None) -> Sweep:
+    found: dict[int, Run] = {}
+    for place in sorted(path.parent for path in folder.rglob(".hydra") if path.is_dir()):
+        if "optim" not in read_mapping(place / ".hydra" / "config.yaml"):
+            continue  # an evaluation inside a run
+        hydra = read_mapping(place / ".hydra" / "hydra.yaml").get("hydra") or {}
+        number = (hydra.get("job") or {}).get("num")
+        number = number if isinstance(number, int) and number not in found else len(found)
+        led = home(place)
+        found[number] = read_run(led if began(led) else place, checkpoint, number)
+    planned = jobs(folder) if jobs else None
+    going_on = any(run.status == "running" for run in found.values())
+    last = max(found, default=-1)
+    for number in range(max([*found, len(planned or ()) - 1, -1]) + 1):
+        if number not in found:
+            overrides = split_overrides(planned[number]) if planned and number < len(planned) else {}
+            waiting = going_on and number > last
+            error = "it is not started yet" if waiting else "it left no folder: it failed before it began"
+            status: Status = "unfinished" if waiting else "failed"
+            found[number] = Run(folder / str(number), status, error, str(number), overrides=overrides, job=number)
+    runs = tuple(found[number] for number in sorted(found))
+    config = read_mapping(folder / "multirun.yaml")
+    names = [str(config["name"])] if config.get("name") else [run.name for run in runs if run.config]
+    return Sweep(folder, (names or [folder.name])[0], runs)
+
+
+def _read_checkpoint(file: Path) -> Run:
+    """Return the run that a checkpoint belongs to, with this checkpoint; the checkpoint alone where there is none."""
+    folder = file.parents[1] if len(file.parents) > 1 else file.parent
+    if file.parent.name == "checkpoints" and any((folder / name).exists() for name in (".hydra", "run.json")):
+        run = read_run(folder, file.stem)
+        return dataclasses.replace(run, checkpoint=file)
+    return Run(file, name=file.stem, checkpoint=file)

@@ -1,0 +1,1 @@
+"""What a run folder is: written by training, read by reports."""

@@ -1,0 +1,209 @@
+"""The plain record of a model: everything but the weights that using it again needs, checked when it is read.
+
+It stands under ``"saunet"`` in every checkpoint and as JSON beside every exported model. Reading it needs no torch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from saunet import __version__
+from saunet.errors import CheckpointError
+from saunet.registry import attentions, decoders, encoders, poses
+
+FORMAT = 1
+"""Version of the record's layout; raised when an older reader would misunderstand a newer file."""
+
+_SLOTS = {
+    "encoder": (encoders,),
+    "decoder": (decoders,),
+    "pose": (poses,),
+}
+_NESTED = (encoders, decoders, attentions, poses)
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """The factor that turns a model's depth into meters, and where it is known from."""
+
+    factor: float
+    source: str
+    """Such as ``"camera height 1.65 m"`` or ``"median over LiDAR"``."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.factor < math.inf:
+            raise CheckpointError(f"scale factor is {self.factor}; it must be a finite number above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class ModelRecord:
+    """Everything but the weights that prediction needs, as plain data.
+
+    Args:
+        encoder: Config node of the depth encoder (``_target_`` and its parameters).
+        decoder: Config node of the depth decoder.
+        pose: Config node of the pose network; None where the model has none.
+        min_depth: Depth at sigmoid 1, meters up to scale.
+        max_depth: Depth at sigmoid 0, meters up to scale.
+        height: Height of the network's input in pixels.
+        width: Width of the network's input in pixels.
+        offsets: Time offsets of the sources that the pose network was trained with.
+        scale: Factor to meters, where known.
+        data: Facts about the training data, free-form.
+        version: saunet version that wrote it.
+    """
+
+    encoder: Mapping[str, Any]
+    decoder: Mapping[str, Any]
+    pose: Mapping[str, Any] | None
+    min_depth: float
+    max_depth: float
+    height: int
+    width: int
+    offsets: tuple[int, ...] = (-1, 1)
+    scale: Scale | None = None
+    data: Mapping[str, Any] = field(default_factory=dict)
+    version: str = __version__
+
+    def __post_init__(self) -> None:
+        if not 0 < self.min_depth < self.max_depth < math.inf:
+            raise CheckpointError(
+                f"the model record's depth range is {self.min_depth} to {self.max_depth}; needed: 0 < min < max"
+            )
+        if self.height < 1 or self.width < 1:
+            raise CheckpointError(f"the model record's size is {self.height}x{self.width}; both must be above 0")
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return the record as plain containers: what stands under ``"saunet"`` in a checkpoint."""
+        return {
+            "format": FORMAT,
+            "version": self.version,
+            "model": {
+                "encoder": _plain(self.encoder),
+                "decoder": _plain(self.decoder),
+                "pose": _plain(self.pose),
+                "min_depth": float(self.min_depth),
+                "max_depth": float(self.max_depth),
+            },
+            "height": self.height,
+            "width": self.width,
+            "offsets": list(self.offsets),
+            "scale": asdict(self.scale) if self.scale else None,
+            "data": _plain(self.data),
+        }
+
+    @classmethod
+    def from_plain(cls, plain: Any) -> ModelRecord:
+        """Read a record from plain containers.
+
+        Raises:
+            CheckpointError: if a key is missing, a value cannot work, or the layout is newer than this version.
+        """
+        if not isinstance(plain, Mapping) or not isinstance(plain.get("format"), int):
+            raise CheckpointError(f"the model record is {_short(plain)}; it must be a mapping with a 'format' number")
+        if plain["format"] > FORMAT:
+            raise CheckpointError(
+                f"the model record has format {plain['format']}, written by saunet {plain.get('version', '?')}; "
+                f"this is saunet {__version__}, which reads up to {FORMAT}; upgrade saunet"
+            )
+        model, scale = _get(plain, "model", Mapping), _get(plain, "scale", Mapping | None)
+        return cls(
+            encoder=_node(model, "encoder"),
+            decoder=_node(model, "decoder"),
+            pose=_node(model, "pose") if model.get("pose") is not None else None,
+            min_depth=_get(model, "min_depth", int | float),
+            max_depth=_get(model, "max_depth", int | float),
+            height=_get(plain, "height", int),
+            width=_get(plain, "width", int),
+            offsets=tuple(_get({"offsets": value}, "offsets", int) for value in _get(plain, "offsets", list | tuple)),
+            scale=Scale(_get(scale, "factor", int | float), _get(scale, "source", str)) if scale is not None else None,
+            data=_get(plain, "data", Mapping),
+            version=_get(plain, "version", str),
+        )
+
+    def check_same_training(self, plain: Mapping[str, Any]) -> None:
+        """Check that a training about to resume from this record's checkpoint sees the same images and depths.
+
+        Args:
+            plain: The new training's record.
+
+        Raises:
+            CheckpointError: naming the first setting that differs.
+        """
+        new = ModelRecord.from_plain(plain)
+        for name in ("height", "width", "offsets", "min_depth", "max_depth"):
+            before, now = getattr(self, name), getattr(new, name)
+            if before != now:
+                raise CheckpointError(
+                    f"the checkpoint was trained with {name} {before} and this run has {now}; "
+                    "a resumed run continues the same training, so give the same settings"
+                )
+
+    def check_registered(self) -> None:
+        """Check that every component is registered, in the place of its kind.
+
+        Raises:
+            CheckpointError: naming the first ``_target_`` that is not.
+        """
+        for slot, kinds in _SLOTS.items():
+            node = getattr(self, slot)
+            if node is not None and "_target_" not in node:
+                raise CheckpointError(f"the recorded {slot} has no '_target_', so nothing is built")
+            for depth, target in enumerate(_targets(node)):
+                allowed = {entry.path for kind in (kinds if depth == 0 else _NESTED) for entry in kind}
+                if target not in allowed:
+                    what = slot if depth == 0 else "part of a model"
+                    raise CheckpointError(
+                        f"the recorded {slot} asks for '{target}', which is not a registered {what}, "
+                        "so nothing is built; import the module that registers it first, if you trust the file"
+                    )
+
+
+def _targets(node: Any) -> Iterator[str]:
+    """Yield every ``_target_`` of a node, the outermost first."""
+    if isinstance(node, Mapping):
+        if "_target_" in node:
+            yield str(node["_target_"])
+        for value in node.values():
+            yield from _targets(value)
+    elif isinstance(node, list | tuple):
+        for value in node:
+            yield from _targets(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(item) for item in value]
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    raise CheckpointError(f"a checkpoint keeps plain values only, got {_short(value)}; convert it first")
+
+
+def _get(plain: Mapping[str, Any], key: str, kind: Any) -> Any:
+    """Return ``plain[key]`` if it has the right type.
+
+    Raises:
+        CheckpointError: if it is missing or has another type.
+    """
+    if key not in plain:
+        raise CheckpointError(f"the model record lacks '{key}'; the file is damaged or was edited")
+    value = plain[key]
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise CheckpointError(f"the model record's {key} is {_short(value)}; the file is damaged or was edited")
+    return value
+
+
+def _node(model: Mapping[str, Any], slot: str) -> Mapping[str, Any]:
+    node: Mapping[str, Any] = _get(model, slot, Mapping)
+    _get(node, "_target_", str)
+    return node
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return f"{type(value).__name__} {text if len(text) <= 60 else text[:57] + '...'}"

@@ -1,0 +1,130 @@
+"""What runs have in common and what not: differing config keys as columns, and short names made from them."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from saunet.runs.summary import Run
+
+RATIO = "α/β"
+"""A column of its own where the weights of SAU-Net eq. (14) differ."""
+_SLOTS = ("model/encoder", "model/decoder", "model/pose", "objective", "data", "loss")
+_UNTOLD = ("output_dir", "callbacks", "logger", "resume", "name")
+"""Keys of a config that say where a run writes and what it is called, not what it computes."""
+
+
+_OFF = (None, "null", "false", "[]", "{}", "0.0", "0")
+"""What a key that is not there may as well be."""
+
+
+def settings(run: Run) -> dict[str, str]:
+    """Return all that decides what a run computes, as text by dotted key; a chosen component is one key more."""
+    found = {slot.replace("/", "."): run.component(slot) for slot in _SLOTS if run.component(slot)}
+    _flatten("", run.config, found)
+    return {key: value for key, value in found.items() if key.split(".")[0] not in _UNTOLD}
+
+
+def differing(runs: Sequence[Run], *, by_overrides: bool = False) -> list[str]:
+    """Return the keys whose values are not the same for all runs, in the order they are first met.
+
+    Parameters of components of different names are left out: they say nothing beyond the names.
+
+    Args:
+        runs: The runs.
+        by_overrides: Compare what the command lines said; for the jobs of one sweep that is what was swept.
+    """
+    tables = [dict(run.overrides) if by_overrides else settings(run) for run in runs]
+    tables = [table for table in tables if table]  # a job that left nothing says nothing
+    keys = dict.fromkeys(key for table in tables for key in table)
+    different = [key for key in keys if len({_given(table, key) for table in tables}) > 1]
+    chosen = [slot.replace("/", ".") for slot in _SLOTS if slot.replace("/", ".") in different]
+    return [key for key in different if not any(key.startswith(f"{slot}.") for slot in chosen)]
+
+
+def values(run: Run, keys: Sequence[str]) -> list[str]:
+    """Return a run's values of these keys; empty where it has none."""
+    table = settings(run) | dict(run.overrides)
+    return [table.get(key, "") for key in keys]
+
+
+def ratio(run: Run) -> float | None:
+    """Return alpha/beta of eq. (14); None where the objective has no such weights or beta is 0."""
+    objective = run.config.get("objective")
+    alpha, beta = (objective.get(key) if isinstance(objective, Mapping) else None for key in ("alpha", "beta"))
+    if not isinstance(alpha, int | float) or not isinstance(beta, int | float) or not beta:
+        return None
+    return alpha / beta
+
+
+def sweeps_ratio(runs: Sequence[Run]) -> bool:
+    """Tell whether the runs differ in the ratio of eq. (14) and in nothing else that was swept."""
+    keys = set(differing(runs, by_overrides=True))
+    ratios = {round(value, 6) for value in map(ratio, runs) if value is not None}
+    return bool(keys) and keys <= {"objective.alpha", "objective.beta"} and len(ratios) > 1
+
+
+def labels(groups: Sequence[Sequence[Run]]) -> list[list[str]]:
+    """Return a short name for every run, unlike all others, made of what sets it apart within its group.
+
+    Args:
+        groups: The single runs, then the jobs of each sweep.
+    """
+    named = [_labels(group) for group in groups]
+    counts = Counter(name for names in named for name in names)
+    taken: Counter[str] = Counter()
+    result = []
+    for group, names in zip(groups, named, strict=True):
+        row = []
+        for run, name in zip(group, names, strict=True):
+            unique = name if counts[name] == 1 else f"{name} ({run.name})"
+            taken[unique] += 1
+            row.append(unique if taken[unique] == 1 else f"{unique} {taken[unique]}")
+        result.append(row)
+    return result
+
+
+def _given(table: Mapping[str, str], key: str) -> str | None:
+    """Return a value; None where it is absent or off, for older versions lack keys that newer ones leave off."""
+    value = table.get(key)
+    return None if value in _OFF else value
+
+
+def _labels(runs: Sequence[Run]) -> list[str]:
+    if sweeps_ratio(runs):
+        ratios = [ratio(run) for run in runs]
+        if None not in ratios:
+            return [f"{RATIO} = {value:.4g}" for value in ratios]
+    swept = bool(runs) and all(run.job is not None for run in runs)
+    keys = differing(runs, by_overrides=swept)
+    return [_label(run, keys) for run in runs]
+
+
+def _label(run: Run, keys: Sequence[str]) -> str:
+    if not run.config and not run.overrides:  # another system's predictions, or a checkpoint alone
+        return run.name
+    networks = [key for key in ("model.encoder", "model.decoder", "model/encoder", "model/decoder") if key in keys]
+    parts = []
+    if networks:  # always named in full: encoder + decoder
+        parts.append(" + ".join(run.component(slot) or "?" for slot in ("model/encoder", "model/decoder")))
+    table = settings(run) | dict(run.overrides)
+    others = [key for key in keys if key not in networks]
+    for key in others[:3]:
+        if key in table:
+            short = key.replace("/", ".").rpartition(".")[2]
+            named = key in ("loss", "objective", "data", "experiment", "model")
+            parts.append(table[key] if named else f"{short} = {table[key]}")
+    return ", ".join(parts) or run.name
+
+
+def _flatten(prefix: str, node: Any, found: dict[str, str]) -> None:
+    for key, value in node.items():
+        if str(key).startswith("_"):
+            continue
+        path = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            _flatten(f"{path}.", value, found)
+        else:
+            found[path] = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

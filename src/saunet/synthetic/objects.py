@@ -1,0 +1,249 @@
+"""Houses, cars, trees, lamps, hedges and walls, each added to a mesh at a place beside the road."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from saunet.synthetic.facades import FLOORS, WINDOWS
+from saunet.synthetic.mesh import Color, Mesh, Polygons, Surface, footprint
+
+_WALLS: tuple[Color, ...] = (
+    (0.62, 0.30, 0.22), (0.72, 0.62, 0.48), (0.82, 0.78, 0.70), (0.55, 0.52, 0.50), (0.80, 0.66, 0.36),
+    (0.66, 0.44, 0.34), (0.48, 0.56, 0.62), (0.74, 0.54, 0.50), (0.50, 0.54, 0.42), (0.88, 0.84, 0.76),
+    (0.42, 0.34, 0.32),
+)  # fmt: skip
+_PAINTS: tuple[Color, ...] = (
+    (0.75, 0.75, 0.77), (0.18, 0.19, 0.22), (0.55, 0.08, 0.08), (0.12, 0.22, 0.48), (0.86, 0.86, 0.84),
+    (0.35, 0.37, 0.40), (0.20, 0.38, 0.26), (0.80, 0.62, 0.15), (0.42, 0.58, 0.70), (0.50, 0.36, 0.24),
+)  # fmt: skip
+_GLASS: Color = (0.20, 0.24, 0.30)
+
+
+def _vary(rng: np.random.Generator, color: Color, amount: float = 0.12) -> Color:
+    shade = (1 + amount * rng.standard_normal()) * (1 + 0.04 * rng.standard_normal(3))
+    tint = np.clip(np.asarray(color) * shade, 0.02, 0.95)
+    return float(tint[0]), float(tint[1]), float(tint[2])
+
+
+def _pick(rng: np.random.Generator, colors: tuple[Color, ...]) -> Color:
+    return _vary(rng, colors[int(rng.integers(len(colors)))])
+
+
+def building(
+    mesh: Mesh,
+    rng: np.random.Generator,
+    center: tuple[float, float],
+    size: tuple[float, float],
+    heading: float,
+    floors: int,
+    front: int,
+) -> None:
+    """Add a house with windows on all sides and a flat or a gabled roof.
+
+    Args:
+        mesh: Where to add it.
+        rng: Source of randomness.
+        center: World (x, z).
+        size: Depth away from the road and length along it, meters.
+        heading: Heading of the road there, radians.
+        floors: Number of floors.
+        front: Wall that faces the road (1 right, 3 left), which may get a shop.
+    """
+    style = ("facade_sash", "facade_tall", "facade_ribbon", "facade_panel")[int(rng.integers(4))]
+    wall = Surface(style, _pick(rng, _WALLS), _vary(rng, _GLASS, 0.3), grain=0.12)
+    storey = float(rng.uniform(2.8, 3.6))
+    period = (float(rng.uniform(2.2, 3.6)) * WINDOWS, storey * FLOORS)
+    top = floors * storey
+    outline = footprint(center, size, heading)
+    has_shop = floors > 1 and rng.uniform() < 0.4
+    plinth = Surface("brick", _pick(rng, _WALLS), (0.7, 0.68, 0.64)) if rng.uniform() < 0.5 else None
+    for i in range(4):
+        left, right = outline[i], outline[(i + 1) % 4]
+        bottom = 0.0
+        if has_shop and i == front:
+            bottom = storey
+            board = Surface("shop", _pick(rng, _WALLS), _vary(rng, _GLASS, 0.3))
+            mesh.wall(left, right, 0.0, bottom, board, (float(rng.uniform(7, 11)), storey))
+        elif plinth is not None:
+            bottom = 0.9
+            mesh.wall(left, right, 0.0, bottom, plinth, (1.8, 1.4))
+        mesh.wall(left, right, bottom, top, wall, period)
+    tiles = Surface("roof", _vary(rng, (0.45, 0.24, 0.18), 0.25), _vary(rng, (0.32, 0.26, 0.24), 0.2))
+    if rng.uniform() < 0.55 and floors <= 4:
+        _gable(mesh, outline, top, float(rng.uniform(1.5, 3.5)), tiles, Surface("plaster", wall.color, wall.second))
+
+
+def _gable(mesh: Mesh, outline: list[np.ndarray], top: float, rise: float, tiles: Surface, wall: Surface) -> None:
+    rear_left, rear_right, front_right, front_left = ((x, -top, z) for x, z in outline)
+    (rear_x, rear_z), (front_x, front_z) = (outline[0] + outline[1]) / 2, (outline[2] + outline[3]) / 2
+    ridge_rear, ridge_front = (rear_x, -top - rise, rear_z), (front_x, -top - rise, front_z)
+    mesh.polygon([ridge_rear, ridge_front, front_right, rear_right], tiles, (2.4, 2.8))
+    mesh.polygon([ridge_front, ridge_rear, rear_left, front_left], tiles, (2.4, 2.8))
+    for left, right, peak in ((rear_left, rear_right, ridge_rear), (front_right, front_left, ridge_front)):
+        mesh.polygon([left, peak, right], wall, (5.0, 5.0))
+
+
+def car(rng: np.random.Generator) -> Polygons:
+    """Return a car or van standing on the origin, heading along z, with its contact shadow."""
+    mesh = Mesh(rng)
+    van = rng.uniform() < 0.12
+    length, width = (5.0, 1.95) if van else (float(rng.uniform(3.7, 4.7)), float(rng.uniform(1.68, 1.85)))
+    waist, top = (1.1, 2.2) if van else (float(rng.uniform(0.82, 0.95)), float(rng.uniform(1.38, 1.62)))
+    paint, half, sill = _pick(rng, _PAINTS), width / 2, 0.22
+    dark = (0.05, 0.05, 0.06)
+    flank = Surface("car_side", paint, dark, grain=0.06)
+    front = Surface("car_front", paint, (0.8, 0.8, 0.75), grain=0.03)
+    rear = Surface("car_rear", paint, (0.6, 0.06, 0.05), grain=0.03)
+    plain, glass = Surface("paint", paint, dark, grain=0.08), Surface("glass", (0.22, 0.26, 0.31), dark, grain=0.08)
+    outline = footprint((0.0, 0.0), (width, length), 0.0)
+    for wall, surface in enumerate((rear, flank, front, flank)):
+        span = width if wall % 2 == 0 else length
+        mesh.wall(outline[wall], outline[(wall + 1) % 4], sill, waist, surface, (span, waist - sill), fit=True)
+    _level(mesh, half, length / 2, waist, plain)
+    _cabin(mesh, half, waist, top, length, van, glass, plain)
+    rubber = Surface("wheel", (0.22, 0.22, 0.23), (0.55, 0.56, 0.58), grain=0.0)
+    for z in (-0.31 * length, 0.30 * length):
+        for side in (-1.0, 1.0):
+            _wheel(mesh, side * (half + 0.02), z, 0.32, side, rubber)
+    shadow = Surface("asphalt", (0.07, 0.07, 0.08), (0.08, 0.08, 0.09))
+    _level(mesh, half + 0.12, length / 2 + 0.15, 0.01, shadow)
+    return mesh.polygons()
+
+
+def _level(mesh: Mesh, half: float, ends: float, up: float, surface: Surface) -> None:
+    """A horizontal rectangle around the origin, ``up`` meters above the road."""
+    mesh.polygon([(-half, -up, ends), (half, -up, ends), (half, -up, -ends), (-half, -up, -ends)], surface, (4.0, 4.0))
+
+
+def _cabin(
+    mesh: Mesh, half: float, waist: float, top: float, length: float, van: bool, glass: Surface, plain: Surface
+) -> None:
+    """The part above the waist: four sloping windows and a roof."""
+    back, ahead = (-0.48, 0.30) if van else (-0.44, 0.24)
+    roof_back, roof_ahead = (-0.47, 0.18) if van else (-0.32, 0.06)
+    inset = half - 0.16
+    low = {
+        "bl": (-half + 0.03, back),
+        "br": (half - 0.03, back),
+        "fr": (half - 0.03, ahead),
+        "fl": (-half + 0.03, ahead),
+    }
+    high = {"bl": (-inset, roof_back), "br": (inset, roof_back), "fr": (inset, roof_ahead), "fl": (-inset, roof_ahead)}
+    for left, right in (("bl", "br"), ("br", "fr"), ("fr", "fl"), ("fl", "bl")):
+        corners = [(high[left], top), (high[right], top), (low[right], waist), (low[left], waist)]
+        mesh.polygon([(p[0], -y, p[1] * length) for p, y in corners], glass, (2.0, top - waist), fit=True)
+    mesh.polygon([(high[k][0], -top, high[k][1] * length) for k in ("fl", "fr", "br", "bl")], plain, (4.0, 4.0))
+
+
+def _wheel(mesh: Mesh, x: float, z: float, radius: float, side: float, surface: Surface) -> None:
+    angles = np.radians(-112.5 + 45.0 * np.arange(8))
+    corners = [(x, -radius + radius * np.sin(a), z + side * radius * np.cos(a)) for a in angles]
+    mesh.polygon(corners, surface, (2 * radius, 2 * radius), phase=0.5 - 0.5 * float(np.sin(np.radians(22.5))))
+
+
+def tree(mesh: Mesh, rng: np.random.Generator, x: float, z: float, height: float) -> None:
+    """Add a tree: a trunk and a crown of a few ellipsoids.
+
+    Args:
+        mesh: Takes the shapes.
+        rng: Decides what varies.
+        x: Of its foot on the ground, meters.
+        z: Of its foot on the ground, meters.
+        height: To the top of the crown, meters.
+    """
+    bark = Surface("bands", _vary(rng, (0.30, 0.23, 0.17), 0.2), (0.42, 0.36, 0.28))
+    green = _vary(rng, (0.22, 0.36, 0.12), 0.25)
+    if rng.uniform() < 0.15:
+        green = _vary(rng, (0.50, 0.36, 0.12), 0.2)
+    leaves = Surface("foliage", green, _vary(rng, (0.40, 0.48, 0.20), 0.2), grain=0.2)
+    mesh.cylinder(x, z, 0.035 * height * float(rng.uniform(0.7, 1.2)), 0.0, 0.6 * height, bark)
+    spread = height * float(rng.uniform(0.20, 0.30))
+    mesh.ellipsoid((x, -0.68 * height, z), spread, 0.32 * height, leaves)
+    for _ in range(3):
+        angle, out = rng.uniform(0, 2 * np.pi), spread * rng.uniform(0.4, 0.8)
+        place = (x + out * np.cos(angle), -height * rng.uniform(0.5, 0.75), z + out * np.sin(angle))
+        mesh.ellipsoid(place, spread * rng.uniform(0.5, 0.8), 0.17 * height, leaves)
+
+
+def bush(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
+    """Add a low shrub.
+
+    Args:
+        mesh: Takes the shapes.
+        rng: Decides what varies.
+        x: Of its foot on the ground, meters.
+        z: Of its foot on the ground, meters.
+    """
+    leaves = Surface("foliage", _vary(rng, (0.22, 0.36, 0.14), 0.25), _vary(rng, (0.42, 0.46, 0.2), 0.2), grain=0.2)
+    radius = float(rng.uniform(0.5, 1.2))
+    mesh.ellipsoid((x, -0.5 * radius, z), radius, radius * float(rng.uniform(0.7, 1.1)), leaves)
+
+
+def lamp(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
+    """Add a lamp post, sometimes with a sign board.
+
+    Args:
+        mesh: Takes the shapes.
+        rng: Decides what varies.
+        x: Of its foot on the ground, meters.
+        z: Of its foot on the ground, meters.
+    """
+    gray = float(rng.uniform(0.25, 0.6))
+    metal = Surface("bands", (gray, gray, gray * 1.03), (gray * 0.7, gray * 0.65, gray * 0.6))
+    height = float(rng.uniform(4.5, 8.0))
+    mesh.cylinder(x, z, float(rng.uniform(0.06, 0.12)), 0.0, height, metal)
+    mesh.ellipsoid((x, -height, z), 0.28, 0.16, Surface("paint", (0.85, 0.85, 0.8), (0.6, 0.6, 0.6)))
+    if rng.uniform() < 0.4:
+        board = Surface("poster", _pick(rng, _PAINTS), _pick(rng, _PAINTS), grain=0.05)
+        low = float(rng.uniform(2.0, 2.6))
+        mesh.box((x, z), (0.9, 0.08), float(rng.uniform(-0.2, 0.2)), low, low + 0.8, board, (1.0, 1.0))
+
+
+def barrier(mesh: Mesh, rng: np.random.Generator, start: np.ndarray, end: np.ndarray, kind: str) -> None:
+    """Add a hedge, a wooden fence or a garden wall between two ground points (x, z).
+
+    Args:
+        mesh: Takes the shapes.
+        rng: Decides what varies.
+        start: Ground point, two numbers, meters.
+        end: Ground point, two numbers, meters.
+        kind: ``hedge``, ``fence`` or ``wall``.
+    """
+    surface, period, height, thickness = {
+        "hedge": (
+            Surface("foliage", _vary(rng, (0.18, 0.30, 0.11), 0.2), (0.34, 0.42, 0.18), 0.2),
+            (2.0, 2.0),
+            1.5,
+            0.8,
+        ),
+        "fence": (Surface("planks", _vary(rng, (0.48, 0.36, 0.24), 0.25), (0.40, 0.32, 0.26)), (2.4, 1.6), 1.6, 0.06),
+        "wall": (Surface("brick", _pick(rng, _WALLS), (0.72, 0.70, 0.66)), (2.0, 1.5), 1.2, 0.3),
+    }[kind]
+    along = end - start
+    length = float(np.hypot(*along))
+    middle = (start + end) / 2
+    heading = float(np.arctan2(along[0], along[1]))
+    top = height * float(rng.uniform(0.75, 1.25))
+    roof = (
+        Surface("foliage", surface.color, surface.second)
+        if kind == "hedge"
+        else Surface("plaster", (0.6, 0.58, 0.55), (0.5, 0.5, 0.5))
+    )
+    mesh.box((float(middle[0]), float(middle[1])), (thickness, length), heading, 0.0, top, surface, period, roof)
+
+
+def billboard(mesh: Mesh, rng: np.random.Generator, x: float, z: float, heading: float) -> None:
+    """Add a poster on two legs, facing the traffic.
+
+    Args:
+        mesh: Takes the shapes.
+        rng: Decides what varies.
+        x: Of its foot on the ground, meters.
+        z: Of its foot on the ground, meters.
+        heading: Direction that it faces along, radians from z towards x.
+    """
+    legs = Surface("bands", (0.4, 0.4, 0.42), (0.3, 0.28, 0.26))
+    for side in (-1.3, 1.3):
+        mesh.cylinder(x + side * float(np.cos(heading)), z - side * float(np.sin(heading)), 0.08, 0.0, 1.6, legs)
+    board = Surface("poster", _pick(rng, _PAINTS), _pick(rng, _WALLS), grain=0.05)
+    mesh.box((x, z), (3.4, 0.15), heading, 1.5, 3.8, board, (float(rng.uniform(2.5, 4.5)), 2.4))

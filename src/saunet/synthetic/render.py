@@ -1,0 +1,261 @@
+"""Ray casting: what each sample of a pixel sees first, and how far along the camera's axis.
+
+In a pinhole camera the inverse depth of a plane, its texture coordinates over depth, and the edges of a convex polygon
+are all linear in the ray (x, y, 1). So each polygon is tested exactly on the samples inside its screen rectangle with a
+few sums, and ellipsoids and cylinders with one quadratic form. Road, kerb and pavement are solved in closed form for
+what is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from saunet.synthetic.mesh import CORNERS, Polygons, Quadrics
+from saunet.synthetic.world import KERB_HEIGHT, World
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+
+SAMPLES = np.array([[0.0, 0.0], [-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
+"""Where a pixel is sampled, pixels from its center: the center, which alone gives the depth, and a rotated square."""
+
+NEAR = 0.3
+"""Nothing nearer is drawn, meters."""
+DRAW = 230.0
+"""Nothing farther is drawn but ground and sky, meters."""
+
+SKY, ROAD, KERB_FACE, KERB_TOP, PAVEMENT, GRASS = -1, -2, -3, -4, -5, -6
+"""Identities of what is not a polygon (0 ... q - 1) or quadric (q ... q + k - 1)."""
+KERB_WIDTH = 0.18
+
+_BOX_EDGES = np.array([(0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
+_POLYGON_EDGES = np.array([(i, (i + 1) % CORNERS) for i in range(CORNERS)])
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A pinhole camera in the world."""
+
+    K: F64
+    """3 x 3, pixels; integer coordinates are pixel centers."""
+    T_world_cam: F64
+    """4 x 4, meters, x right, y down, z forward."""
+    height: int
+    width: int
+
+    @property
+    def rotation(self) -> F64:
+        """World from camera, 3 x 3."""
+        return self.T_world_cam[:3, :3]
+
+    @property
+    def position(self) -> F64:
+        """Position in the world, meters."""
+        return self.T_world_cam[:3, 3]
+
+
+@dataclass(frozen=True, slots=True)
+class Hits:
+    """What the samples see; s samples a pixel, the first at its center."""
+
+    inverse_depth: F32
+    """s x h x w, 1/meter along the camera's axis, 0 for the sky."""
+    identity: I32
+    """s x h x w."""
+    x: F32
+    """s x 1 x w: rays are (x, y, 1)."""
+    y: F32
+    """s x h x 1."""
+    planes: F64
+    """q x 3: inverse depth of each polygon's plane is planes . (x, y, 1)."""
+
+
+def cast(world: World, polygons: Polygons, camera: Camera) -> Hits:
+    """Find what each sample of each pixel sees."""
+    fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
+    offsets = SAMPLES.astype(np.float64)
+    x = ((np.arange(camera.width)[None, None] + offsets[:, 0, None, None] - cx) / fx).astype(np.float32)
+    y = ((np.arange(camera.height)[None, :, None] + offsets[:, 1, None, None] - cy) / fy).astype(np.float32)
+    shape = (len(offsets), camera.height, camera.width)
+    nearest = np.zeros(shape, np.float32)
+    identity = np.full(shape, SKY, np.int32)
+    planes = _cast_polygons(polygons, camera, x, y, nearest, identity)
+    _cast_quadrics(world.quadrics, polygons.count, camera, x, y, nearest, identity)
+    _cast_ground(world, camera, x, y, nearest, identity)
+    return Hits(nearest, identity, x, y, planes)
+
+
+def _rectangles(camera: Camera, points: F64, edges: NDArray[np.int64]) -> tuple[I32, F64]:
+    """Return screen rectangles (left, right, top, bottom; exclusive ends) of point sets and their nearest depth.
+
+    Edges that cross the near plane contribute their crossing point, so objects beside the camera keep tight rectangles.
+    """
+    z = points[..., 2]
+    first, second = points[:, edges[:, 0]], points[:, edges[:, 1]]
+    z0, z1 = first[..., 2], second[..., 2]
+    crosses = (z0 < NEAR) != (z1 < NEAR)
+    step = np.where(crosses, (NEAR - z0) / np.where(crosses, z1 - z0, 1.0), 0.0)
+    cut = first + step[..., None] * (second - first)
+    candidates = np.concatenate([points, cut], axis=1)
+    seen = np.concatenate([z >= NEAR, crosses], axis=1)
+    depth = np.where(seen, candidates[..., 2], 1.0)
+    u = camera.K[0, 0] * candidates[..., 0] / depth + camera.K[0, 2]
+    v = camera.K[1, 1] * candidates[..., 1] / depth + camera.K[1, 2]
+    big = 1e9
+    low_u, high_u = np.where(seen, u, big).min(axis=1), np.where(seen, u, -big).max(axis=1)
+    low_v, high_v = np.where(seen, v, big).min(axis=1), np.where(seen, v, -big).max(axis=1)
+    tiny = (high_u - low_u < 0.1) | (high_v - low_v < 0.1)
+    reach = float(np.abs(SAMPLES).max())
+    left = np.clip(np.ceil(low_u - reach), 0, camera.width)
+    right = np.clip(np.floor(high_u + reach) + 1, 0, camera.width)
+    top = np.clip(np.ceil(low_v - reach), 0, camera.height)
+    bottom = np.clip(np.floor(high_v + reach) + 1, 0, camera.height)
+    right = np.where(tiny, left, right)
+    return np.stack([left, right, top, bottom], axis=1).astype(np.int32), np.where(seen, depth, big).min(axis=1)
+
+
+def _cast_polygons(polygons: Polygons, camera: Camera, x: F32, y: F32, nearest: F32, identity: I32) -> F64:
+    planes = np.zeros((polygons.count, 3))
+    offset = polygons.corners[:, 0] - camera.position
+    chosen = np.flatnonzero((offset**2).sum(axis=1) < DRAW**2)
+    corners = (polygons.corners[chosen] - camera.position) @ camera.rotation
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    distance = (normal * corners[:, 0]).sum(axis=1)
+    scale = np.linalg.norm(normal, axis=1)
+    visible = (distance > 1e-6 * scale) & (corners[..., 2].max(axis=1) > NEAR)
+    chosen, corners, normal, distance = chosen[visible], corners[visible], normal[visible], distance[visible]
+    rectangles, front = _rectangles(camera, corners, _POLYGON_EDGES)
+    on_screen = (rectangles[:, 1] > rectangles[:, 0]) & (rectangles[:, 3] > rectangles[:, 2])
+    order = np.flatnonzero(on_screen)
+    order = order[np.argsort(front[order], kind="stable")]  # near to far, so that hidden ones are found out early
+    inside = np.cross(corners, np.roll(corners, -1, axis=1))  # x, y, 1 coefficients of each edge
+    size = np.abs(inside).max(axis=2, keepdims=True)
+    plane = normal / distance[:, None]
+    planes[chosen] = plane
+    tests = np.concatenate([inside / np.maximum(size, 1e-9), plane[:, None]], axis=1).astype(np.float32)
+    real = size[..., 0] > 1e-9
+    for i in order:
+        left, right, top, bottom = rectangles[i]
+        buffer = nearest[:, top:bottom, left:right]
+        if buffer.min() * front[i] >= 1.0:
+            continue
+        rows = tests[i][np.append(real[i], True)][:, :, None, None, None]
+        value = rows[:, 0] * x[:, :, left:right] + (rows[:, 1] * y[:, top:bottom] + rows[:, 2])
+        hit = (value[:-1] >= 0).all(axis=0) & (value[-1] > buffer)
+        np.copyto(buffer, value[-1], where=hit)
+        np.copyto(identity[:, top:bottom, left:right], np.int32(chosen[i]), where=hit)
+    return planes
+
+
+def _cast_quadrics(quadrics: Quadrics, first: int, camera: Camera, x: F32, y: F32, nearest: F32, identity: I32) -> None:
+    offset = quadrics.center - camera.position
+    chosen = np.flatnonzero((offset[:, 0] ** 2 + offset[:, 2] ** 2 < DRAW**2) & (offset @ camera.rotation[:, 2] > -15))
+    signs = np.array([(i, j, k) for i in (-1, 1) for j in (0, 1) for k in (-1, 1)])
+    box = np.empty((chosen.size, 8, 3))
+    box[..., 0] = offset[chosen, 0, None] + signs[:, 0] * quadrics.radius[chosen, None]
+    box[..., 1] = quadrics.extent[chosen][:, signs[:, 1]] - camera.position[1]
+    box[..., 2] = offset[chosen, 2, None] + signs[:, 2] * quadrics.radius[chosen, None]
+    rectangles, front = _rectangles(camera, box @ camera.rotation, _BOX_EDGES)
+    is_cylinder = quadrics.height[chosen] == 0
+    upright = np.where(is_cylinder, 0.0, 1 / np.where(is_cylinder, 1.0, quadrics.height[chosen]))
+    scale = np.stack([1 / quadrics.radius[chosen], upright, 1 / quadrics.radius[chosen]], axis=1)
+    form = camera.rotation * scale[:, :, None]  # ray -> direction in which the surface is a unit sphere
+    center = offset[chosen] * scale
+    outside = (center**2).sum(axis=1) - 1.0
+    toward = np.einsum("nij,ni->nj", form, center)
+    # Rays are counted from the middle of the rectangle, in float64: float32 would cancel on thin far things.
+    middle = (rectangles[:, ::2] + rectangles[:, 1::2]) / 2 - camera.K[:2, 2]
+    middle /= np.diag(camera.K)[:2]
+    shift = np.tile(np.eye(3), (chosen.size, 1, 1))
+    shift[:, :2, 2] = middle
+    swapped = form.transpose(0, 2, 1)
+    conics = toward[:, :, None] * toward[:, None] - outside[:, None, None] * swapped @ form
+    conics = (shift.transpose(0, 2, 1) @ conics @ shift).astype(np.float32)
+    outside_or_one = np.where(outside > 0, outside, 1.0)
+    lines = ((toward[:, None] @ shift)[:, 0] / outside_or_one[:, None]).astype(np.float32)
+    falls = (camera.rotation[1] @ shift).astype(np.float32)  # world y per meter of depth along the ray
+    centers = middle.astype(np.float32)
+    on_screen = np.flatnonzero(
+        (rectangles[:, 1] > rectangles[:, 0]) & (rectangles[:, 3] > rectangles[:, 2]) & (outside > 0)
+    )
+    for i in on_screen[np.argsort(front[on_screen], kind="stable")]:
+        left, right, top, bottom = rectangles[i]
+        buffer = nearest[:, top:bottom, left:right]
+        if buffer.min() * front[i] >= 1.0:
+            continue
+        k, conic, line = chosen[i], conics[i], lines[i]
+        xs, ys = x[:, :, left:right] - centers[i, 0], y[:, top:bottom] - centers[i, 1]
+        root = (2 * conic[0, 1] * xs) * ys
+        root += (conic[0, 0] * xs + 2 * conic[0, 2]) * xs + conic[2, 2]
+        root += (conic[1, 1] * ys + 2 * conic[1, 2]) * ys
+        hit = root > 0
+        inverse = np.sqrt(np.maximum(root, 0, out=root), out=root)
+        inverse *= np.float32(1 / outside[i])
+        inverse += line[0] * xs
+        inverse += line[1] * ys + line[2]
+        hit &= inverse > buffer
+        if front[i] < 2 * NEAR:
+            hit &= inverse < 1 / NEAR
+        if is_cylinder[i]:
+            fall = falls[i]
+            below = fall[0] * xs + (fall[1] * ys + fall[2])
+            highest, lowest = (np.float32(v) for v in quadrics.extent[k] - camera.position[1])
+            hit &= (below >= highest * inverse) & (below <= lowest * inverse)
+        np.copyto(buffer, inverse, where=hit)
+        np.copyto(identity[:, top:bottom, left:right], np.int32(first + k), where=hit)
+
+
+def _cast_ground(world: World, camera: Camera, x: F32, y: F32, nearest: F32, identity: I32) -> None:
+    """Solve road, kerb and pavement: two level planes and the upright step between them."""
+    down = camera.rotation[1].astype(np.float32)
+    drop = down[0] * x + (down[1] * y + down[2])
+    height = -float(camera.position[1])
+    upper = drop * np.float32(1 / (height - KERB_HEIGHT))
+    sample, row, column = np.nonzero(upper > np.maximum(nearest, np.float32(1e-6)))
+    if sample.size == 0:
+        return
+    upper = upper[sample, row, column]
+    lower = drop[sample, row, column] * np.float32(1 / height)
+    rays = (x[sample, 0, column], y[sample, row, 0])
+    across_upper = _across(world, camera, rays, upper)
+    across_lower = _across(world, camera, rays, lower)
+    half = np.float32(world.section.half_width)
+    edge, edge_lower = np.abs(across_upper), np.abs(across_lower)
+    on_road, on_top = edge_lower <= half, edge >= half
+    share = np.clip((half - edge) / np.maximum(edge_lower - edge, 1e-6), 0, 1)  # of the way down the kerb's face
+    face = 1 / (1 / upper + share * (1 / lower - 1 / upper))
+    inverse = np.where(on_top, upper, np.where(on_road, lower, face))
+    beyond = edge - half
+    kind = np.where(on_road, ROAD, KERB_FACE)
+    kind = np.where(on_top, np.where(beyond < KERB_WIDTH, KERB_TOP, PAVEMENT), kind)
+    kind = np.where(on_top & (beyond > world.section.pavement), GRASS, kind)
+    wins = inverse > nearest[sample, row, column]
+    sample, row, column = sample[wins], row[wins], column[wins]
+    nearest[sample, row, column] = inverse[wins]
+    identity[sample, row, column] = kind[wins]
+
+
+def _across(world: World, camera: Camera, rays: tuple[F32, F32], inverse: F32) -> F32:
+    x, z = ground_point(camera, rays[0], rays[1], inverse)
+    return world.road.locate(x, z)[1]
+
+
+def ground_point(camera: Camera, x: F32, y: F32, inverse_depth: F32) -> tuple[F32, F32]:
+    """Return world (x, z) of the points at an inverse depth along rays (x, y, 1).
+
+    Args:
+        camera: Where it stands and looks.
+        x: Of each ray, any shape.
+        y: Of each ray, of the same shape.
+        inverse_depth: Of each point, 1/meter, of the same shape.
+    """
+    turn, place = camera.rotation.astype(np.float32), camera.position.astype(np.float32)
+    depth = 1 / inverse_depth
+    return (
+        place[0] + (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2]) * depth,
+        place[2] + (turn[2, 0] * x + turn[2, 1] * y + turn[2, 2]) * depth,
+    )

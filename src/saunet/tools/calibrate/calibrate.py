@@ -1,0 +1,226 @@
+"""A camera's intrinsics and distortion from pictures of a board, and whether they can be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from numpy.typing import NDArray
+
+from saunet.data.camera_file import MODELS, CameraFile
+from saunet.data.clips import frame_paths
+from saunet.data.lens import Lens
+from saunet.data.sampling import evenly
+from saunet.errors import DataError, one_of, positive
+from saunet.io.images import read_image
+from saunet.io.video import VideoReader
+from saunet.tools.calibrate.boards import Board, BoardView
+
+FEWEST_VIEWS = 8
+UNCERTAIN = 0.02
+"""Relative standard deviation of the focal length from which a calibration is refused."""
+_CELLS = (6, 8)
+"""Rows and columns of the grid on which coverage is counted."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was found."""
+
+    camera: CameraFile
+    error: float
+    """Root mean square reprojection error in pixels."""
+    uncertainty: float
+    """Standard deviation of the focal length over the focal length; NaN for a fisheye lens."""
+    coverage: float
+    """Share of the image in which the board was seen."""
+    views: tuple[BoardView, ...]
+    looked_at: int
+    dropped: int
+    """Views left out since they fit the others badly."""
+    example: UInt8[np.ndarray, "h w 3"]
+    """One of the pictures."""
+
+
+def calibrate(
+    source: str | Path,
+    board: Board,
+    *,
+    model: str = "pinhole",
+    views: int = 40,
+    max_error: float = 1.0,
+    advance: Callable[[int, int | None], None] = lambda done, total: None,
+) -> Calibration:
+    """Calibrate a camera from a video or a folder of pictures of a board held in many places and tilts.
+
+    Args:
+        source: A video, or a folder of images.
+        board: What to look for.
+        model: ``pinhole`` (five numbers of distortion) or ``fisheye`` (four).
+        views: Pictures to use at most: those that differ most.
+        max_error: Reprojection error in pixels from which the result is refused.
+        advance: Called with the pictures looked at so far and their number.
+
+    Raises:
+        DataError: if the source cannot be read, the board is hardly seen, or the result cannot be trusted.
+        ConfigError: for an unknown model.
+    """
+    one_of("model", model, MODELS)
+    positive("max_error", max_error)
+    most = max(FEWEST_VIEWS, int(positive("views", views)))
+    found: list[BoardView] = []
+    looked_at, size, example = 0, (0, 0), None
+    for image, total in _pictures(Path(source).expanduser(), 3 * most):
+        looked_at += 1
+        if size != (0, 0) and image.shape[:2] != size:
+            raise DataError(
+                f"{source} mixes pictures of {size[1]}x{size[0]} and {image.shape[1]}x{image.shape[0]}; "
+                "calibrate with pictures of one camera in one mode"
+            )
+        size = (image.shape[0], image.shape[1])
+        view = board.find(image)
+        if view is not None:
+            found.append(view)
+            example = image
+        advance(looked_at, total)
+    if len(found) < FEWEST_VIEWS or example is None:
+        raise DataError(
+            f"a {board} was found in {len(found)} of {looked_at} pictures of {source}, needed are {FEWEST_VIEWS}; "
+            "check columns and rows (they count squares), keep the whole board in view, sharp and flat"
+        )
+    chosen = _most_different(found, size, most)
+    K, distortion, error, uncertainty, used = _solve(chosen, size, model)
+    problem = _problem(error, uncertainty, max_error, float(K[0, 0]) / size[1])
+    if problem:
+        raise DataError(f"the calibration from {source} is not to be trusted: {problem}")
+    # Without fps, also where the source is a video: it is that recording's, and other recordings have their own.
+    camera = CameraFile(
+        Path(source), K, size, tuple(distortion), model, reprojection_error=error if error > 0 else None
+    )
+    coverage = _coverage(used, size)
+    return Calibration(camera, error, uncertainty, coverage, tuple(used), looked_at, len(chosen) - len(used), example)
+
+
+def check_picture(result: Calibration) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Return a picture to judge a calibration by: all corners found, and beside it the same picture undistorted."""
+    left = result.example.copy()
+    radius = max(2, left.shape[1] // 320)
+    for view in result.views:
+        for x, y in view.pixels:
+            cv2.circle(left, (round(float(x)), round(float(y))), radius, (255, 60, 0), -1, cv2.LINE_AA)
+    right = Lens(result.camera, *result.example.shape[:2])(result.example)
+    return np.concatenate([left, right], axis=1)
+
+
+def _pictures(source: Path, most: int) -> Any:
+    """Yield (image, number of pictures), evenly spread where there are more than ``most``."""
+    if source.is_dir():
+        paths = frame_paths(source)
+        if not paths:
+            raise DataError(f"no images in {source}; give a folder of pictures of the board, or a video")
+        for place in evenly(len(paths), most):
+            yield read_image(paths[place]), min(most, len(paths))
+        return
+    with VideoReader(source) as reader:
+        step = max(1, (reader.declared or 0) // most)
+        for number, image in enumerate(reader):
+            if number % step == 0:
+                yield image, (reader.declared or 0) // step or None
+
+
+def _most_different(found: Sequence[BoardView], size: tuple[int, int], most: int) -> list[BoardView]:
+    """Choose views that differ most in place, size and tilt, one after the other."""
+    features = np.array([_feature(view, size) for view in found])
+    chosen = [0]
+    distance = np.linalg.norm(features - features[0], axis=1)
+    while len(chosen) < min(most, len(found)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
+    return [found[place] for place in sorted(chosen)]
+
+
+def _feature(view: BoardView, size: tuple[int, int]) -> NDArray[np.float64]:
+    pixels = view.pixels / np.array([size[1], size[0]], dtype=np.float64)
+    center, spread = pixels.mean(0), pixels.std(0)
+    fit, *_ = np.linalg.lstsq(np.c_[view.points[:, :2] / view.points[:, :2].std(), np.ones(len(pixels))], pixels, None)
+    return np.concatenate([center, spread, fit[:2].ravel()])
+
+
+def _solve(
+    views: Sequence[BoardView], size: tuple[int, int], model: str
+) -> tuple[NDArray[np.float64], list[float], float, float, list[BoardView]]:
+    """Return K, distortion, error, uncertainty and the views used, without those that fit badly."""
+    used = list(views)
+    while True:
+        K, distortion, error, uncertainty, errors = (_fisheye if model == "fisheye" else _pinhole)(used, size)
+        good = errors <= max(0.5, 3 * float(np.median(errors)))
+        if good.all() or int(good.sum()) < FEWEST_VIEWS:
+            return K, distortion, error, uncertainty, used
+        used = [view for view, fits in zip(used, good, strict=True) if fits]
+
+
+Solution = tuple[NDArray[np.float64], list[float], float, float, NDArray[np.float64]]
+
+
+def _pinhole(views: Sequence[BoardView], size: tuple[int, int]) -> Solution:
+    error, K, distortion, _, _, deviations, _, errors = cv2.calibrateCameraExtended(
+        [view.points for view in views],
+        [view.pixels for view in views],
+        (size[1], size[0]),
+        None,  # type: ignore[call-overload]
+        None,
+    )
+    uncertainty = float(np.max(np.ravel(deviations)[:2] / np.array([K[0, 0], K[1, 1]])))
+    return np.asarray(K, np.float64), np.ravel(distortion)[:5].tolist(), float(error), uncertainty, np.ravel(errors)
+
+
+def _fisheye(views: Sequence[BoardView], size: tuple[int, int]) -> Solution:
+    points = [view.points[None].astype(np.float64) for view in views]
+    pixels = [view.pixels[None].astype(np.float64) for view in views]
+    flags = _flag("CALIB_RECOMPUTE_EXTRINSIC") | _flag("CALIB_FIX_SKEW")
+    try:
+        error, K, distortion, rotations, shifts = cv2.fisheye.calibrate(
+            points, pixels, (size[1], size[0]), np.zeros((3, 3)), np.zeros((4, 1)), flags=flags
+        )
+    except cv2.error as reason:
+        raise DataError(
+            f"the views do not fit a fisheye lens ({str(reason).strip().splitlines()[-1]}); "
+            "hold the board nearer to the middle and tilt it less, or use lens=pinhole"
+        ) from reason
+    errors = []
+    for each, seen, rotation, shift in zip(points, pixels, rotations, shifts, strict=True):
+        expected, _ = cv2.fisheye.projectPoints(each, rotation, shift, K, distortion)
+        errors.append(float(np.sqrt(((np.asarray(expected) - seen) ** 2).sum(-1).mean())))
+    return np.asarray(K, np.float64), np.ravel(distortion).tolist(), float(error), float("nan"), np.array(errors)
+
+
+def _flag(name: str) -> int:
+    """Return a flag of OpenCV's fisheye calibration, which moved between its versions 4 and 5."""
+    return int(getattr(cv2.fisheye if hasattr(cv2.fisheye, name) else cv2, name))
+
+
+def _problem(error: float, uncertainty: float, max_error: float, focal: float) -> str | None:
+    if not error <= max_error:
+        return (
+            f"the reprojection error is {error:.2f} pixels and at most {max_error:g} is accepted; "
+            "use sharp pictures, a flat board and the right number of squares, or raise max_error"
+        )
+    remedy = "the views are too alike: tilt the board by up to 45 degrees in all directions, near and far"
+    if not 0.2 < focal < 10:
+        return f"a focal length of {focal:.1f} picture widths is impossible; {remedy}"
+    if uncertainty > UNCERTAIN:
+        return f"the focal length is known to {uncertainty:.1%} only; {remedy}"
+    return None
+
+
+def _coverage(views: Sequence[BoardView], size: tuple[int, int]) -> float:
+    seen = np.zeros(_CELLS, dtype=bool)
+    for view in views:
+        cells = (view.pixels[:, ::-1] / np.array(size) * np.array(_CELLS)).astype(int)
+        seen[tuple(np.clip(cells, 0, np.array(_CELLS) - 1).T)] = True
+    return float(seen.mean())

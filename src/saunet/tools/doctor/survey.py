@@ -1,0 +1,297 @@
+"""What a data set holds, measured: frames, motion, light, cameras, ground truth, and how fast it is read."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from saunet.data.drive import Drive
+from saunet.data.manifest import numbering
+from saunet.data.module import DepthDataModule
+from saunet.data.motion import relative_change, shrink
+from saunet.data.sampling import evenly
+from saunet.data.static import optical_flow
+from saunet.data.windows import WindowDataset
+from saunet.errors import DataError, SaunetError
+
+SPLITS = ("train", "val", "test")
+ABSENT = "in absent recordings"
+"""The reason under which the frames of recordings without any frame are counted, apart from gaps in others."""
+BANDS = 32
+"""Horizontal bands of the image for which motion is told apart."""
+_TRUTHS = 16
+"""Ground-truth maps that are looked at."""
+_PICTURES = 8
+
+
+@dataclass(frozen=True)
+class FrameFacts:
+    """One frame that was read."""
+
+    drive: str
+    index: int
+    size: tuple[int, int] = (0, 0)
+    """(height, width)."""
+    seconds: float = 0.0
+    """To read and decode it."""
+    file_bytes: int | None = None
+    brightness: float = 0.0
+    """Mean, 0 to 1."""
+    contrast: float = 0.0
+    """Standard deviation, 0 to 1."""
+    flow: float | None = None
+    """Median motion against a neighbor, pixels at 320 width; None without a neighbor."""
+    change: float | None = None
+    """Mean difference to the neighbor over the picture's standard deviation."""
+    bands: NDArray[np.float64] | None = None
+    """Mean motion of each horizontal band, from top to bottom."""
+    problem: str | None = None
+    """Why it cannot be read."""
+
+
+@dataclass(frozen=True)
+class CameraFacts:
+    """The camera of one drive."""
+
+    drive: str
+    K: NDArray[np.float64]
+    size: tuple[int, int]
+    fps: float | None
+    height: float | None
+    """Meters above the road."""
+
+
+@dataclass(frozen=True)
+class TruthFacts:
+    """One ground-truth map that was read."""
+
+    drive: str
+    index: int
+    known: float
+    """Share of the pixels."""
+    low: float
+    middle: float
+    high: float
+    """Smallest, median and largest depth in meters."""
+
+
+@dataclass
+class Survey:
+    """Everything that was measured."""
+
+    problems: dict[str, SaunetError] = field(default_factory=dict)
+    """Split -> why it cannot be used."""
+    windows: dict[str, int] = field(default_factory=dict)
+    left_out: dict[str, dict[str, int]] = field(default_factory=dict)
+    """Split -> reason -> frames."""
+    absent: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Split -> recordings that it lists and that have no frame at all, and all that it lists."""
+    test_only: frozenset[str] = frozenset()
+    """Recordings that neither training nor validation read."""
+    fingerprints: dict[str, str] = field(default_factory=dict)
+    shared_frames: int = 0
+    """Frames that training and validation windows both read."""
+    known: int = 0
+    """Frames that any split reads."""
+    judged: int = 0
+    """Of them, those that were asked for."""
+    frames: list[FrameFacts] = field(default_factory=list)
+    cameras: list[CameraFacts] = field(default_factory=list)
+    camera_problems: list[str] = field(default_factory=list)
+    truths: list[TruthFacts] = field(default_factory=list)
+    truth_wanted: int = 0
+    """Frames whose ground truth was asked for."""
+    pictures: list[tuple[str, NDArray[np.uint8]]] = field(default_factory=list)
+    """A few frames with their names, 320 wide."""
+    numbering: dict[str, str] = field(default_factory=dict)
+    step: int = 1
+    """Offset of the neighbor that motion is measured against."""
+    cacheable: bool = False
+    """Whether the data module could read a cache of smaller images and does not."""
+
+    def readable(self) -> list[FrameFacts]:
+        """Return the frames that could be read."""
+        return [frame for frame in self.frames if frame.problem is None]
+
+    def compared(self) -> list[FrameFacts]:
+        """Return the frames whose motion against a neighbor was measured."""
+        return [frame for frame in self.readable() if frame.flow is not None]
+
+
+def survey(
+    data: DepthDataModule,
+    splits: Sequence[str] = SPLITS,
+    frames: int = 1000,
+    advance: Callable[[int, int], None] = lambda done, total: None,
+) -> Survey:
+    """Look at a data module: set its splits up, and read frames of all drives, evenly spread.
+
+    Args:
+        data: What to look at.
+        splits: Which of ``train``, ``val`` and ``test``.
+        frames: Frames to read at most; 0 reads all.
+        advance: Called with the number of frames read and to read.
+    """
+    cacheable = data.cacheable and data.copies is None
+    found = Survey(step=min((abs(offset) for offset in data.offsets), default=1), cacheable=cacheable)
+    datasets = dict(_set_up(data, splits, found))
+    if "train" in datasets and "val" in datasets:
+        found.shared_frames = len(_read_by(datasets["train"]) & _read_by(datasets["val"]))
+    drives: dict[str, Drive] = {}
+    wanted: dict[str, set[int]] = {}
+    for dataset in datasets.values():
+        for position, frame in dataset.windows:
+            drive = dataset.drives[position]
+            drives[drive.name] = drive
+            wanted.setdefault(drive.name, set()).update(frame + offset for offset in (0, *dataset.offsets))
+    for name in wanted:
+        found.numbering[name] = numbering(drives[name])
+    trained = {drive.name for split in ("train", "val") if split in datasets for drive in datasets[split].drives}
+    found.test_only = frozenset(wanted.keys() - trained) if trained else frozenset()
+    everything = [(name, frame) for name, numbers in wanted.items() for frame in sorted(numbers)]
+    plan = _spread(everything, frames)
+    found.known, found.judged = len(everything), len(plan)
+    _read_frames(found, drives, plan, advance)
+    for name in wanted:
+        _look_at_camera(found, drives[name], min(wanted[name]))
+    for split in ("test", "val"):
+        if split in datasets and not found.truths:
+            _read_truths(found, datasets[split])
+    return found
+
+
+def _set_up(data: DepthDataModule, splits: Sequence[str], found: Survey) -> Iterator[tuple[str, WindowDataset]]:
+    for split in splits:
+        try:
+            data.setup_split(split)
+        except SaunetError as error:
+            found.problems[split] = error
+        if split not in data.datasets:
+            continue
+        dataset = data.datasets[split]
+        found.windows[split] = len(dataset)
+        found.fingerprints[split] = dataset.fingerprint()
+        found.left_out[split] = {}
+        absent = [not drive.indices for drive in dataset.drives]
+        found.absent[split] = (sum(absent), len(absent))
+        for usage, gone in zip(data.usage[split], absent, strict=True):
+            for reason, count in usage.left_out.items():
+                reason = ABSENT if gone and reason == "missing" else reason
+                found.left_out[split][reason] = found.left_out[split].get(reason, 0) + count
+        yield split, dataset
+
+
+def _read_by(dataset: WindowDataset) -> set[tuple[str, int]]:
+    """Return all frames that windows read, targets and neighbors."""
+    return {
+        (dataset.drives[position].name, frame + offset)
+        for position, frame in dataset.windows
+        for offset in (0, *dataset.offsets)
+    }
+
+
+def _spread(plan: Sequence[tuple[str, int]], most: int) -> list[tuple[str, int]]:
+    if not most or len(plan) <= most:
+        return list(plan)
+    return [plan[place] for place in evenly(len(plan), most)]
+
+
+def _read_frames(
+    found: Survey, drives: Mapping[str, Drive], plan: Sequence[tuple[str, int]], advance: Callable[[int, int], None]
+) -> None:
+    shown = set(evenly(len(plan), _PICTURES))
+    existing = {name: set(drives[name].indices) for name in {name for name, _ in plan}}
+    last: tuple[str, int, NDArray[np.uint8]] | None = None
+    for place, (name, index) in enumerate(plan):
+        drive = drives[name]
+        neighbor = index - found.step if index - found.step in existing[name] else index + found.step
+        try:
+            if last is None or last[:2] != (name, neighbor):
+                before = shrink(drive.image(neighbor)) if neighbor in existing[name] else None
+            else:
+                before = last[2]
+        except DataError:
+            before = None  # it is reported when its own turn comes
+        start = time.perf_counter()
+        try:
+            image = drive.image(index)
+        except DataError as error:
+            found.frames.append(FrameFacts(name, index, problem=str(error)))
+            continue
+        seconds = time.perf_counter() - start
+        small = shrink(image)
+        found.frames.append(_facts(drive, index, image.shape[:2], seconds, small, before))
+        if place in shown:
+            found.pictures.append((f"{name} {index}", small))
+        last = (name, index, small)
+        advance(place + 1, len(plan))
+
+
+def _facts(
+    drive: Drive,
+    index: int,
+    size: tuple[int, ...],
+    seconds: float,
+    small: NDArray[np.uint8],
+    before: NDArray[np.uint8] | None,
+) -> FrameFacts:
+    flow = change = bands = None
+    if before is not None and before.shape == small.shape:
+        lengths = np.linalg.norm(optical_flow(before, small), axis=-1)
+        flow = float(np.median(lengths))
+        change = relative_change(before, small)
+        bands = np.array([band.mean() for band in np.array_split(lengths, BANDS)], dtype=np.float64)
+    return FrameFacts(
+        drive.name,
+        index,
+        (size[0], size[1]),
+        seconds,
+        _file_bytes(drive, index),
+        float(small.mean()) / 255,
+        float(small.mean(axis=2).std()) / 255,
+        flow,
+        change,
+        bands,
+    )
+
+
+def _file_bytes(drive: Drive, index: int) -> int | None:
+    path = getattr(drive, "path", None)
+    try:
+        return Path(path(index)).stat().st_size if callable(path) else None
+    except OSError:
+        return None
+
+
+def _look_at_camera(found: Survey, drive: Drive, index: int) -> None:
+    sizes = Counter(frame.size for frame in found.readable() if frame.drive == drive.name)
+    try:
+        K = np.asarray(drive.intrinsics(index), dtype=np.float64)
+    except DataError as error:
+        found.camera_problems.append(str(error))
+        return
+    if sizes:
+        fps, height = getattr(drive, "fps", None), getattr(drive, "camera_height", None)
+        found.cameras.append(CameraFacts(drive.name, K, sizes.most_common(1)[0][0], fps, height))
+
+
+def _read_truths(found: Survey, dataset: WindowDataset) -> None:
+    chosen = _spread([(dataset.drives[position].name, frame) for position, frame in dataset.windows], _TRUTHS)
+    drives = {drive.name: drive for drive in dataset.drives}
+    for name, index in chosen:
+        found.truth_wanted += 1
+        try:
+            depth = drives[name].depth(index)
+        except DataError as error:
+            found.frames.append(FrameFacts(name, index, problem=str(error)))
+            continue
+        known = depth[depth > 0] if depth is not None else np.zeros(0)
+        if depth is not None and known.size:
+            low, middle, high = (float(value) for value in np.quantile(known, [0, 0.5, 1]))
+            found.truths.append(TruthFacts(name, index, known.size / depth.size, low, middle, high))

@@ -1,0 +1,188 @@
+"""Smaller copies of recordings, made once, so that training does not decode full images again and again.
+
+Whatever happens, the folder is a part of the finished cache: each copy appears when it is whole, a recording's list of
+hashes when all its copies are there. Run again, it checks what is there against the lists and makes the rest, and those
+copies anew whose originals have changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from saunet.data.drive import Drive
+from saunet.data.frame_size import check_frame
+from saunet.data.image_cache import FRAMES, SETTINGS, CacheSettings, ImageCache, origin
+from saunet.errors import DataError
+from saunet.io.atomic import write_bytes, write_json
+from saunet.io.images import resize
+from saunet.tools.prepare.cleanup import remove_partial
+from saunet.tools.prepare.pool import OnError, Work
+
+Entry = tuple[int, str, tuple[int, int], list[int] | None]
+"""Bytes and SHA-256 of a copy; (height, width) of its original, and the `_state` of the original's file."""
+
+
+@dataclass(frozen=True, slots=True)
+class CacheReport:
+    """What `build_cache` did."""
+
+    made: int
+    """Copies written now."""
+    verified: int
+    """Copies that were there and are whole."""
+    replaced: int
+    """Of those written now: copies that were there and damaged, or made from an original that has changed."""
+    failures: tuple[str, ...]
+    """One sentence for each frame that was skipped because its original is broken."""
+
+
+def encode(image: np.ndarray, settings: CacheSettings) -> bytes:
+    """Return a frame at the cache's size as the bytes of a file.
+
+    Args:
+        image: h x w x 3, RGB.
+        settings: Size, format and quality.
+
+    Raises:
+        DataError: if this OpenCV lacks the format.
+    """
+    small = cv2.cvtColor(resize(image, settings.height, settings.width), cv2.COLOR_RGB2BGR)
+    flag = cv2.IMWRITE_JPEG_QUALITY if settings.format == "jpg" else cv2.IMWRITE_WEBP_QUALITY
+    done, data = cv2.imencode(f".{settings.format}", small, [flag, settings.quality])
+    if not done:
+        raise DataError(f"this OpenCV cannot write {settings.format}; use format=jpg")
+    return bytes(data.tobytes())
+
+
+@dataclass(frozen=True, slots=True)
+class _Copy:
+    """Makes the copy of one frame, or keeps the one that is there if it is whole."""
+
+    drives: tuple[Drive, ...]
+    cache: ImageCache
+    known: tuple[dict[str, Any], ...]
+
+    def __call__(self, item: tuple[int, int]) -> tuple[str, Entry]:
+        drive, frame = self.drives[item[0]], item[1]
+        path, known, key = self.cache.path(drive, frame), self.known[item[0]], f"{frame:010d}"
+        there, state = path.is_file(), _state(drive, frame)
+        if there:
+            data = path.read_bytes()
+            digest = hashlib.sha256(data).hexdigest()
+            same = known.get("originals", {}).get(key) == state
+            if same and known.get("frames", {}).get(key) == [len(data), digest]:
+                return "verified", (len(data), digest, tuple(known["native"]), state)
+        image = drive.image(frame)
+        check_frame(drive, frame, image)
+        size = (image.shape[0], image.shape[1])
+        fresh = encode(image, self.cache.settings)
+        entry = (len(fresh), hashlib.sha256(fresh).hexdigest(), size, state)
+        if there and data == fresh:
+            return "verified", entry
+        write_bytes(path, fresh)
+        return "replaced" if there else "made", entry
+
+
+def _state(drive: Drive, frame: int) -> list[int] | None:
+    """Return bytes and time of change (ns) of a frame's original file; None where there is none to ask."""
+    path = getattr(drive, "path", None)
+    if not callable(path):
+        return None
+    try:
+        found = Path(path(frame)).stat()
+    except OSError:  # reading it says what is wrong
+        return None
+    return [found.st_size, found.st_mtime_ns]
+
+
+def build_cache(
+    recordings: Sequence[tuple[Drive, Sequence[int]]],
+    folder: str | Path,
+    settings: CacheSettings,
+    workers: int = 0,
+    on_error: OnError = "raise",
+) -> CacheReport:
+    """Make, complete or check a cache. The recordings are only read.
+
+    Args:
+        recordings: Recordings of any data set, and the frames of each.
+        folder: Of the cache; made if missing.
+        settings: Size, format and quality of the copies.
+        workers: Processes; 0 works in this one.
+        on_error: A broken original: ``raise`` stops and names it, ``skip`` goes on without the frame.
+
+    Raises:
+        DataError: if the folder holds something else or a cache of another version or other settings, a frame is
+            broken or has another size than its recording, or the system refuses to write.
+    """
+    cache = _open(Path(folder).expanduser(), settings)
+    homes = [cache.home(drive) for drive, _ in recordings]
+    for home in homes:
+        remove_partial(home)
+    known = tuple(cache.frames(drive) for drive, _ in recordings)
+    for (drive, _), frames in zip(recordings, known, strict=True):
+        if frames:
+            cache.check_origin(drive, frames)
+    items = [(place, frame) for place, (_, frames) in enumerate(recordings) for frame in frames]
+    work: Work[tuple[int, int], tuple[str, Entry]] = Work(
+        _Copy(tuple(drive for drive, _ in recordings), cache, known), workers, on_error
+    )
+    counts = {"made": 0, "verified": 0, "replaced": 0}
+    lists: list[dict[int, Entry]] = [{} for _ in recordings]
+    waiting = [len(frames) for _, frames in recordings]
+    for (place, frame), (what, entry) in work.run(items, "cache"):
+        counts[what] += 1
+        lists[place][frame] = entry
+        waiting[place] -= 1
+        if waiting[place] == 0:
+            _finish(homes[place], recordings[place][0], known[place], lists[place])
+    for place, left in enumerate(waiting):
+        if left and lists[place]:  # some of its frames are broken and skipped
+            _finish(homes[place], recordings[place][0], known[place], lists[place])
+    return CacheReport(
+        counts["made"] + counts["replaced"], counts["verified"], counts["replaced"], tuple(work.failures)
+    )
+
+
+def _open(folder: Path, settings: CacheSettings) -> ImageCache:
+    """Claim a folder for a cache of these settings, or take up the one that is there."""
+    path = folder / SETTINGS
+    remove_partial(folder)
+    if not path.is_file():
+        if folder.is_dir() and any(folder.iterdir()):
+            raise DataError(f"{folder} is not empty and not a cache; set folder to a new one")
+        write_json(path, settings.plain())
+    cache = ImageCache(folder)
+    changed = [key for key, value in settings.plain().items() if cache.settings.plain()[key] != value]
+    if changed:
+        is_now = ", ".join(f"{key}={cache.settings.plain()[key]}" for key in changed)
+        raise DataError(f"the cache at {folder} was made with {is_now}; use the same, or set folder to a new one")
+    return cache
+
+
+def _finish(home: Path, drive: Drive, known: dict[str, Any], entries: dict[int, Entry]) -> None:
+    """Write the list of a recording's copies; those of other runs stay in it."""
+    sizes = {size: f"frame {frame}" for frame, (_, _, size, _) in entries.items()}
+    if known:
+        sizes.setdefault((known["native"][0], known["native"][1]), "those before")
+    if len(sizes) > 1:  # of a recording that does not know its size by itself
+        examples = " and ".join(f"{h}x{w} ({sizes[h, w]})" for h, w in sorted(sizes))
+        raise DataError(
+            f"frames of '{drive.name}' have different sizes: {examples} (height x width); "
+            "a cache needs one size a recording"
+        )
+    frames, originals = dict(known.get("frames", {})), dict(known.get("originals", {}))
+    frames |= {f"{frame:010d}": [count, digest] for frame, (count, digest, _, _) in entries.items()}
+    originals |= {f"{frame:010d}": state for frame, (_, _, _, state) in entries.items() if state}
+    content: dict[str, Any] = {"native": list(*sizes), "frames": dict(sorted(frames.items()))}
+    content |= {"originals": dict(sorted(originals.items()))} if originals else {}
+    content |= {"origin": origin(drive)} if origin(drive) else {}
+    if content != known:
+        write_json(home / FRAMES, content, indent=0)

@@ -1,0 +1,104 @@
+"""Which frames a preparation is about: all below a root, those of a split, or all recordings of a data module."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+from saunet.data import splits
+from saunet.data.drive import Drive, StereoDrive
+from saunet.data.kitti import CAMERAS, DepthKind, KittiDrive, KittiRaw
+from saunet.data.module import DepthDataModule
+from saunet.errors import ConfigError, DataError, one_of, suggest
+
+Recording = tuple[KittiDrive, list[int]]
+"""A recording and the frames of it that are wanted."""
+
+
+def kitti_recordings(
+    root: str | Path,
+    cameras: Sequence[str] = ("left", "right"),
+    drives: Sequence[str] = (),
+    split: str = "all",
+    depth: DepthKind = "camera_z",
+) -> list[Recording]:
+    """Find the recordings of a KITTI raw tree that have frames.
+
+    Args:
+        root: As the ``kitti`` data module's.
+        cameras: ``left``, ``right`` or both.
+        drives: Only these drives, by name or by the end of a name; all if empty.
+        split: ``all`` frames; the training and validation frames of a named split, with their neighbors in time; or
+            a file in Monodepth2's format.
+        depth: Kind of ground truth the recordings give.
+
+    Raises:
+        ConfigError: if a camera, drive or split is unknown.
+        DataError: if there is no such recording, or a calibration is broken.
+    """
+    for camera in cameras:
+        one_of("cameras", camera, CAMERAS)
+    raw = KittiRaw(root)
+    for drive in drives:
+        if not any(name.endswith(drive) for name in raw.drives):
+            hint = suggest(drive, [name.rpartition("/")[2] for name in raw.drives])
+            raise ConfigError(f"drives holds '{drive}', which is not below {raw.root}{hint}")
+    wanted = _frames(split)
+    found: list[Recording] = []
+    for name in raw.drives:
+        if drives and not any(name.endswith(drive) for drive in drives):
+            continue
+        for camera in cameras:
+            recording = raw.drive(name, camera, depth)
+            side = CAMERAS[camera][1]
+            frames = [n for n in recording.indices if wanted is None or (name, n, side) in wanted]
+            if frames:
+                found.append((recording, frames))
+    if not found:
+        raise DataError(f"the drives below {raw.root} hold no frames of cameras {list(cameras)} and split '{split}'")
+    return found
+
+
+def module_recordings(data: DepthDataModule) -> list[tuple[Drive, Sequence[int]]]:
+    """Return the recordings that a data module trains and validates on, with all frames of each.
+
+    Args:
+        data: The data module, with the settings of the training; with ``stereo`` the other cameras come along.
+
+    Raises:
+        ConfigError: if the module cannot read prepared copies.
+        DataError: if its data are missing or broken.
+    """
+    if not data.cacheable:
+        raise ConfigError(
+            f"{type(data).__name__} reads no copies made by saunet-prepare; use data=kitti, kitti_odometry or campus"
+        )
+    data.prepare_data()
+    drives: dict[str, Drive] = {}
+    for split in ("train", "val"):
+        for drive, *_ in data.select(split):
+            drives.setdefault(drive.name, drive)
+            if data.stereo:
+                partner = cast(StereoDrive, drive).partner()
+                drives.setdefault(partner.name, partner)
+    return [(drive, drive.indices) for drive in drives.values() if len(drive.indices)]
+
+
+def _frames(split: str) -> set[tuple[str, int, str]] | None:
+    if split == "all":
+        return None
+    if split in splits.TRAINING:
+        train, val = splits.training_split(split, 0)
+        frames = [*train, *val]
+    elif split in splits.TEST:
+        frames = splits.test_split(split)
+    elif Path(split).is_file():
+        frames = splits.read_split(Path(split))
+    else:
+        words = ("all", *splits.TRAINING, *splits.TEST)
+        hint = suggest(split, words)
+        raise ConfigError(
+            f"split is '{split}'{hint or ','} allowed: {', '.join(words)}, or the path of an existing file"
+        )
+    return {(frame.drive, frame.number + step, frame.side) for frame in frames for step in (-1, 0, 1)}

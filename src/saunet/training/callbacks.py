@@ -1,0 +1,208 @@
+"""What accompanies a training: checkpoints, the progress bar, a picture every epoch."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_info
+from rich.console import Console
+
+from saunet.data.module import DepthDataModule
+from saunet.errors import CheckpointError, positive
+from saunet.io.atomic import replacing
+from saunet.io.images import write_image
+from saunet.io.progress import watched
+from saunet.metrics.functional import RISING
+from saunet.runs.run_record import RunRecord
+from saunet.training.module import EPOCH_LOSS
+from saunet.training.pictures import training_panel
+from saunet.types import EvalBatch
+
+
+class SplitsRecorded(Callback):
+    """Write into ``run.json`` which frames a run sees, as one SHA-256 a split.
+
+    Args:
+        record: The run's record.
+    """
+
+    def __init__(self, record: RunRecord) -> None:
+        self.record = record
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write them once the data are set up."""
+        data = getattr(trainer, "datamodule", None)
+        if trainer.is_global_zero and isinstance(data, DepthDataModule):
+            self.record.write(splits=data.fingerprints())
+
+
+class LastCheckpoint(ModelCheckpoint):
+    """``last.ckpt``, after every epoch and every so many steps: what to resume from.
+
+    Args:
+        folder: Where it goes.
+        every_n_steps: Also after so many optimizer steps; 0 for never.
+    """
+
+    def __init__(self, folder: str, every_n_steps: int = 1000) -> None:
+        super().__init__(folder, "last", enable_version_counter=False)
+        self.every_n_steps = int(positive("every_n_steps", every_n_steps, allow_zero=True))
+        self._saved_at = 0
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Save when it is time, right after an optimizer step."""
+        step = trainer.global_step
+        if (batch_idx + 1) % trainer.accumulate_grad_batches and not trainer.is_last_batch:
+            return  # a gradient that is being accumulated is in no checkpoint
+        if self.every_n_steps and step % self.every_n_steps == 0 and step != self._saved_at:
+            self._saved_at = step
+            trainer.save_checkpoint(Path(str(self.dirpath)) / "last.ckpt", weights_only=False)
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """``best.ckpt``: the state with the best monitored value, the smallest but for ``val/a1``, ``a2`` and ``a3``.
+
+    Args:
+        folder: Where it goes.
+        monitor: What decides; where it is not measured (no validation frame has ground truth), ``val/loss`` does, and
+            without validation ``train/loss``, its mean over the epoch.
+    """
+
+    def __init__(self, folder: str, monitor: str = "val/abs_rel") -> None:
+        super().__init__(folder, "best", monitor, mode=_direction(monitor), enable_version_counter=False)
+        self.wanted = monitor
+        self._scored_by, self._said = monitor, False
+
+    @property
+    def cost(self) -> float | None:
+        """The best monitored value as what a search minimizes: its negative where more is better."""
+        if self.best_model_score is None:
+            return None
+        return -float(self.best_model_score) if self.mode == "max" else float(self.best_model_score)
+
+    @property
+    def state_key(self) -> str:
+        """Name in the checkpoint; without the monitor, which may have fallen back."""
+        return "BestCheckpoint"
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over the best so far from the run that is resumed, with its file: a new run has its own folder."""
+        best, folder = Path(state_dict["best_model_path"]), Path(str(self.dirpath))
+        if best.is_file() and best.parent != folder:
+            folder.mkdir(parents=True, exist_ok=True)
+            with replacing(folder / best.name, CheckpointError) as temporary:
+                shutil.copyfile(best, temporary)
+            moved = str(folder / best.name)
+            state_dict = {
+                **state_dict,
+                "dirpath": str(folder),
+                "best_model_path": moved,
+                "kth_best_model_path": moved,
+                "best_k_models": {moved: state_dict["best_model_score"]},
+            }
+        super().load_state_dict(state_dict)
+        self._scored_by = state_dict["monitor"]
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Choose what to monitor, then save."""
+        if not (trainer.sanity_checking or self._should_save_on_train_epoch_end(trainer)):
+            self._choose(trainer)
+        super().on_validation_end(trainer, pl_module)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Choose what to monitor, then save."""
+        if self._should_save_on_train_epoch_end(trainer):
+            self._choose(trainer)
+        super().on_train_epoch_end(trainer, pl_module)
+
+    def _choose(self, trainer: Trainer) -> None:
+        wanted = EPOCH_LOSS if self.wanted == "train/loss" else self.wanted
+        measured = [name for name in (wanted, "val/loss", EPOCH_LOSS) if name in trainer.callback_metrics]
+        self.monitor = measured[0] if measured else wanted
+        self.mode = _direction(self.monitor)
+        if self.monitor != wanted and not self._said:
+            self._said = True
+            named = "the epoch's mean train/loss" if self.monitor == EPOCH_LOSS else self.monitor
+            rank_zero_info(f"{self.wanted} is not measured in this run; best.ckpt is chosen by {named}")
+        if self.monitor != self._scored_by:  # what is known of the best is of another kind
+            self._scored_by = self.monitor
+            self.best_k_models, self.kth_best_model_path, self.best_model_score = {}, "", None
+
+
+def _direction(monitor: str) -> Literal["min", "max"]:
+    return "max" if monitor.removeprefix("val/") in RISING else "min"
+
+
+class PicturePanel(Callback):
+    """Write input, disparity, warped view and auto-mask of one validation batch after every validation.
+
+    Args:
+        folder: Where the PNG files go.
+        rows: How many samples to show.
+    """
+
+    def __init__(self, folder: str, rows: int = 2) -> None:
+        self.folder, self.rows = Path(folder), rows
+        self._batch: EvalBatch | None = None
+
+    def on_validation_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: EvalBatch, batch_idx: int, dataloader_idx: int = 0
+    ) -> None:
+        """Keep the first batch that has source images."""
+        if self._batch is None and trainer.is_global_zero and batch["sources"].shape[1] > 0:
+            self._batch = batch
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw the batch with the networks as they are now."""
+        batch, self._batch = self._batch, None
+        if batch is None or trainer.sanity_checking:
+            return
+        with torch.no_grad():
+            pyramid, views, terms = pl_module.step(batch)  # type: ignore[operator]
+        panel = training_panel(batch, pyramid, views, terms, rows=self.rows)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_image(self.folder / f"epoch_{trainer.current_epoch:03d}.png", panel)
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                logger.experiment.add_image("panel", panel, trainer.global_step, dataformats="HWC")
+
+
+class Progress(TQDMProgressBar):
+    """One bar with what matters, after one line that says how large the networks are.
+
+    The bar is on a terminal or in a notebook only; a file or a pipe gets the line alone.
+
+    Args:
+        refresh_rate: Steps between two updates of the bar.
+    """
+
+    def __init__(self, refresh_rate: int = 5) -> None:
+        super().__init__(refresh_rate=refresh_rate)
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Show the bar where somebody looks."""
+        super().setup(trainer, pl_module, stage)
+        if not watched(Console()):  # standard output, where Lightning's bar is
+            self.disable()
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say how many parameters are trained."""
+        counts = {
+            name: sum(parameter.numel() for parameter in module.parameters()) / 1e6
+            for name, module in pl_module.named_children()
+        }
+        parts = ", ".join(f"{name} {count:.1f} M" for name, count in counts.items() if count)
+        rank_zero_info(f"networks: {parts}; together {sum(counts.values()):.1f} M parameters")
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
+        """Return what the bar shows; the logger's version number is not a metric."""
+        metrics = super().get_metrics(trainer, pl_module)
+        return {name: value for name, value in metrics.items() if name != "v_num"}

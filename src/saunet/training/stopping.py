@@ -1,0 +1,206 @@
+"""Ends in good order: a run that is asked to stop saves first, and one that loses a process says so and ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from subprocess import Popen
+from types import FrameType
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
+from torch import distributed
+
+from saunet.errors import SaunetError, positive
+from saunet.runs.run_record import Stopped, mark_lost
+
+LAST = "last.ckpt"
+
+
+def way_on(folder: str | Path) -> str:
+    """Return how a run with this checkpoint folder is continued, as the end of a sentence."""
+    last = Path(folder) / LAST
+    return f"go on with resume={last}" if last.is_file() else "no checkpoint was written yet, so start again"
+
+
+class GracefulStop(Callback):
+    """On SIGTERM, Ctrl-C, or a batch system's SIGUSR1: finish the step, save ``last.ckpt``, end with a message.
+
+    All processes of a run stop after the same step, whichever of them was asked. A second Ctrl-C ends at once. A
+    validation that is under way or due is finished first, and so is an epoch after its last step: a training that has
+    none left is complete then, and ends as such.
+
+    Args:
+        folder: Where ``last.ckpt`` goes.
+        every_n_steps: How often several processes ask each other; they also do at the end of an epoch.
+    """
+
+    def __init__(self, folder: str, every_n_steps: int = 4) -> None:
+        self.folder = Path(folder)
+        self.every_n_steps = int(positive("every_n_steps", every_n_steps))
+        self.received: int | None = None
+        self._agreed = 0  # the signal for which all processes stop
+        self._saved = self._went_on = False
+        self._before: dict[int, Any] = {}
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Listen, in place of the trainer, which would stop between two steps without saving."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        wanted = [signal.SIGTERM, signal.SIGINT]
+        if "SLURM_JOB_ID" in os.environ and hasattr(signal, "SIGUSR1"):
+            wanted.append(signal.SIGUSR1)
+        self._before = {number: signal.signal(number, self._receive) for number in wanted}
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Save if anybody was asked to stop, where no accumulated gradient is lost."""
+        if (batch_idx + 1) % trainer.accumulate_grad_batches and not trainer.is_last_batch:
+            return
+        number = self._agreed or self.received or 0
+        if trainer.world_size > 1 and not self._agreed:
+            if trainer.global_step % self.every_n_steps and not trainer.is_last_batch:
+                return
+            asked = torch.tensor(number, device=pl_module.device)
+            distributed.all_reduce(asked, distributed.ReduceOp.MAX)
+            number = int(asked)
+        self._agreed = number
+        if number:  # before a validation that is due too: whoever asked may not wait for its end
+            self._save(trainer)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Take what was measured into the checkpoint, with the next step or the end of the epoch."""
+        if self._agreed and not self._went_on:  # once: there may be a validation after every step
+            self._saved, self._went_on = False, True
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save with all that belongs to the epoch."""
+        if self._agreed:
+            self._save(trainer)
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Stop before another step, when the last one is in the log."""
+        self._stop(trainer)
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Stop before another epoch."""
+        self._stop(trainer)
+
+    def _save(self, trainer: Trainer) -> None:
+        trainer.save_checkpoint(self.folder / LAST, weights_only=False)
+        self._saved = True
+
+    def _stop(self, trainer: Trainer) -> None:
+        if not self._saved:
+            return
+        self._restore()
+        number = self._agreed
+        name = signal.Signals(number).name
+        message = f"stopped by {name} after step {trainer.global_step}, everything is saved; {way_on(self.folder)}"
+        # Where one process starts the others, it takes a bad end of theirs for a crash.
+        raise Stopped(message, 128 + number if trainer.is_global_zero else 0)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Listen no longer."""
+        self._restore()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Listen no longer."""
+        self._restore()
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if self.received == signal.SIGINT == number:
+            raise KeyboardInterrupt
+        self.received = number
+        print(f"\n{signal.Signals(number).name}: finishing the step, then saving", file=sys.stderr, flush=True)
+
+    def _restore(self) -> None:
+        before, self._before = self._before, {}
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class ProcessWatch(Callback):
+    """End the whole run with one sentence when one of its processes dies, instead of waiting for it for ever.
+
+    For runs whose processes the trainer starts (``trainer=ddp``); torchrun and SLURM look after theirs themselves.
+
+    Args:
+        folder: The run's folder, whose record is told.
+        checkpoints: Where ``last.ckpt`` is.
+    """
+
+    def __init__(self, folder: str, checkpoints: str) -> None:
+        self.folder, self.checkpoints = Path(folder), Path(checkpoints)
+        self._thread: threading.Thread | None = None
+        self._own_end = False
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Begin to watch: the first process its children, the children their parent."""
+        started: list[Popen[bytes]] = list(getattr(trainer.strategy.launcher, "procs", None) or [])
+        if started:
+            _silence_lightnings_watch()
+            self._thread = threading.Thread(target=self._watch_children, args=(started,), daemon=True)
+        elif (
+            isinstance(getattr(trainer.strategy, "cluster_environment", None), LightningEnvironment)
+            and int(os.environ.get("LOCAL_RANK", "0")) > 0
+        ):
+            self._thread = threading.Thread(target=self._watch_parent, args=(os.getppid(),), daemon=True)
+        if self._thread is not None:
+            self._thread.start()
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Watch no longer."""
+        self._own_end = True
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Let the watch speak if what went wrong here is only that another process is gone."""
+        if isinstance(exception, SaunetError | SystemExit | KeyboardInterrupt):
+            self._own_end = True
+        elif self._thread is not None:
+            self._thread.join(timeout=3)
+            self._own_end = True
+
+    def _watch_children(self, started: list[Popen[bytes]]) -> None:
+        while not self._own_end:
+            for rank, process in enumerate(started, start=1):
+                code = process.poll()
+                if code:
+                    if code > 0 and self._ends_by_itself():
+                        return
+                    how = f"was killed (signal {-code})" if code < 0 else f"ended with code {code}, see its message"
+                    self._end(f"process {rank} of {len(started) + 1} {how}, so the run ends", started)
+            time.sleep(0.2)
+
+    def _ends_by_itself(self) -> bool:
+        """Wait a moment: what ended another process may be ending this one too, with a better message."""
+        time.sleep(1)
+        return self._own_end
+
+    def _watch_parent(self, parent: int) -> None:
+        while not self._own_end:
+            if os.getppid() != parent:
+                self._end("the first process of the run is gone, so the run ends", [])
+            time.sleep(0.2)
+
+    def _end(self, reason: str, started: list[Popen[bytes]]) -> None:
+        sentence = f"{reason}; {way_on(self.checkpoints)}"
+        mark_lost(self.folder, sentence)
+        print(f"\nsaunet-train: {sentence}", file=sys.stderr, flush=True)
+        for process in started:
+            process.kill()
+        os._exit(1)  # the main thread waits inside a collective call, which no exception reaches
+
+
+def _silence_lightnings_watch() -> None:
+    """Keep Lightning's own watch from killing this process before it has said why."""
+    for thread in threading.enumerate():
+        if thread.name == "child-process-observer":
+            thread._child_processes = []  # type: ignore[attr-defined]

@@ -1,0 +1,350 @@
+"""Exported files compute what the network computes, carry their record, and predict without torch."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import saunet
+from saunet.checkpoint import ModelRecord, Scale, atomic_save, build_networks
+from saunet.errors import CheckpointError, ConfigError, DataError
+from saunet.exporting import export, exporters
+from saunet.exporting.card import fingerprint
+from saunet.exporting.export import export_model
+from saunet.exporting.exporters import export_onnx, export_program
+from saunet.exporting.onnx import OnnxPredictor, open_session
+from saunet.exporting.parity import Parity
+from saunet.io.images import write_image
+from saunet.models.depth import DepthNet
+from saunet.prediction.predictor import Predictor
+from saunet.registry import decoders, encoders
+
+Picture = NDArray[np.uint8]
+Node = Callable[..., dict[str, Any]]
+onnx = pytest.importorskip("onnx", reason="ONNX export needs saunet[export]")
+pytest.importorskip("onnxscript", reason="ONNX export needs saunet[export]")
+pytest.importorskip("onnxruntime", reason="ONNX export needs saunet[export]")
+
+
+@pytest.fixture(scope="module")
+def record(node: Node) -> ModelRecord:
+    return ModelRecord(
+        {**node("encoder", "resnet18"), "blocks": [1, 1, 1, 1]}, {**node("decoder", "unet"), "channels": [8] * 5},
+        None, 0.1, 100.0, 32, 64,
+        scale=Scale(12.5, "camera height 1.65 m"), data={"name": "synthetic", "seed": 3},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def checkpoint(record: ModelRecord, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run") / "last.ckpt"
+    depth, _ = build_networks(record)
+    state = {f"depth.{name}": value for name, value in depth.state_dict().items()}
+    trained = dataclasses.replace(record, data={**record.data, "root": "/home/someone/data"})
+    atomic_save({"state_dict": state, "saunet": trained.to_plain()}, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def exported(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Parity]]:
+    folder = tmp_path_factory.mktemp("export")
+    y, x = np.mgrid[0:50, 0:100]
+    write_image(folder / "road.png", np.stack([x * 2, y * 5, x + y], axis=-1).astype(np.uint8))
+    row = {
+        "predictor": "model",
+        "protocol": "eigen_lidar_x",
+        "abs_rel": 0.111,
+        "sq_rel": 0.9,
+        "a1": None,
+        "images": 697,
+    }
+    (folder / "metrics.json").write_text(json.dumps({"protocols": [], "results": [row]}))
+    reports = export_model(checkpoint, folder / "model", images=folder / "road.png", evaluation=folder)
+    return folder / "model", reports
+
+
+def test_folder_has_files_config_report_and_card(exported: tuple[Path, list[Parity]], record: ModelRecord) -> None:
+    folder, reports = exported
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "README.md", "config.json", "model.onnx", "model.pt2", "model.safetensors", "report.json",
+    ]  # fmt: skip
+    assert [report.file for report in reports] == ["model.onnx", "model.pt2", "model.safetensors"]
+    for report in reports:
+        assert report.difference < 1e-5
+        assert report.depth_difference < 1e-3
+        assert (report.batch, report.random, report.real) == ("any", 2, 1)
+        assert min(report.eager_ms, report.exported_ms, report.megabytes) > 0
+        assert report.eager_ms == reports[0].eager_ms
+    assert ModelRecord.from_plain(json.loads((folder / "config.json").read_text())) == record
+    stored = json.loads((folder / "report.json").read_text())
+    assert stored["files"] == [dataclasses.asdict(report) for report in reports]
+    assert stored["versions"]["torch"] == torch.__version__
+    card = (folder / "README.md").read_text()
+    for text in (
+        "ResNet(",
+        "64 x 32",
+        "Network depth x 12.5 is meters",
+        "camera height 1.65 m",
+        "synthetic",
+        "model.onnx",
+        f"`{fingerprint(record.to_plain()['data'])}`",
+        "| model | eigen_lidar_x | 0.111 | 0.900 |",
+    ):
+        assert text in card, text
+
+
+def test_onnx_predicts_what_the_checkpoint_predicts(
+    exported: tuple[Path, list[Parity]], checkpoint: Path, picture: Picture
+) -> None:
+    onnx_predictor = OnnxPredictor(exported[0] / "model.onnx")
+    images = [picture, picture[:, ::-1].copy(), picture[:30]]
+    expected = Predictor.from_checkpoint(checkpoint).predict_batch(images)
+    for got, wanted in zip(onnx_predictor.predict_batch(images), expected, strict=True):
+        assert np.allclose(got.disparity, wanted.disparity, atol=1e-5)
+        assert got.unit == wanted.unit == "meters (scale from camera height 1.65 m)"
+    assert len(onnx_predictor.fingerprint) == 16
+
+
+def test_program_runs_without_saunet(exported: tuple[Path, list[Parity]], checkpoint: Path) -> None:
+    image = torch.rand(3, 3, 32, 64)
+    program = torch.export.load(exported[0] / "model.pt2")
+    network = Predictor.from_checkpoint(checkpoint).network
+    assert torch.allclose(program.module()(image), network(image).disparity[0], atol=1e-5)
+
+
+def test_predicting_from_onnx_does_not_import_torch(exported: tuple[Path, list[Parity]], tmp_path: Path) -> None:
+    write_image(tmp_path / "in" / "x.png", np.zeros((20, 30, 3), np.uint8))
+    code = (
+        "import sys, saunet\n"
+        "from saunet.prediction.files import predict_files\n"
+        "outputs = ('color', 'png16', 'npy', 'ply')\n"
+        "predict_files(saunet.load(sys.argv[1]), sys.argv[2], sys.argv[3], outputs, camera=(30, 30, 15, 10))\n"
+        "print([name for name in ('torch', 'lightning', 'onnx') if name in sys.modules])"
+    )
+    arguments = [str(exported[0] / "model.onnx"), str(tmp_path / "in"), str(tmp_path / "out")]
+    result = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+    assert (tmp_path / "out" / "x_disparity.png").exists()
+
+
+def test_the_comparison_leaves_the_cores_to_the_original(
+    exported: tuple[Path, list[Parity]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sessions: list[Any] = []
+
+    def noted(*arguments: Any, **settings: Any) -> Any:
+        sessions.append(open_session(*arguments, **settings))
+        return sessions[-1]
+
+    monkeypatch.setattr(exporters, "open_session", noted)
+    exporters.run_onnx(exported[0] / "model.onnx")
+    assert sessions[0].get_session_options().get_session_config_entry("session.intra_op.allow_spinning") == "0"
+
+
+def test_fixed_batch_is_filled_up(network: DepthNet, record: ModelRecord, tmp_path: Path, picture: Picture) -> None:
+    export_onnx(network, record, tmp_path / "x.onnx", batch="one")
+    images = [picture, picture[:20], picture[:, ::-1].copy()]
+    expected = Predictor(network, 32, 64, scale=record.scale).predict_batch(images)
+    for got, wanted in zip(OnnxPredictor(tmp_path / "x.onnx").predict_batch(images), expected, strict=True):
+        assert np.allclose(got.disparity, wanted.disparity, atol=1e-5)
+
+
+def test_flip_averaging_is_that_of_the_network(
+    exported: tuple[Path, list[Parity]], checkpoint: Path, picture: Picture
+) -> None:
+    flipping = saunet.load(exported[0] / "model.onnx", flip=True)
+    expected = Predictor.from_checkpoint(checkpoint, flip=True).predict(picture).disparity
+    assert np.allclose(flipping.predict(picture).disparity, expected, atol=1e-5)
+    assert flipping.fingerprint != saunet.load(exported[0] / "model.onnx").fingerprint
+
+
+def test_a_folder_with_another_export_is_not_mixed(
+    exported: tuple[Path, list[Parity]], checkpoint: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(exported[0], tmp_path / "out")
+    with pytest.raises(ConfigError, match=r"holds config\.json already; choose another output folder"):
+        export_model(checkpoint, tmp_path / "out", ["safetensors"])
+    with pytest.raises(ConfigError, match="holds the model itself"):
+        export_model(tmp_path / "out", tmp_path / "out", ["safetensors"], overwrite=True)
+    export_model(exported[0], tmp_path / "out", ["safetensors"], overwrite=True)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "README.md", "config.json", "model.safetensors", "report.json",
+    ]  # fmt: skip
+    assert saunet.load(tmp_path / "out").fingerprint == saunet.load(checkpoint).fingerprint
+
+
+def test_a_file_that_gives_nan_is_not_written(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(export._RUNNERS, "program", lambda path, record: lambda image: image[:, :1] * np.float32("nan"))
+    with pytest.raises(CheckpointError, match=r"model\.pt2 gives NaN where .*so it is not written"):
+        export_model(checkpoint, tmp_path / "out", ["program"])
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_settings_that_the_folder_cannot_hold(checkpoint: Path, tmp_path: Path) -> None:
+    content = torch.load(checkpoint, weights_only=True)
+    content["saunet"]["data"]["far"] = float("inf")
+    atomic_save(content, tmp_path / "far.ckpt")
+    with pytest.raises(ConfigError, match=r"config\.json cannot hold the model's settings .*give finite numbers"):
+        export_model(tmp_path / "far.ckpt", tmp_path / "out", ["safetensors"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_that_differs_is_not_written(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(export._RUNNERS, "program", lambda path, record: lambda image: image[:, :1] * 0 + 1)
+    with pytest.raises(CheckpointError, match=r"model\.pt2 differs from the network by .* so it is not written"):
+        export_model(checkpoint, tmp_path / "out", ["program"])
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_network_that_fixes_its_batch_size(network: DepthNet, record: ModelRecord, tmp_path: Path) -> None:
+    class FixedBatch(torch.nn.Module):
+        def forward(self, image: Tensor) -> tuple[Tensor, ...]:
+            return (image.view(int(image.shape[0]), 3, 32, 64)[:, :, ::2, ::2],)
+
+    network.encoder = FixedBatch()
+    with pytest.raises(ConfigError, match="fixes its batch size when it is exported; export with batch=one"):
+        export_program(network, record, tmp_path / "x.pt2", batch="any")
+    for batch in ("one", "auto"):
+        export_program(network, record, tmp_path / f"{batch}.pt2", batch=batch)
+        program = torch.export.load(tmp_path / f"{batch}.pt2").module()
+        assert program(torch.zeros(1, 3, 32, 64)).shape == (1, 1, 32, 64)
+
+
+@pytest.mark.parametrize("name", ["onnx", "program", "compiled", "safetensors"])
+def test_full_disk(checkpoint: Path, tmp_path: Path, name: str) -> None:
+    """A file size limit in a process of its own stands for a full disk; the compiler itself is left out."""
+    code = (
+        "import resource, signal, sys, torch\n"
+        "from saunet.errors import DataError\n"
+        "from saunet.exporting.export import export_model\n"
+        "def compiled(program, package_path):\n"
+        "    torch.export.save(program, package_path)\n"
+        "torch._inductor.aoti_compile_and_package = compiled\n"
+        "import shutil; shutil.which = lambda name: name\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
+        "try:\n"
+        "    export_model(sys.argv[1], sys.argv[2], [sys.argv[3]])\n"
+        "except DataError as error:\n    print(error)\n"
+    )
+    arguments = [sys.executable, "-c", code, str(checkpoint), str(tmp_path / "out"), name]
+    result = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith(f"cannot write {tmp_path / 'out'}/model.")
+    assert "File too large; check the folder, its rights and its space" in result.stdout
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+TINY: dict[str, dict[str, Any]] = {
+    "StratifiedTransformer": {"dim": 8, "depths": (2, 1, 1, 1), "heads": (1, 1, 2, 2), "window": (4, 4, 4, 4)},
+    "SwinTransformer": {"dim": 8, "depths": (2, 1, 1, 1), "heads": (1, 1, 2, 2), "window": (4, 4, 4, 4)},
+    "ResNet": {"blocks": (1, 1, 1, 1)},
+    "PackNetEncoder": {"channels": (16, 16, 16, 16, 16), "blocks": (1, 1, 1, 1)},
+    "LiteMonoEncoder": {"dims": (8, 16, 16), "depths": (2, 2, 2), "rates": (2,), "last_rates": (2,), "heads": 2},
+}
+"""What makes an encoder of each kind small; its layers stay the same."""
+HANDFUL = [("stratified_tiny", "aunet"), ("lite_mono", "lite_mono"), ("resnet50", "unet")]
+
+
+def check_pair(node: Node, encoder: str, decoder: str, record: ModelRecord, folder: Path) -> None:
+    """Export to ONNX with any number of images and compare, in disparity, with 1, 2 and 3."""
+    tiny = TINY[encoders.entry(encoder).target.__name__]
+    network = DepthNet(encoders.build(encoder, **tiny), decoders.partial(decoder)).eval()
+    height, width = 2 * network.size_divisor, 3 * network.size_divisor
+    own = dataclasses.replace(
+        record,
+        encoder={**node("encoder", encoder), **tiny}, decoder=node("decoder", decoder), height=height, width=width,
+    )  # fmt: skip
+    assert export_onnx(network, own, folder / "x.onnx") == "any"
+    predictor = OnnxPredictor(folder / "x.onnx")
+    for batch in (1, 2, 3):
+        image = torch.rand(batch, 3, height, width)
+        with torch.no_grad():
+            expected = network(image).disparity[0][:, 0].numpy()
+        assert np.abs(predictor.disparity(image.numpy()) - expected).max() < 1e-4
+
+
+@pytest.mark.parametrize(("encoder", "decoder"), HANDFUL)
+def test_networks_export_to_onnx(node: Node, encoder: str, decoder: str, record: ModelRecord, tmp_path: Path) -> None:
+    check_pair(node, encoder, decoder, record, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("decoder", decoders.names())
+@pytest.mark.parametrize("encoder", encoders.names())
+def test_every_pair_exports_to_onnx(
+    node: Node, encoder: str, decoder: str, record: ModelRecord, tmp_path: Path
+) -> None:
+    check_pair(node, encoder, decoder, record, tmp_path)
+
+
+@pytest.mark.slow
+def test_compiled_package(checkpoint: Path, tmp_path: Path) -> None:
+    if shutil.which("g++") is None:
+        pytest.skip("AOTInductor needs a C++ compiler")
+    (report,) = export_model(checkpoint, tmp_path / "out", ["compiled"], batch="one")
+    assert report.file == "model.aoti.pt2"
+    assert report.difference < 1e-5
+    image = torch.rand(1, 3, 32, 64)
+    compiled = torch._inductor.aoti_load_package(str(tmp_path / "out" / "model.aoti.pt2"))
+    expected = Predictor.from_checkpoint(checkpoint).network(image).disparity[0]
+    assert torch.allclose(compiled(image), expected, atol=1e-5)
+
+
+def test_refused(
+    network: DepthNet, record: ModelRecord, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ConfigError, match="formats is 'onx'; did you mean 'onnx'"):
+        export_model(checkpoint, tmp_path, ["onx"])
+    with pytest.raises(CheckpointError, match="no checkpoint at"):
+        export_model(tmp_path / "absent.ckpt", tmp_path)
+    with pytest.raises(ConfigError, match="formats is empty"):
+        export_model(checkpoint, tmp_path, [])
+    with pytest.raises(DataError, match=r"cannot read .*metrics\.json: No such file"):
+        export_model(checkpoint, tmp_path, evaluation=tmp_path)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="needs the package onnx; run: pip install"):
+        export_onnx(network, record, tmp_path / "x.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+class TestOnnxFile:
+    def test_missing_broken_foreign(self, tmp_path: Path) -> None:
+        with pytest.raises(CheckpointError, match="no ONNX model at"):
+            OnnxPredictor(tmp_path / "x.onnx")
+        (tmp_path / "x.onnx").write_bytes(b"nothing")
+        with pytest.raises(CheckpointError, match="not an ONNX model that onnxruntime can read"):
+            OnnxPredictor(tmp_path / "x.onnx")
+        value = onnx.helper.make_tensor_value_info
+        graph = onnx.helper.make_graph(
+            [onnx.helper.make_node("Identity", ["image"], ["disparity"])], "g",
+            [value("image", 1, [1, 3, 8, 8])], [value("disparity", 1, [1, 3, 8, 8])],
+        )  # fmt: skip
+        model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9)
+        onnx.save(model, tmp_path / "y.onnx")
+        with pytest.raises(CheckpointError, match="not one that saunet exported"):
+            OnnxPredictor(tmp_path / "y.onnx")
+
+    def test_truncated(self, exported: tuple[Path, list[Parity]], tmp_path: Path) -> None:
+        data = (exported[0] / "model.onnx").read_bytes()
+        (tmp_path / "x.onnx").write_bytes(data[: len(data) // 2])
+        with pytest.raises(CheckpointError, match="or is damaged"):
+            OnnxPredictor(tmp_path / "x.onnx")
+
+    def test_device(self, exported: tuple[Path, list[Parity]]) -> None:
+        with pytest.raises(ConfigError, match=r"device 'tpu' is not supported by this onnxruntime; available: .*cpu"):
+            OnnxPredictor(exported[0] / "model.onnx", device="tpu")

@@ -1,0 +1,66 @@
+"""Run the tiny training in one process or two: ``python ddp_curve.py FOLDER PROCESSES EPOCHS [RANK SIGNAL]``.
+
+Writes the logged losses of its steps and the validation metric to ``FOLDER/curve.json``. With a rank and a signal, that
+process sends itself the signal in its fourth step.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import tiny
+import torch
+from lightning import Callback, LightningModule, Trainer
+
+from saunet.runs.run_record import recording
+from saunet.training.callbacks import LastCheckpoint
+from saunet.training.optim import Recipe
+from saunet.training.stopping import GracefulStop, ProcessWatch
+
+
+class Curve(Callback):
+    def __init__(self, rank: int | None, number: int) -> None:
+        self.rank, self.number = rank, number
+        self.losses: list[float] = []
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any) -> None:
+        self.losses.append(float(trainer.callback_metrics["train/loss"]))  # as it is logged
+        if trainer.global_rank == self.rank and trainer.global_step == 4:
+            os.kill(os.getpid(), self.number)
+
+
+def main(folder: Path, processes: int, epochs: int, rank: int | None = None, number: int = signal.SIGTERM) -> None:
+    with recording(folder, "curve"):
+        # The mean of the halves' losses is the whole's where all pixels count and no sample sees another: no auto-mask,
+        # no validity mask, no dropout, no batch norm (which is synchronized on GPUs only).
+        model = tiny.tiny_model(Recipe(lr=3e-3, schedule="cosine"), dropout=0.0)
+        photometric: Any = model.objective.terms["photometric"]
+        photometric.automask, photometric.use_validity = False, False
+        model.depth.encoder[1] = torch.nn.Identity()  # type: ignore[union-attr, index, operator]
+        curve = Curve(rank, number)
+        watch = [
+            GracefulStop(str(folder / "c")),
+            ProcessWatch(str(folder), str(folder / "c")),
+            LastCheckpoint(str(folder / "c"), every_n_steps=1),
+        ]
+        trainer = tiny.tiny_trainer(
+            folder,
+            max_epochs=epochs,
+            devices=processes,
+            log_every_n_steps=1,
+            strategy="ddp" if processes > 1 else "auto",
+            callbacks=[curve, *watch],
+        )
+        trainer.fit(model, tiny.tiny_walls())
+        if trainer.is_global_zero:
+            metrics = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("val")}
+            (folder / "curve.json").write_text(json.dumps({"losses": curve.losses, "metrics": metrics}))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), *(int(word) for word in sys.argv[2:]))

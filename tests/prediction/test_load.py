@@ -1,0 +1,184 @@
+"""One door to any trained model: checkpoint, exported folder or file, hub; and nothing in a file is ever run."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import saunet
+from saunet.checkpoint import ModelRecord, atomic_save, build_networks
+from saunet.errors import CheckpointError, ConfigError
+from saunet.exporting.exporters import write_safetensors
+from saunet.exporting.folder import read_model
+from saunet.prediction.load import locate
+from saunet.prediction.pointcloud import Camera
+
+Node = Callable[..., dict[str, Any]]
+pytest.importorskip("safetensors", reason="safetensors is not installed")
+
+
+@pytest.fixture(scope="module")
+def record(node: Node) -> ModelRecord:
+    encoder = {**node("encoder", "resnet18"), "blocks": [1, 1, 1, 1]}
+    decoder = {**node("decoder", "unet"), "channels": [8] * 5}
+    return ModelRecord(encoder, decoder, node("pose", "posecnn"), 0.1, 100.0, 32, 64)
+
+
+@pytest.fixture(scope="module")
+def state(record: ModelRecord) -> dict[str, torch.Tensor]:
+    depth, pose = build_networks(record)
+    assert pose is not None
+    return dict(torch.nn.ModuleDict({"depth": depth, "pose": pose}).state_dict())
+
+
+@pytest.fixture
+def exported(record: ModelRecord, state: dict[str, torch.Tensor], tmp_path: Path) -> Path:
+    folder = tmp_path / "model"
+    folder.mkdir()
+    write_safetensors(state, folder / "model.safetensors")
+    (folder / "config.json").write_text(json.dumps(record.to_plain()))
+    return folder
+
+
+def test_folder_and_checkpoint_are_the_same_model(
+    exported: Path, record: ModelRecord, state: dict[str, torch.Tensor], tmp_path: Path
+) -> None:
+    atomic_save({"state_dict": state, "saunet": record.to_plain()}, tmp_path / "x.ckpt")
+    expected = saunet.load(tmp_path / "x.ckpt")
+    for source in (exported, str(exported), exported / "model.safetensors"):
+        assert saunet.load(source).fingerprint == expected.fingerprint
+    pose = read_model(exported).networks()[1]
+    assert pose is not None
+    assert all(torch.equal(value, state[f"pose.{name}"]) for name, value in pose.state_dict().items())
+
+
+def test_folders_that_are_no_model(exported: Path, tmp_path: Path) -> None:
+    (exported / "config.json").rename(exported / "x.json")
+    with pytest.raises(CheckpointError, match=r"cannot read .*config\.json: No such file"):
+        saunet.load(exported)
+    (exported / "config.json").write_text("{")
+    with pytest.raises(CheckpointError, match=r"config\.json is not JSON"):
+        saunet.load(exported)
+    (exported / "config.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"config\.json: the model record is"):
+        saunet.load(exported)
+    (exported / "model.safetensors").unlink()
+    with pytest.raises(CheckpointError, match=r"has no model\.safetensors"):
+        saunet.load(exported)
+    with pytest.raises(CheckpointError, match="is a folder; give the checkpoint file in it"):
+        saunet.load(tmp_path)
+    (tmp_path / "x.pt2").touch()
+    with pytest.raises(CheckpointError, match="runs with torch alone"):
+        saunet.load(tmp_path / "x.pt2")
+
+
+@pytest.mark.parametrize("keep", [0, 4, 100, 0.5])
+def test_truncated_weights(exported: Path, keep: float) -> None:
+    path = exported / "model.safetensors"
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * keep) if isinstance(keep, float) else keep])
+    with pytest.raises(CheckpointError, match="is damaged or truncated"):
+        saunet.load(exported)
+
+
+class TestNothingIsRun:
+    def test_unregistered_target(self, exported: Path) -> None:
+        plain = json.loads((exported / "config.json").read_text())
+        plain["model"]["encoder"] = {"_target_": "os.system", "command": "true"}
+        (exported / "config.json").write_text(json.dumps(plain))
+        with pytest.raises(CheckpointError, match=r"'os\.system', which is not a registered encoder, so nothing is"):
+            saunet.load(exported)
+
+    def test_pickle_under_any_name(self, exported: Path, tmp_path: Path) -> None:
+        marker = tmp_path / "ran"
+
+        class Evil:
+            def __reduce__(self) -> Any:
+                return os.mkdir, (str(marker),)
+
+        for path in (exported / "model.safetensors", tmp_path / "x.ckpt", tmp_path / "x.onnx"):
+            path.write_bytes(pickle.dumps(Evil()))
+            with pytest.raises((CheckpointError, ConfigError)):
+                saunet.load(path)
+        torch.save({"state_dict": {}, "saunet": Evil()}, tmp_path / "y.ckpt")
+        with pytest.raises(CheckpointError, match="holds pickled objects, which could run code"):
+            saunet.load(tmp_path / "y.ckpt")
+        assert not marker.exists()
+
+
+class TestHub:
+    @pytest.fixture
+    def fetched(self, exported: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str | None]]:
+        hub = pytest.importorskip("huggingface_hub", reason="huggingface_hub is not installed")
+        calls: list[tuple[str, str | None]] = []
+
+        def snapshot_download(name: str, *, revision: str | None, allow_patterns: list[str]) -> str:
+            assert all(pattern.endswith((".json", ".safetensors", ".onnx", ".md")) for pattern in allow_patterns)
+            calls.append((name, revision))
+            return str(exported)
+
+        monkeypatch.setattr(hub, "snapshot_download", snapshot_download)
+        return calls
+
+    def test_fetched_and_loaded(self, fetched: list[tuple[str, str | None]], exported: Path) -> None:
+        expected = saunet.load(exported).fingerprint
+        for source in ("hf://someone/depth", "someone/depth", "hf://someone/depth@v1.2", "some.one/depth-v2@main"):
+            assert saunet.load(source).fingerprint == expected
+        assert fetched == [("someone/depth", None)] * 2 + [("someone/depth", "v1.2"), ("some.one/depth-v2", "main")]
+
+    def test_paths_are_not_asked_for(self, fetched: list[tuple[str, str | None]], tmp_path: Path) -> None:
+        (tmp_path / "runs").mkdir()
+        for source in ("runs/last.ckpt", "absent/last.ckpt", "a/b/c", str(tmp_path / "runs" / "x"), Path("a/b")):
+            assert locate(source) == Path(source)
+        assert fetched == []
+        with pytest.raises(CheckpointError, match=r"no checkpoint at absent/last\.ckpt"):
+            saunet.load("absent/last.ckpt")
+        with pytest.raises(ConfigError, match="is not a hub id"):
+            saunet.load("hf://someone")
+
+    def test_offline(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        hub = pytest.importorskip("huggingface_hub", reason="huggingface_hub is not installed")
+
+        def offline(*_: object, **__: object) -> str:
+            raise ConnectionError("no route to host\nand many more lines")
+
+        monkeypatch.setattr(hub, "snapshot_download", offline)
+        with pytest.raises(CheckpointError) as error:
+            saunet.load("hf://someone/depth")
+        text = str(error.value)
+        assert "cannot fetch 'someone/depth' from the hub (ConnectionError: no route to host); check" in text
+        assert "\n" not in text
+
+    def test_package_that_is_missing(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+        with pytest.raises(ConfigError, match=r"no file 'someone/depth'.* pip install 'saunet\[hub\]'"):
+            saunet.load("someone/depth")
+
+
+def test_onnx_has_one_size(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="takes one size of images; leave keep_aspect out"):
+        saunet.load(tmp_path / "x.onnx", keep_aspect=True)
+
+
+def test_a_resized_camera_is_that_of_the_geometry() -> None:
+    from saunet.geometry.camera import scale_intrinsics
+
+    camera = Camera.from_numbers((70.0, 65.0, 40.3, 20.0), 60, 80)
+    expected = scale_intrinsics(torch.from_numpy(camera.K), 37 / 80, 23 / 60).numpy()
+    assert np.allclose(camera.resized(23, 37).K, expected)
+    assert np.allclose(Camera.from_numbers([90.0], 60, 80).K[0, 0], 40)
+
+
+@pytest.mark.parametrize("source", [None, "", 3])
+def test_what_names_no_model_is_refused(source: Any) -> None:
+    with pytest.raises(CheckpointError, match=r"saunet\.load got .*; give the path of a checkpoint"):
+        saunet.load(source)

@@ -1,0 +1,283 @@
+"""Videos in and out: every frame arrives, colors are stable, nothing half-written stays."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from saunet.errors import ConfigError, DataError
+from saunet.io.colormaps import RunningRange
+from saunet.io.images import write_image
+from saunet.io.video import VideoReader
+from saunet.prediction.clips import VideoWriter, open_clip
+from saunet.prediction.predictor import Predictor
+from saunet.prediction.sinks import compose
+from saunet.prediction.video import render_video
+
+Picture = NDArray[np.uint8]
+
+
+def clip(count: int, height: int = 48, width: int = 96) -> Iterator[Picture]:
+    x = np.arange(width)
+    for index in range(count):
+        row = (127 + 100 * np.sin((x + 4 * index) / 12)).astype(np.uint8)
+        yield np.ascontiguousarray(np.broadcast_to(row[None, :, None], (height, width, 3)))
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    with VideoWriter(tmp_path / "in.mp4", 12.0) as writer:
+        for frame in clip(9):
+            writer.write(frame)
+    return tmp_path / "in.mp4"
+
+
+def test_what_is_written_is_read_back(video: Path) -> None:
+    with VideoReader(video) as reader:
+        assert (reader.height, reader.width, reader.declared) == (48, 96, 9)
+        assert reader.fps == pytest.approx(12)
+        frames = list(reader)
+    assert len(frames) == 9
+    assert max(np.abs(a.astype(int) - b).mean() for a, b in zip(frames, clip(9), strict=True)) < 4
+
+
+def test_color_channels_keep_their_order(tmp_path: Path) -> None:
+    red = np.zeros((32, 32, 3), np.uint8)
+    red[:, :, 0] = 220
+    with VideoWriter(tmp_path / "x.mp4", 10) as writer:
+        writer.write(red)
+    with VideoReader(tmp_path / "x.mp4") as reader:
+        frame = next(iter(reader)).mean(axis=(0, 1))
+    assert frame[0] > 180
+    assert frame[1:].max() < 40
+
+
+def test_codec_that_plays_in_browsers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with VideoWriter(tmp_path / "x.mp4", 12, "vp09") as writer:
+        for frame in clip(9):
+            writer.write(frame)
+    assert b"vp09" in (tmp_path / "x.mp4").read_bytes()
+    with VideoReader(tmp_path / "x.mp4") as reader:
+        frames = list(reader)
+    assert max(np.abs(a.astype(int) - b).mean() for a, b in zip(frames, clip(9), strict=True)) < 4
+    with pytest.raises(ConfigError, match="codec is 'avc1', allowed: mp4v, vp09"):
+        VideoWriter(tmp_path / "x.mp4", 12, "avc1")
+    monkeypatch.setattr(cv2.VideoWriter, "isOpened", lambda self: False)  # an OpenCV that lacks it
+    message = r"vp09, with which this OpenCV cannot write .*y\.mp4; set codec=mp4v"
+    with pytest.raises(ConfigError, match=message), VideoWriter(tmp_path / "y.mp4", 12, "vp09") as writer:
+        writer.write(next(clip(1)))
+    assert [path.name for path in tmp_path.iterdir()] == ["x.mp4"]
+
+
+def test_odd_sizes_are_made_even(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "x.mp4", 10) as writer:
+        for frame in clip(3, 31, 45):
+            writer.write(frame)
+    with VideoReader(tmp_path / "x.mp4") as reader:
+        assert (reader.height, reader.width) == (32, 46)
+
+
+def test_side_by_side_from_file(predictor: Predictor, video: Path, tmp_path: Path) -> None:
+    before = video.read_bytes()
+    summary = render_video(predictor, video, tmp_path / "new" / "out.mp4")
+    assert (summary.frames, summary.missing) == (9, 0)
+    with VideoReader(summary.path) as reader:
+        assert (reader.height, reader.width) == (2 * (48 + 14), 96)
+        assert len(list(reader)) == 9
+    assert video.read_bytes() == before
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["out.mp4"]
+
+
+def test_side_by_side_from_frames(predictor: Predictor, tmp_path: Path) -> None:
+    summary = render_video(
+        predictor, clip(5), tmp_path / "out.mp4", fps=7, layout="beside", labels=False, colormap="turbo", max_frames=4
+    )
+    with VideoReader(summary.path) as reader:
+        assert (reader.height, reader.width, reader.declared) == (48, 192, 4)
+        assert reader.fps == pytest.approx(7)
+
+
+def test_layouts() -> None:
+    wide, tall = np.zeros((10, 40, 3), np.uint8), np.zeros((40, 10, 3), np.uint8)
+    assert compose(wide, wide).shape == (20, 40, 3)
+    assert compose(tall, tall).shape == (40, 20, 3)
+    assert compose(wide, wide, "beside").shape == (10, 80, 3)
+    assert compose(wide, np.zeros((5, 20, 3), np.uint8), "stacked").shape == (20, 40, 3)
+
+
+def test_colors_are_stable_over_a_clip() -> None:
+    """One outlying frame moves the limits by a twentieth of what it would alone; they then come back."""
+    limits = RunningRange(0.95)
+    ramp = np.linspace(0.1, 0.5, 1000, dtype=np.float32).reshape(20, 50)
+    first = limits.update(ramp)
+    alone = RunningRange(0.0).update(ramp * 3)
+    jumped = limits.update(ramp * 3)
+    assert jumped[1] - first[1] == pytest.approx(0.05 * (alone[1] - first[1]), rel=1e-4)
+    for _ in range(200):
+        last = limits.update(ramp)
+    assert last == pytest.approx(first, rel=1e-4)
+    with pytest.raises(ConfigError, match="memory is 1"):
+        RunningRange(1.0)
+
+
+def test_folder_of_images_and_truncated_ones(predictor: Predictor, tmp_path: Path) -> None:
+    for index, frame in enumerate(clip(3)):
+        write_image(tmp_path / "in" / f"{index}.png", frame)
+    for source in (tmp_path / "in", str(tmp_path / "in" / "*.png")):
+        assert render_video(predictor, source, tmp_path / "out.mp4").frames == 3
+    (tmp_path / "in" / "1.png").write_bytes(b"")
+    (tmp_path / "out.mp4").unlink()
+    with pytest.raises(DataError, match=r"1\.png is empty"):
+        render_video(predictor, tmp_path / "in", tmp_path / "out.mp4")
+    assert not (tmp_path / "out.mp4").exists()
+
+
+class TestBrokenSource:
+    def test_missing_empty_text(self, tmp_path: Path) -> None:
+        (tmp_path / "empty.mp4").touch()
+        (tmp_path / "text.mp4").write_text("no video here")
+        for name, message in (("absent.mp4", "no video at"), ("empty.mp4", "0 bytes"), ("text.mp4", "is not a video")):
+            with pytest.raises(DataError, match=message):
+                VideoReader(tmp_path / name)
+
+    def test_folder(self, tmp_path: Path) -> None:
+        with pytest.raises(DataError, match="no video at"):
+            VideoReader(tmp_path)
+        with pytest.raises(DataError, match="no images in"):
+            open_clip(tmp_path)
+
+    def test_no_frames(self, tmp_path: Path) -> None:
+        writer = cv2.VideoWriter(str(tmp_path / "x.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 32))
+        writer.release()
+        with pytest.raises(DataError, match=r"x\.avi (holds no frame|is not a video|is empty)"):
+            VideoReader(tmp_path / "x.avi")
+
+    def test_truncated_index_at_the_end(self, video: Path) -> None:
+        video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+        with pytest.raises(DataError, match="is not a video that can be read, or is truncated"):
+            VideoReader(video)
+
+    def test_truncated_stream_gives_what_is_there_and_says_so(self, predictor: Predictor, tmp_path: Path) -> None:
+        writer = cv2.VideoWriter(str(tmp_path / "x.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (96, 48))
+        for frame in clip(20):
+            writer.write(frame)
+        writer.release()
+        data = (tmp_path / "x.avi").read_bytes()
+        (tmp_path / "x.avi").write_bytes(data[: len(data) * 6 // 10])
+        summary = render_video(predictor, tmp_path / "x.avi", tmp_path / "out.mp4")
+        assert 5 < summary.frames < 15
+        assert summary.frames + summary.missing == 20
+
+    def test_camera_that_is_not_there(self) -> None:
+        with pytest.raises(DataError, match="camera 97 gives no picture"):
+            VideoReader(97)
+
+
+@pytest.mark.slow
+def test_memory_stays_flat_over_a_long_clip(predictor: Predictor, tmp_path: Path) -> None:
+    used: list[float] = []
+
+    def frames() -> Iterator[Picture]:
+        for index, frame in enumerate(itertools.islice(itertools.cycle(list(clip(12))), 10_000)):
+            if index % 1000 == 999:
+                pages = int(Path("/proc/self/statm").read_text().split()[1])
+                used.append(pages * os.sysconf("SC_PAGE_SIZE") / 2**20)
+            yield frame
+
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("no /proc to read the memory in use from")
+    assert render_video(predictor, frames(), tmp_path / "out.mp4").frames == 10_000
+    assert used[-1] - used[0] < 10, f"MB in use every 1000 frames: {used}"
+
+
+class FakeCamera(VideoReader):
+    """Gives three frames; then the user has seen enough."""
+
+    def __init__(self, source: int) -> None:
+        assert source == 0
+        self.fps, self.declared = 20.0, None
+
+    def __iter__(self) -> Iterator[Picture]:
+        yield from clip(3)
+        raise KeyboardInterrupt
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+class TestUnfinished:
+    def test_interrupting_a_camera_finishes_its_video(
+        self, predictor: Predictor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("saunet.prediction.clips.VideoReader", FakeCamera)
+        assert render_video(predictor, 0, tmp_path / "out.mp4").frames == 3
+        with VideoReader(tmp_path / "out.mp4") as reader:
+            assert reader.declared == 3
+
+    def test_error_and_interrupt_leave_nothing(self, predictor: Predictor, tmp_path: Path) -> None:
+        def frames(error: type[BaseException]) -> Iterator[Picture]:
+            yield from clip(2)
+            raise error
+
+        for error in (KeyboardInterrupt, RuntimeError):
+            with pytest.raises(error):
+                render_video(predictor, frames(error), tmp_path / "out.mp4")
+            assert list(tmp_path.iterdir()) == []
+
+    def test_older_file_survives_a_failure(self, predictor: Predictor, video: Path) -> None:
+        before = video.read_bytes()
+        with pytest.raises(DataError, match="frame 1 is"):
+            render_video(predictor, [np.zeros((32, 32, 3), np.uint8), np.zeros((16, 32, 3), np.uint8)], video)
+        assert video.read_bytes() == before
+        assert [path.name for path in video.parent.iterdir()] == ["in.mp4"]
+
+    def test_no_frame_given(self, predictor: Predictor, tmp_path: Path) -> None:
+        with pytest.raises(DataError, match=r"no frame was given, so .*out\.mp4 was not written"):
+            render_video(predictor, [], tmp_path / "out.mp4")
+        assert list(tmp_path.iterdir()) == []
+
+    def test_full_disk(self, tmp_path: Path) -> None:
+        """A file size limit in a process of its own stands for a full disk."""
+        code = (
+            "import resource, signal, sys, numpy as np\n"
+            "from saunet.errors import DataError\n"
+            "from saunet.prediction.clips import VideoWriter\n"
+            "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+            "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
+            "noise = np.random.default_rng(0)\n"
+            "try:\n"
+            "    with VideoWriter(sys.argv[1], 10) as writer:\n"
+            "        for _ in range(30):\n"
+            "            writer.write(noise.integers(0, 255, (64, 64, 3), dtype=np.uint8))\n"
+            "except DataError as error:\n    print(error)\n"
+        )
+        target = tmp_path / "x.mp4"
+        result = subprocess.run([sys.executable, "-c", code, str(target)], capture_output=True, text=True, check=True)
+        assert f"{target} kept" in result.stdout
+        assert list(tmp_path.iterdir()) == []
+
+
+class TestRefused:
+    def test_output(self, predictor: Predictor, video: Path, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match="is the source; choose another name"):
+            render_video(predictor, video, video)
+        with pytest.raises(ConfigError, match=r"the suffix of x\.gif is '\.gif', allowed: \.mp4"):
+            render_video(predictor, video, tmp_path / "x.gif")
+        (tmp_path / "file").touch()
+        with pytest.raises(DataError, match="cannot write"):
+            render_video(predictor, video, tmp_path / "file" / "x.mp4")
+
+    def test_words_and_numbers(self, predictor: Predictor, video: Path, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match="layout is 'side'"):
+            render_video(predictor, video, tmp_path / "x.mp4", layout="side")
+        with pytest.raises(ConfigError, match="fps is 0"):
+            render_video(predictor, video, tmp_path / "x.mp4", fps=0.0)

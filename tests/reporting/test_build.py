@@ -1,0 +1,255 @@
+"""From folders to the page, whole; and two runs against each other."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from made_runs import ERRORS, add_checkpoint, make_evaluation, make_run
+from rich.console import Console
+
+from saunet.errors import ConfigError, DataError
+from saunet.reporting import Options, build, collect, write
+from saunet.reporting.compare import print_comparison
+from saunet.reporting.document import Column, Document, Row, Section, Table
+from saunet.reporting.markdown import as_markdown, table_csv
+from saunet.reporting.models import Seen, look
+from saunet.reporting.page import as_html
+from saunet.reporting.speed import speed
+
+
+@pytest.fixture
+def picture(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    path = tmp_path / "street.png"
+    cv2.imwrite(str(path), rng.integers(0, 255, (40, 90, 3), dtype=np.uint8))
+    return path
+
+
+@pytest.fixture
+def everything(tmp_path: Path, sweep: Path) -> list[Path]:
+    """A run with a checkpoint and an evaluation, a sweep, and a benchmark of that run's network."""
+    file = add_checkpoint(make_run(tmp_path / "run", status="finished"))
+    parameters = sum(value.numel() for value in _state(file).values())
+    row = {"model": "mine", "size": "32x64", "device": "cpu", "precision": "fp32", "mode": "eager", "batch_size": 2}
+    row |= {"depth_parameters": parameters, "pose_parameters": 0, "median": 0.02}
+    (tmp_path / "bench").mkdir()
+    (tmp_path / "bench" / "benchmark.json").write_text(json.dumps({"machine": {}, "results": [row]}))
+    return [tmp_path / "run", make_evaluation(tmp_path / "e", file), sweep, tmp_path / "bench"]
+
+
+def _state(file: Path) -> dict[str, object]:
+    from saunet.checkpoint import read_checkpoint
+
+    depth, _ = read_checkpoint(file).networks()
+    return dict(depth.named_parameters())
+
+
+def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path: Path) -> None:
+    options = Options(scenes={"kitti": str(picture), "campus_sunny": [str(picture)]})
+    document = build(collect(everything), options)
+    files = write(document, tmp_path / "report")
+    page = files["report.html"].read_text()
+    assert [section.title for section in document.sections] == [
+        "Accuracy", "Networks", "Runs", "Training", "Depth side by side", "Accuracy and time",
+    ]  # fmt: skip
+    for words in (
+        "Fig. 4",
+        "Fig. 5",
+        "Fig. 8",
+        "Fig. 9",
+        "Fig. 10",
+        "the loss became NaN",
+        "α/β",
+        "SAU-Net",
+        "constant depth",
+    ):
+        assert words in page
+    assert {
+        "tables/table1.csv",
+        "tables/sweep_alpha_beta.csv",
+        "tables/figure10.csv",
+        "figures/sweep_alpha_beta_ratio.svg",
+    } <= files.keys()
+    rows = list(csv.DictReader(io.StringIO(files["tables/figure10.csv"].read_text())))
+    assert [(row["Method"], row["ms an image"]) for row in rows] == [("Mono R18", "2.8"), ("run", "10.0")]
+    methods = [row["Method"] for row in csv.DictReader(io.StringIO(files["tables/table1.csv"].read_text()))]
+    assert not any(method.startswith("α/β") for method in methods)
+    missing = {one.what: one.why for one in document.missing}
+    assert "in the tables of their sweeps" in missing["Table 1, jobs of sweeps"]
+    assert missing["Fig. 7"] == "no group of runs differs in its loss alone"
+    assert "Fig. 8" not in missing
+    text = files["report.md"].read_text()
+    for reference in re.findall(r"\]\((figures/[^)]+)\)", text):
+        assert (tmp_path / "report" / reference).is_file()
+
+
+def test_the_page_fetches_nothing(everything: list[Path], picture: Path) -> None:
+    page = as_html(build(collect(everything), Options(scenes={"kitti": str(picture)})))
+    links = re.findall(r"""(?<![-\w])(?:src|href)=["']?([^"'\s>]+)""", page)
+    assert links
+    assert all(link.startswith(("data:", "#")) for link in links)
+    assert "<script" not in page
+    assert "@import" not in page
+    assert "url(" not in page
+    assert "default-src 'none'" in page
+
+
+def test_losses_side_by_side_are_figure_7(sweep: Path, picture: Path) -> None:
+    for job in (0, 2):
+        add_checkpoint(sweep / str(job))
+    document = build(collect([sweep]), Options(scenes={"kitti": str(picture)}, figures=False))
+    titles = [block.title for section in document.sections for block in section.blocks]
+    assert "Fig. 7. Loss functions side by side: kitti" in titles
+    missing = {one.what: one.why for one in document.missing}
+    assert missing["Figs. 4, 5 and 10"] == "figures=false"
+    assert "Fig. 7" not in missing
+
+
+def test_what_has_no_data_is_listed(tmp_path: Path) -> None:
+    document = build(collect([make_run(tmp_path / "a", abs_rel=())]))
+    what = {one.what for one in document.missing}
+    assert {"Size and pictures of a", "Table 1, row of a", "Figs. 7, 8, 9 and 11", "Fig. 10"} <= what
+    assert "Fig. 4, loss of runs" in what
+
+
+def test_without_matplotlib_there_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    inputs = collect([make_run(tmp_path / "a")])
+    with pytest.raises(ConfigError, match=r"need matplotlib; run `pip install 'saunet\[plot\]'` or set figures=false"):
+        build(inputs)
+    assert build(inputs, Options(figures=False)).sections
+
+
+def test_a_damaged_checkpoint_costs_its_pictures_only(tmp_path: Path, picture: Path) -> None:
+    folder = make_run(tmp_path / "a")
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "best.ckpt").write_bytes(b"PK broken")
+    document = build(collect([folder]), Options(scenes={"kitti": str(picture)}))
+    why = {one.what: one.why for one in document.missing}
+    assert "damaged" in why["Size and pictures of a"]
+    assert any(row.kind == "measured" for row in document.tables[0].rows)
+
+
+@pytest.mark.parametrize(("names", "words"), [(("x",), "1 names for 2"), (("x", "x"), "name two runs alike")])
+def test_labels_must_fit(tmp_path: Path, names: tuple[str, ...], words: str) -> None:
+    inputs = collect([make_run(tmp_path / name) for name in "ab"])
+    with pytest.raises(ConfigError, match=words):
+        build(inputs, Options(labels=names, figures=False))
+
+
+def test_a_foreign_json_is_no_benchmark(tmp_path: Path) -> None:
+    (tmp_path / "benchmark.json").write_text("{}")
+    make_run(tmp_path / "a")
+    with pytest.raises(DataError, match="not a result of saunet-benchmark"):
+        build(collect([tmp_path / "a", tmp_path / "benchmark.json"]), Options(figures=False))
+
+
+def test_names_from_outside_cannot_become_markup() -> None:
+    table = Table("t", "<b>", (Column("a|b"), Column("Status")), (Row(("<script>|", "failed"), "failed", note="<i>"),))
+    document = Document("<img>", (), (Section("S", (table,)),), ())
+    page, text = as_html(document), as_markdown(document)
+    assert not {"<script>", "<img>", "<i>"} & set(re.findall(r"<\w+>", page))
+    assert "&lt;script>\\|" in text
+
+
+def test_csv_keeps_full_numbers_and_its_sources() -> None:
+    row = Row(("x", 0.123456789), "measured", "Measured", "a note")
+    text = table_csv(Table("t", "T", (Column("a"), Column("b", 3)), (row,)))
+    assert text == "a,b,Source,Note\nx,0.123456789,Measured,a note\n"
+
+
+def _compared(*paths: Path) -> str:
+    stream = io.StringIO()
+    print_comparison(collect(list(paths)), (), Console(file=stream, width=200))
+    return stream.getvalue()
+
+
+def test_two_runs_are_compared_image_by_image(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / name, beta=beta, status="finished") for name, beta in (("a", 0.1), ("b", 0.2))]
+    for folder, value in zip(runs, (0.25, 0.3), strict=True):
+        make_evaluation(folder / "test", "x", value)
+    text = _compared(*runs)
+    assert re.search(r"objective\.beta\s+0\.1\s+0\.2", text)
+    assert "Paired on 6 images under synthetic: beta = 0.2 minus beta = 0.1" in text
+    assert re.search(r"Abs Rel\s+0\.2750\s+0\.3250\s+0\.0500\s+0\.0500\s+0\.0500\s+0%", text)
+
+
+def test_what_cannot_be_paired_is_said(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / name, beta=beta) for name, beta in (("a", 0.1), ("b", 0.2), ("c", 0.3))]
+    make_evaluation(runs[0] / "test", "x")
+    make_evaluation(runs[1] / "test", "x", images=5)
+    text = " ".join(_compared(*runs).split())
+    assert "do not pair up" in text
+    assert "were not both evaluated under one protocol" in text
+    with pytest.raises(DataError, match="not enough to compare"):
+        _compared(runs[0])
+
+
+def _two(tmp_path: Path) -> list[Path]:
+    return [make_run(tmp_path / name, beta=beta, status="finished") for name, beta in (("a", 0.1), ("b", 0.2))]
+
+
+def test_among_all_evaluations_those_of_the_same_images_are_paired(tmp_path: Path) -> None:
+    one, two = _two(tmp_path)
+    make_evaluation(one / "test", "x", 0.25)
+    make_evaluation(one / "zzz_other", "x", 0.9, drive="another drive")
+    make_evaluation(two / "test", "x", 0.3)
+    text = _compared(one, two)
+    assert text.count("Paired on 6 images under synthetic") == 1
+    assert re.search(r"Abs Rel\s+0\.2750\s+0\.3250\s+0\.0500", text)
+    assert "left out" not in text
+
+
+def test_a_flipped_evaluation_is_not_paired_with_a_plain_one(tmp_path: Path) -> None:
+    one, two = _two(tmp_path)
+    make_evaluation(one / "flipped", "x", 0.25, post_processing="monodepth blend of two flips")
+    make_evaluation(two / "test", "x", 0.3)
+    text = " ".join(_compared(one, two).split())
+    assert "Paired on" not in text
+    assert "the first was evaluated with flip=true and the second with no flip or scale" in text
+    make_evaluation(two / "flipped", "x", 0.26, post_processing="monodepth blend of two flips")
+    text = _compared(one, two)
+    assert text.count("Paired on 6 images") == 1
+    assert re.search(r"Abs Rel\s+0\.2750\s+0\.2850", text)
+    assert "synthetic, test split, flip=true; resampled" in text
+
+
+def test_other_systems_are_compared_under_their_names(tmp_path: Path) -> None:
+    ours = make_run(tmp_path / "ours", status="finished")
+    make_evaluation(ours / "test", "x", 0.25)
+    theirs = [make_evaluation(tmp_path / f"foreign_{key}", None, 0.3, predictions=f"{key}.npy") for key in "ab"]
+    text = _compared(ours, *theirs)
+    assert "Paired on 6 images under synthetic: foreign_a minus ours" in text
+    assert "Paired on 6 images under synthetic: foreign_b minus ours" in text
+    assert "?" not in text
+    assert "predictions" not in text
+
+
+def test_figure_10_has_a_point_where_a_run_was_timed_at_its_own_size(everything: list[Path], tmp_path: Path) -> None:
+    place = tmp_path / "bench" / "benchmark.json"
+    row = {**json.loads(place.read_text())["results"][0], "batch_size": 1, "median": 0.01}
+    rows = [row, {**row, "size": "64x128", "median": 0.04}, {**row, "batch_size": 2}, {**row, "mode": "compiled"}]
+    place.write_text(json.dumps({"results": [*rows, {**row, "median": 0.02}]}))
+    inputs = collect(everything)
+    (run,) = inputs.runs
+    seen = look(run, ())
+    assert isinstance(seen, Seen)
+    points, table, missing = speed(inputs.benchmarks, {"run": run}, {"run": seen})
+    accuracy = ERRORS[4]
+    assert points == [("run (cpu, fp32, eager)", accuracy, 0.02), ("run (cpu, fp32, compiled)", accuracy, 0.01)]
+    assert table is not None
+    assert [(row.cells[0], row.cells[2], row.cells[3]) for row in table.rows[1:]] == [
+        *[("run", "32x64", accuracy)] * 4,
+        ("mine", "64x128", None),
+    ]
+    told = {one.what: one.why for one in missing}
+    assert "that runs at 64x128" in told["Fig. 10, accuracy of mine (64x128, cpu, fp32, eager, batch 1)"]
+    assert "several images at once" in told["Fig. 10, point of run (cpu, fp32, eager, batch 2)"]

@@ -1,0 +1,55 @@
+"""Differing keys, and names made from them."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from made_runs import make_run
+
+from saunet.reporting.inputs import collect
+from saunet.runs.settings import differing, labels, ratio, sweeps_ratio
+from saunet.runs.summary import read_run
+
+
+def test_a_component_of_another_name_is_one_difference(tmp_path: Path) -> None:
+    runs = [read_run(make_run(tmp_path / name, encoder=name)) for name in ("resnet18", "stratified_nano")]
+    assert differing(runs) == ["model.encoder"]
+    assert labels([runs]) == [["resnet18 + aunet", "stratified_nano + aunet"]]
+
+
+def test_other_keys_are_named_by_their_last_part(tmp_path: Path) -> None:
+    runs = [read_run(make_run(tmp_path / str(beta), beta=beta)) for beta in (0.1, 0.2)]
+    assert differing(runs) == ["objective.beta"]
+    assert labels([runs]) == [["beta = 0.1", "beta = 0.2"]]
+
+
+def test_a_key_that_older_versions_lack_is_no_difference_while_it_is_off(tmp_path: Path) -> None:
+    old, new = (read_run(make_run(tmp_path / name)) for name in ("old", "new"))
+    newer = dataclasses.replace(new, config={**new.config, "speed": {"compile": False, "ema": 0.0, "freeze": []}})
+    assert differing([old, newer]) == []
+    newest = dataclasses.replace(new, config={**new.config, "speed": {"compile": True}})
+    assert differing([old, newest]) == ["speed.compile"]
+
+
+def test_runs_alike_go_by_their_own_names_and_never_twice_by_one(tmp_path: Path) -> None:
+    one, other = (read_run(make_run(tmp_path / folder / "same")) for folder in ("x", "y"))
+    assert labels([[one, other]]) == [["same (same)", "same (same) 2"]]
+    assert labels([[one]]) == [["same"]]
+
+
+def test_the_ratio_of_the_weights_names_an_alpha_beta_sweep(sweep: Path) -> None:
+    (found,) = collect([sweep]).sweeps
+    assert sweeps_ratio(found.runs)
+    assert [ratio(run) for run in found.runs] == [1, 10, 100]
+    assert labels([found.runs]) == [["α/β = 1", "α/β = 10", "α/β = 100"]]
+
+
+def test_a_job_that_left_nothing_is_named_by_its_plan(sweep: Path) -> None:
+    planned = [[f"objective.beta={beta}"] for beta in (10, 1, 0.1, 0.01)]
+    (found,) = collect([sweep], jobs=lambda folder: planned).sweeps
+    assert labels([found.runs])[0][-1] == "beta = 0.01"
+
+
+def test_no_ratio_without_a_gradient_term(tmp_path: Path) -> None:
+    assert ratio(read_run(make_run(tmp_path / "a", beta=0))) is None

@@ -1,0 +1,223 @@
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from campus_tree import CAMERA, frames, make_clip, make_video
+from kitti_tree import make_drive, name
+
+from saunet.data import splits
+from saunet.data.image_cache import CacheSettings
+from saunet.data.manifest import read_manifest, write_manifest
+from saunet.io.video import VideoReader
+from saunet.registry import datamodules
+from saunet.tools.doctor import diagnose, draw_sheet, manifest_of, survey
+from saunet.tools.prepare.cache import build_cache
+from saunet.tools.prepare.recordings import kitti_recordings
+
+
+def kitti(root, **options):
+    small = {"height": 10, "width": 30, "workers": 0, "split": "all", "cameras": ["left"], "val_share": 0.3}
+    return datamodules.build("kitti", root=str(root), **{**small, **options})
+
+
+def campus(root, **options):
+    cache = str(root.parent / "cache")
+    return datamodules.build("campus", root=str(root), workers=0, frames_cache=cache, val_share=0.3, **options)
+
+
+def look(data, **options):
+    found = survey(data, **options)
+    findings = diagnose(found)
+    return found, findings, "\n".join(map(str, findings))
+
+
+def test_a_good_clip_is_described_and_drawn(tmp_path):
+    make_clip(tmp_path / "r", "ä", frames(16, 5))
+    found, findings, text = look(campus(tmp_path / "r"))
+    assert "error" not in text
+    assert re.search(r"motion between frames 1 apart: median (4\.9|5\.\d) px", text)
+    assert "(recorded at 10.0 frames a second)" in text
+    assert "camera height 1.4 m" in text
+    assert "horizontal field of view 65 degrees" in text
+    assert "no ground-truth depth" in text
+    assert "only 8 training samples" in text
+    sheet = draw_sheet(found, findings, "title")
+    assert sheet.shape[1:] == (1312, 3)
+    assert sheet.shape[0] > 400
+    assert 0.05 < (sheet < 200).mean() < 0.6
+    assert manifest_of(found, findings, "m.json").leave_out == {}
+
+
+def test_bad_frames_are_found_and_left_out(tmp_path):
+    drive = make_drive(tmp_path, 1, frames=range(20), sides=(2,))
+    pictures = frames(20, [4] * 8 + [0] * 2 + [4] * 10, size=(20, 60))
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(drive / "image_02" / "data" / f"{number:010d}.png"), picture)
+    images = drive / "image_02" / "data"
+    cv2.imwrite(str(images / "0000000003.png"), np.zeros((20, 60, 3), np.uint8))
+    (images / "0000000012.png").write_bytes(b"")
+    cv2.imwrite(str(images / "0000000006.png"), pictures[6][:10])
+    found, findings, text = look(kitti(tmp_path))
+    assert "error: 1 of " in text
+    assert "0000000012.png is empty" in text
+    assert "mixes frame sizes" in text
+    assert "1 frames are almost black" in text
+    assert "are the same picture as their neighbor" in text
+    assert findings[0].level == "error"
+    manifest = manifest_of(found, findings, tmp_path / "m.json")
+    write_manifest(tmp_path / "m.json", manifest)
+    reasons = read_manifest(tmp_path / "m.json").leave_out[f"{name(1)} l"]
+    assert reasons["dark"] == [3]
+    assert reasons["unreadable"] == [12]
+    assert {8, 9} <= set(reasons["doubled"])
+    data = kitti(tmp_path, manifest=str(tmp_path / "m.json"), on_error="skip")
+    data.setup("fit")
+    kept = {data.datasets["train"].windows[place][1] for place in range(len(data.datasets["train"]))}
+    assert not kept & {3, 8, 9, 11, 12, 13}
+
+
+def test_cameras_that_cannot_be_right_are_named(tmp_path):
+    make_clip(tmp_path / "r", "a", frames(16), camera=CAMERA.replace("K: [250, 252", "K: [1100, 252"))
+    assert "means a field of view of 17 degrees, which no driving camera has" in look(campus(tmp_path / "r"))[2]
+    (tmp_path / "r" / "camera.yaml").write_text(CAMERA.replace("158.0, 101.0", "60.0, 101.0"))
+    assert "the center is far from the middle" in look(campus(tmp_path / "r"))[2]
+    (tmp_path / "r" / "camera.yaml").write_text(CAMERA.replace("250, 252", "250, 300"))
+    assert "the focal lengths differ" in look(campus(tmp_path / "r"))[2]
+    (tmp_path / "r" / "camera.yaml").write_text("image_size: [640, 360]\nK: [500, 504, 316, 182]\n")
+    found, findings, text = look(campus(tmp_path / "r"))
+    assert "error: " in text
+    assert "is for 640x360" in text
+    assert draw_sheet(found, findings, "x").shape[1] == 1312  # also with nothing readable
+
+
+def test_focal_lengths_that_are_not_positive_are_an_error(tmp_path):
+    folder = tmp_path / "sequences" / "00"
+    (folder / "image_2").mkdir(parents=True)
+    for number, picture in enumerate(frames(12, size=(40, 120))):
+        cv2.imwrite(str(folder / "image_2" / f"{number:06d}.png"), picture)
+    options = {"root": str(tmp_path), "train_sequences": ["00"], "test_sequences": ["00"], "val_share": 0.3}
+    for K in ("-50 0 9000 0 0 50 20", "50 0 60 0 0 -50 20"):
+        (folder / "calib.txt").write_text(f"P2: {K} 0 0 0 1 0\n")
+        data = datamodules.build("kitti_odometry", workers=0, **options)
+        found, findings, text = look(data)
+        assert re.search(r"error: .*calib\.txt.* has focal lengths .*; the lengths must be positive", text)
+        assert "horizontal field of view" not in text
+        assert draw_sheet(found, findings, "x").shape[1] == 1312
+
+
+def test_frame_rate_and_camera_height_of_kitti_are_told(tmp_path):
+    make_drive(tmp_path / "raw", 1, frames=range(12), sides=(2,))
+    for number, picture in enumerate(frames(12, 2, size=(20, 60))):
+        cv2.imwrite(str(tmp_path / "raw" / name(1) / "image_02" / "data" / f"{number:010d}.png"), picture)
+    sequence = tmp_path / "sequences" / "00"
+    (sequence / "image_2").mkdir(parents=True)
+    (sequence / "calib.txt").write_text("P2: 50 0 30 0 0 50 10 0 0 0 1 0\n")
+    (sequence / "times.txt").write_text("".join(f"{0.2 * number:e}\n" for number in range(12)))
+    for number, picture in enumerate(frames(12, 2, size=(20, 60))):
+        cv2.imwrite(str(sequence / "image_2" / f"{number:06d}.png"), picture)
+    odometry = datamodules.build(
+        "kitti_odometry", root=str(tmp_path), train_sequences=["00"], test_sequences=["00"], val_share=0.3, workers=0
+    )
+    mixture = datamodules.build("mixed", sources={"town": kitti(tmp_path / "raw")}, height=10, width=30, workers=0)
+    for data, rate in ((kitti(tmp_path / "raw"), "10.0"), (odometry, "5.0"), (mixture, "10.0")):
+        text = look(data)[2]
+        assert f"(recorded at {rate} frames a second)" in text
+        assert "camera height 1.65 m: depth can be made metric" in text
+
+
+def test_a_bonnet_is_seen(tmp_path):
+    bonnet = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (50, 320, 3), dtype=np.uint8), (0, 0), 2)
+    make_clip(tmp_path / "r", "a", [np.concatenate([picture[:150], bonnet]) for picture in frames(16, 6)])
+    text = look(campus(tmp_path / "r"))[2]
+    assert "of the picture do not move: the car's bonnet" in text
+    share = float(re.search(r"data.crop=\[0,([\d.]+),0,0\]", text)[1])
+    assert 0.15 < share < 0.29
+    assert "do not move" not in look(campus(tmp_path / "r", crop=[0.0, 0.27, 0.0, 0.0]))[2]
+
+
+@pytest.mark.parametrize(("step", "words"), [(1, "too little to tell depths apart"), (0, "nothing moves")])
+def test_too_little_motion_is_told(tmp_path, step, words):
+    make_clip(tmp_path / "r", "a", [frame + np.uint8(place % 2) for place, frame in enumerate(frames(12, step))])
+    assert words in look(campus(tmp_path / "r", static="keep"))[2]
+
+
+def test_a_split_that_cannot_be_used_is_a_finding(tmp_path):
+    make_drive(tmp_path, 1, frames=range(6), scans=False)
+    text = look(kitti(tmp_path))[2]
+    assert "error: the test split cannot be used" in text
+    assert re.search(r"'test' has no usable frame \(.* without ground truth\); check the data root and the split", text)
+    nothing = look(kitti(tmp_path / "gone"))[2]
+    assert nothing.count("no data root") == 1
+    assert "error: the train, val and test splits cannot be used: no data root" in nothing
+    assert "on_error" not in nothing
+
+
+def test_a_part_of_a_split_is_told_from_gaps(tmp_path):
+    kept = "2011_09_26_drive_0001_sync"
+    make_drive(tmp_path, 1, frames=range(90))
+    data = kitti(tmp_path, split="eigen_zhou_by_drive", test_split="all", cameras=["left", "right"])
+    found, _, text = look(data, frames=10)
+    listed = {split: [frame for frame in part if kept in frame.drive] for split, part in zip(
+        ("train", "val"), splits.training_split("eigen_zhou_by_drive", 0), strict=True
+    )}  # fmt: skip
+    assert found.windows["train"] == sum(0 < frame.number < 89 for frame in listed["train"]) > 0
+    assert not listed["val"]
+    assert re.search(r"warning: \d+ of \d+ recordings of the train split are not there, with \d{5} of its \d{5} ", text)
+    assert "consecutive" not in text
+    assert re.search(r"error: the val split cannot be used: none of the \d+ drives of the val split is below", text)
+    assert "the train split cannot be used" not in text
+    assert "nothing is held out" not in text
+    assert "on_error" not in text
+
+
+def test_files_that_break_the_set_up_are_counted_with_on_error(tmp_path):
+    drive = make_drive(tmp_path, 1, frames=range(6), sides=(2,))
+    (drive / "image_02" / "data" / "0000000002.png").write_bytes(b"")
+    text = look(kitti(tmp_path, static="flow"))[2]
+    assert "0000000002.png is empty" in text
+    assert "data.on_error=skip counts all files that are broken" in text
+
+
+def test_a_video_that_cannot_be_decoded_to_its_end_is_a_finding(tmp_path):
+    video = make_video(tmp_path / "r" / "a.avi", frames(48))
+    whole = video.read_bytes()
+    video.write_bytes(whole[: len(whole) * 2 // 3])
+    with VideoReader(video) as reader:
+        lost = reader.declared - sum(1 for _ in reader)
+    assert lost > 5
+    text = look(campus(tmp_path / "r"))[2]
+    assert f"warning: {lost} frames that videos claim to hold cannot be decoded and are left out" in text
+
+
+def test_the_manifest_says_how_much_was_judged_and_what_only_tests_read(tmp_path):
+    for number in (1, 2):
+        make_drive(tmp_path, number, frames=range(12), sides=(2,))
+    (tmp_path / "test.txt").write_text("".join(f"{name(2)} {number} l\n" for number in range(12)))
+    (tmp_path / "train.txt").write_text("".join(f"{name(1)} {number} l\n" for number in range(12)))
+    options = {"split": str(tmp_path / "train.txt"), "test_split": str(tmp_path / "test.txt")}
+    found, findings, _ = look(kitti(tmp_path, **options), frames=6)
+    assert (found.judged, found.known) == (6, 24)
+    manifest = manifest_of(found, findings, tmp_path / "m.json")
+    assert manifest.facts["read"].startswith("6 of 24 frames read")
+    assert manifest.test_only == {f"{name(2)} l"}  # one color: each frame is static
+    write_manifest(manifest.path, manifest)
+    assert read_manifest(manifest.path).test_only == manifest.test_only
+
+
+def test_reading_a_cache_is_measured_by_its_files_and_offered_where_there_is_one(tmp_path):
+    make_drive(tmp_path / "raw", 1, frames=range(12), sides=(2,))
+    build_cache(kitti_recordings(tmp_path / "raw", ["left"]), tmp_path / "cache", CacheSettings(10, 30))
+    cached = kitti(tmp_path / "raw", cache=str(tmp_path / "cache"))
+    sizes = {path.stat().st_size for path in (tmp_path / "cache").rglob("*.jpg")}
+    assert {frame.file_bytes for frame in survey(cached, splits=["train"]).frames} <= sizes
+    mixture = datamodules.build("mixed", sources={"a": kitti(tmp_path / "raw")}, height=10, width=30, workers=0)
+    for data, offered in ((kitti(tmp_path / "raw"), True), (cached, False), (mixture, False)):
+        found = survey(data)
+        found.frames = [replace(frame, seconds=0.1) for frame in found.frames]
+        text = "\n".join(map(str, diagnose(found)))
+        assert "a core reads 10 images a second" in text
+        assert ("make a cache of small images once" in text) == offered

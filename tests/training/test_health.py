@@ -1,0 +1,155 @@
+"""The monitors: what they measure, and what they say of a training that goes wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tiny
+import torch
+from lightning import Callback
+
+from saunet.errors import ConfigError
+from saunet.geometry.pose import pose_matrix
+from saunet.training.health import HealthMonitor, health, holes
+from saunet.training.loading import LoaderMonitor, Loading, sentence
+from saunet.types import DepthPyramid, LossTerms
+
+
+def pyramid(disparity: torch.Tensor) -> DepthPyramid:
+    return DepthPyramid((disparity,), (disparity,), (1 / disparity,))
+
+
+def test_sky_is_no_hole_and_a_far_patch_in_a_car_is() -> None:
+    far = torch.zeros(1, 1, 10, 10, dtype=torch.bool)
+    far[..., :3, :] = True
+    assert float(holes(far)) == 0
+    far[..., 6:8, 4:9] = True
+    assert float(holes(far)) == pytest.approx(0.1)
+
+
+def test_the_figures_of_a_step() -> None:
+    ramp = torch.linspace(0.1, 0.3, 8)[:, None].expand(8, 6)[None, None]
+    poses = pose_matrix(torch.tensor([[[0, 0.2, 0]]]), torch.tensor([[[3.0, 0, 4]]]))
+    mask = torch.zeros(1, 1, 8, 6)
+    mask[..., :2, :] = 1
+    terms = LossTerms(torch.tensor(1.0), {}, {"automask": mask})
+    figures = {name: float(value) for name, value in health(pyramid(ramp), poses, terms, 100.0).items()}
+    assert figures == pytest.approx(
+        {
+            "disparity_spread": float(ramp.std() / ramp.mean()),
+            "holes": 0.0,
+            "translation": 5.0,
+            "rotation": 0.2,
+            "automask": 0.25,
+        },
+        abs=1e-5,
+    )
+    assert float(health(pyramid(torch.full((1, 1, 4, 4), 0.3)), poses, terms, 100.0)["disparity_spread"]) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("figure", "value", "words"),
+    [
+        ("disparity_spread", 0.001, "depth has collapsed"),
+        ("holes", 0.2, "20.0% of the pixels are holes"),
+        ("automask", 0.01, "only 1.0% of the pixels teach"),
+        ("translation", 1e-9, "the pose network has collapsed"),
+    ],
+)
+def test_each_sickness_is_said_once(figure: str, value: float, words: str) -> None:
+    healthy = {"disparity_spread": 0.5, "holes": 0.0, "automask": 0.5, "translation": 0.1, "rotation": 0.0}
+    monitor = HealthMonitor()
+    assert monitor.judge(healthy) == []
+    (said,) = monitor.judge({**healthy, figure: value})
+    assert words in said
+    assert monitor.judge({**healthy, figure: value}) == []
+
+
+def test_it_speaks_while_training(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    monitor = HealthMonitor(every_n_steps=2, after=2, spread=1e9)
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=1, limit_val_batches=0, callbacks=[monitor], log_every_n_steps=1)
+    with caplog.at_level("INFO"):
+        trainer.fit(tiny.tiny_model(), tiny.tiny_walls())
+    (said,) = [record.getMessage() for record in caplog.records if "collapsed" in record.getMessage()]
+    assert said.startswith("step 2: disparity is nearly flat")
+
+
+def test_the_figures_are_logged_while_training(tmp_path: Path) -> None:
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=1, limit_train_batches=1, callbacks=[HealthMonitor()])
+    trainer.fit(tiny.tiny_model(), tiny.tiny_walls())
+    names = {"disparity_spread", "holes", "automask", "translation", "rotation"}
+    assert {f"health/{name}" for name in names} <= trainer.callback_metrics.keys()
+
+
+def test_thresholds_are_checked() -> None:
+    with pytest.raises(ConfigError, match=r"holes is 2\.0; it must lie between 0 and 1"):
+        HealthMonitor(holes=2.0)
+
+
+def test_loading_figures() -> None:
+    loading = Loading(images=360, seconds=10.0, waited=4.0)
+    assert (loading.reached, loading.needed, loading.share) == pytest.approx((36.0, 60.0, 0.4))
+
+
+@pytest.mark.parametrize(("cacheable", "cached"), [(True, False), (True, True), (False, False)])
+def test_copies_are_advised_where_the_data_can_be_read_from_them(
+    cacheable: bool, cached: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer, data = tiny.tiny_trainer(tmp_path), tiny.tiny_walls()
+    data.cacheable = cacheable
+    if cached:
+        monkeypatch.setattr(data, "copies", object())
+    monkeypatch.setattr(trainer, "datamodule", data, raising=False)
+    monkeypatch.setattr("saunet.training.loading.available_cores", lambda: 0)
+    said = sentence(Loading(images=360, seconds=10.0, waited=4.0), trainer)
+    assert ("with saunet-prepare cache" in said) == (cacheable and not cached)
+    assert ("use a faster disk or more cores" in said) == (not cacheable or cached)
+
+
+@pytest.mark.parametrize(("slow", "epochs", "every"), [(True, 1, 2), (False, 1, 2), (True, 2, 4), (True, 3, 5)])
+def test_a_slow_loader_is_named_with_its_figures_and_a_fast_one_is_not(
+    slow: bool,
+    epochs: int,
+    every: int,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = [0.0]  # a clock of our own: a busy machine must not decide this test
+    monkeypatch.setattr("saunet.data.sampling.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("saunet.training.loading.time.monotonic", lambda: clock[0])
+    image = tiny.Wall.image
+
+    def read(self: Any, index: int) -> Any:
+        clock[0] += 0.01 if slow else 0.0
+        return image(self, index)
+
+    class Clocked(tiny.TinyDepth):
+        def forward(self, image: torch.Tensor) -> DepthPyramid:
+            clock[0] += 0.04
+            return super().forward(image)
+
+    class Pause(Callback):
+        def on_train_epoch_end(self, *_: Any) -> None:
+            clock[0] += 100.0  # validation and checkpoints, which the loader cannot help
+
+    monkeypatch.setattr(tiny.Wall, "image", read)
+    model = tiny.tiny_model()
+    model.depth = Clocked()
+    callbacks = [LoaderMonitor(every_n_steps=every), Pause()]
+    trainer = tiny.tiny_trainer(
+        tmp_path, max_epochs=epochs, limit_val_batches=0, callbacks=callbacks, log_every_n_steps=1
+    )
+    with caplog.at_level("INFO"):
+        trainer.fit(model, tiny.tiny_walls())
+    said = [record.getMessage() for record in caplog.records if "bottleneck" in record.getMessage()]
+    # four samples of three images: 0.12 s to load, 0.04 s to use
+    assert trainer.callback_metrics["loader/share"] == pytest.approx(0.75 if slow else 0.0, abs=0.01)
+    assert trainer.callback_metrics["loader/images_per_second"] == pytest.approx(75 if slow else 300, rel=0.01)
+    assert len(said) == slow
+    if slow:
+        assert "75 images/s arrive and the model could use 300 (75% of the time" in said[0]
+        assert "raise data.workers (now 0" in said[0]
+        assert "load smaller copies made once with saunet-prepare cache" in said[0]

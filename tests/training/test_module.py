@@ -1,0 +1,217 @@
+"""The training step, validation and resume, on a training small enough to run to the end."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tiny
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+from torch import Tensor, nn
+
+import saunet
+from saunet.checkpoint import read_checkpoint
+from saunet.data.module import DepthDataModule
+from saunet.data.windows import Selection
+from saunet.errors import ConfigError
+from saunet.io.images import read_image
+from saunet.training.assemble import assemble
+from saunet.training.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
+from saunet.training.module import SelfSupervisedDepth
+from saunet.types import EvalBatch
+
+
+@pytest.fixture
+def batch(walls: DepthDataModule) -> EvalBatch:
+    walls.setup("fit")
+    return walls.on_after_batch_transfer(next(iter(walls.val_dataloader())), 0)  # type: ignore[return-value]
+
+
+def test_a_step_trains_every_parameter(model: SelfSupervisedDepth, batch: EvalBatch) -> None:
+    _, views, terms = model.step(batch)
+    terms.total.backward()
+    assert len(views) == 4
+    assert all(view.image.shape == batch["loss_sources"].shape for view in views)
+    missing = [name for name, parameter in model.named_parameters() if parameter.grad is None]
+    assert missing == []
+
+
+def test_what_is_logged_is_what_is_optimized(model: SelfSupervisedDepth, batch: EvalBatch) -> None:
+    terms = model.step(batch)[-1]
+    named = terms.named("train")
+    torch.testing.assert_close(named["train/loss"], terms.total.detach())
+    assert set(named) == {"train/loss", "train/photometric", "train/gradient"}
+    weighted = 10 * named["train/photometric"] + 0.1 * named["train/gradient"]
+    torch.testing.assert_close(named["train/loss"], weighted)
+
+
+def test_training_brings_the_loss_down(
+    model: SelfSupervisedDepth, walls: DepthDataModule, make_trainer: Callable[..., Trainer]
+) -> None:
+    trainer = make_trainer(max_epochs=1, limit_val_batches=1)
+    trainer.validate(model, walls, verbose=False)
+    before = float(trainer.callback_metrics["val/loss"])
+    trainer = make_trainer(max_epochs=8)
+    trainer.fit(model, walls)
+    assert float(trainer.callback_metrics["val/loss"]) < 0.8 * before
+    assert float(trainer.callback_metrics["val/images"]) == 6
+
+
+def test_a_checkpoint_predicts_what_the_model_predicted(
+    model: SelfSupervisedDepth, walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    trainer = make_trainer(max_epochs=1, limit_train_batches=1, limit_val_batches=0)
+    trainer.fit(model, walls)
+    trainer.save_checkpoint(tmp_path / "a.ckpt")
+    image = walls.datasets["val"].drives[0].image(3)
+    predicted = saunet.load(tmp_path / "a.ckpt").predict(image)
+    model.eval()
+    with torch.inference_mode():
+        expected = model(torch.from_numpy(image).permute(2, 0, 1)[None] / 255).depth[0][0, 0]
+    torch.testing.assert_close(torch.from_numpy(predicted.depth), expected, rtol=1e-4, atol=1e-5)
+
+
+class StopAfterTwoEpochs(Callback):
+    """What an interruption leaves: a checkpoint of the second epoch and nothing after it."""
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        trainer.should_stop = trainer.current_epoch == 1
+
+
+def _weights(model: nn.Module) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in model.state_dict().items()}
+
+
+def test_a_resumed_training_equals_the_uninterrupted_one_bit_for_bit(
+    config: dict[str, Any], walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    torch.manual_seed(0)
+    model = assemble(config, walls)
+    twin = copy.deepcopy(model)
+    straight = make_trainer(max_epochs=3)
+    straight.fit(model, walls)
+
+    stop = [ModelCheckpoint(tmp_path, save_last=True), StopAfterTwoEpochs()]
+    make_trainer(max_epochs=3, callbacks=stop, enable_checkpointing=True).fit(twin, copy.deepcopy(walls))
+    torch.manual_seed(99)  # what happened in between must not matter
+    resumed = assemble(config, walls)
+    make_trainer(max_epochs=3).fit(resumed, copy.deepcopy(walls), ckpt_path=tmp_path / "last.ckpt", weights_only=True)
+    expected, got = _weights(model), _weights(resumed)
+    assert expected.keys() == got.keys()
+    assert all(torch.equal(expected[name], got[name]) for name in expected)
+
+
+def test_last_is_the_last_and_best_is_the_best(
+    config: dict[str, Any], walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    class Worsening(Callback):
+        def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+            pl_module.log("score", {0: 0.5, 1: 0.1, 2: 0.3}.get(trainer.current_epoch, 0.2))
+
+    def fit(folder: Path, epochs: int, resume: Path | None = None) -> None:
+        callbacks = [Worsening(), LastCheckpoint(str(folder)), BestCheckpoint(str(folder), "score")]
+        trainer = make_trainer(max_epochs=epochs, limit_train_batches=1, limit_val_batches=1, callbacks=callbacks)
+        trainer.fit(assemble(config, walls), copy.deepcopy(walls), ckpt_path=resume, weights_only=True)
+
+    make_trainer = partial(make_trainer, enable_checkpointing=True)
+    fit(tmp_path / "a", 3)
+    assert read_checkpoint(tmp_path / "a" / "last.ckpt").epoch == 2
+    assert read_checkpoint(tmp_path / "a" / "best.ckpt").epoch == 1
+    fit(tmp_path / "b", 4, resume=tmp_path / "a" / "last.ckpt")  # scores 0.2: not better than the 0.1 of before
+    assert read_checkpoint(tmp_path / "b" / "last.ckpt").epoch == 3
+    assert read_checkpoint(tmp_path / "b" / "best.ckpt").epoch == 1
+
+
+def test_best_falls_back_to_the_loss_where_nothing_has_ground_truth(
+    config: dict[str, Any], walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    best = BestCheckpoint(str(tmp_path), "val/nothing")
+    trainer = make_trainer(max_epochs=1, limit_train_batches=1, callbacks=[best], enable_checkpointing=True)
+    trainer.fit(assemble(config, walls), walls)
+    assert best.monitor == "val/loss"
+    assert (tmp_path / "best.ckpt").is_file()
+
+
+def test_validation_without_ground_truth_says_nothing_of_metrics(tmp_path: Path) -> None:
+    class Plain(tiny.Wall):
+        def depth(self, index: int) -> None:  # type: ignore[override]
+            return None
+
+    class PlainWalls(tiny.TinyWalls):
+        def select(self, split: str) -> list[Selection]:
+            return [Selection(Plain(f"{split} 1"), range(8))]
+
+    model, data = tiny.tiny_model(), PlainWalls(height=32, width=48, batch_size=4, workers=0)
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=1)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=r".*was called before the ``update``.*")
+        trainer.fit(model, data)
+    assert "val/loss" in trainer.callback_metrics
+    assert "val/abs_rel" not in trainer.callback_metrics
+
+
+def test_where_more_is_better_the_highest_is_kept(
+    config: dict[str, Any], walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    class Best(BestCheckpoint):
+        def _monitor_candidates(self, trainer: Trainer) -> dict[str, torch.Tensor]:
+            value = torch.tensor((0.5, 0.9, 0.7)[trainer.current_epoch])
+            return {**super()._monitor_candidates(trainer), "val/a1": value}
+
+    best = Best(str(tmp_path), "val/a1")
+    make_trainer = partial(make_trainer, enable_checkpointing=True, limit_train_batches=1, limit_val_batches=1)
+    make_trainer(max_epochs=3, callbacks=[best]).fit(assemble(config, walls), walls)
+    assert read_checkpoint(tmp_path / "best.ckpt").epoch == 1
+    assert best.cost == pytest.approx(-0.9)
+
+
+def test_without_validation_the_mean_loss_of_the_epoch_decides(
+    config: dict[str, Any],
+    walls: DepthDataModule,
+    make_trainer: Callable[..., Trainer],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    losses = []
+
+    class Watch(Callback):
+        def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any) -> None:
+            losses.append(float(outputs["loss"]))
+
+    best = BestCheckpoint(str(tmp_path), "val/a1")
+    trainer = make_trainer(
+        max_epochs=2, limit_train_batches=2, limit_val_batches=0, callbacks=[Watch(), best], enable_checkpointing=True
+    )
+    with caplog.at_level("INFO"):
+        trainer.fit(assemble(config, walls), walls)
+    assert best.cost == pytest.approx(min(sum(losses[:2]), sum(losses[2:])) / 2, rel=1e-4)
+    said = [each.getMessage() for each in caplog.records if "best.ckpt" in each.getMessage()]
+    assert said == ["val/a1 is not measured in this run; best.ckpt is chosen by the epoch's mean train/loss"]
+
+
+def test_a_picture_is_written_after_every_epoch(
+    model: SelfSupervisedDepth, walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    make_trainer(max_epochs=2, limit_train_batches=1, callbacks=[PicturePanel(str(tmp_path / "p"))]).fit(model, walls)
+    pictures = sorted((tmp_path / "p").iterdir())
+    assert [path.name for path in pictures] == ["epoch_000.png", "epoch_001.png"]
+    picture = read_image(pictures[1])
+    assert picture.shape[1] > 4 * 320  # five tiles a row
+    assert picture.std() > 20
+
+
+def test_parts_that_do_not_fit_are_refused(config: dict[str, Any], walls: DepthDataModule) -> None:
+    config["model"]["pose"]["offsets"] = [-2, 2]
+    with pytest.raises(ConfigError, match=r"model.pose.offsets is \[-2, 2\] but the data give frames at \[-1, 1\]"):
+        assemble(config, walls)
+    config["model"]["pose"]["offsets"] = [-1, 1]
+    walls.height = 90
+    with pytest.raises(ConfigError, match="nearest valid size is 96x96"):
+        assemble(config, walls)

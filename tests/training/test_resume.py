@@ -1,0 +1,227 @@
+"""A run that is killed or asked to stop goes on as if nothing had happened."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tiny
+import torch
+from lightning import Callback, LightningModule, Trainer
+
+from saunet.errors import CheckpointError, ConfigError
+from saunet.runs.run_record import Stopped
+from saunet.training.callbacks import LastCheckpoint
+from saunet.training.optim import Recipe
+from saunet.training.resume import resume_path, warm_start
+from saunet.training.resume_checks import changes
+from saunet.training.stopping import GracefulStop
+
+EPOCHS = 3
+BATCHES = 18  # twelve windows in batches of two, three epochs; two batches a step
+
+
+def same(left: Path, right: Path) -> None:
+    one, other = (torch.load(folder / "end.pt", weights_only=True) for folder in (left, right))
+    assert one.keys() == other.keys()
+    different = [name for name in one if not torch.equal(one[name], other[name])]
+    assert different == []
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the uninterrupted training."""
+    folder = tmp_path_factory.mktemp("whole")
+    tiny.main(folder, EPOCHS)
+    return folder
+
+
+def test_killed_at_a_random_step_and_resumed_it_equals_the_uninterrupted_run(whole: Path, tmp_path: Path) -> None:
+    strike = random.randrange(3, BATCHES - 1)  # a different one every time: any must do
+    command = [sys.executable, str(Path(tiny.__file__)), str(tmp_path), str(EPOCHS)]
+    environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}  # sums in the order of this process
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=1, text=True, env=environment
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith("batch"):
+                process.stdin.write("go on\n")  # the blow falls somewhere before the end of the next batch
+                if int(line.split()[-1]) >= strike:
+                    process.kill()
+                    break
+    assert process.returncode == -signal.SIGKILL
+    assert not (tmp_path / "end.pt").exists()
+    tiny.main(tmp_path, EPOCHS, str(tmp_path / "last.ckpt"))
+    same(whole, tmp_path)
+
+
+class Ask(Callback):
+    """Ask the process to stop during a batch."""
+
+    def __init__(self, batch: int, number: int = signal.SIGTERM) -> None:
+        self.batch, self.number = batch, number
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        if trainer.fit_loop.total_batch_idx + 1 == self.batch:
+            os.kill(os.getpid(), self.number)
+
+
+@pytest.mark.parametrize("batch", [6, 8])  # the middle of an accumulation, the end of an epoch
+def test_asked_to_stop_it_saves_and_says_how_to_go_on(batch: int, whole: Path, tmp_path: Path) -> None:
+    handler = signal.getsignal(signal.SIGTERM)
+    callbacks = [Ask(batch), GracefulStop(str(tmp_path)), LastCheckpoint(str(tmp_path))]
+    trainer = tiny.tiny_trainer(
+        tmp_path, max_epochs=EPOCHS, callbacks=callbacks, accumulate_grad_batches=2, gradient_clip_val=1.0
+    )
+    with pytest.raises(Stopped, match=r"stopped by SIGTERM after step \d+, .*go on with resume=.*last.ckpt") as stop:
+        trainer.fit(tiny.tiny_model(tiny.RECIPE), tiny.tiny_walls(batch_size=2))
+    assert stop.value.code == 143
+    assert trainer.global_step < BATCHES // 2
+    assert signal.getsignal(signal.SIGTERM) == handler
+    tiny.main(tmp_path, EPOCHS, str(tmp_path / "last.ckpt"))
+    same(whole, tmp_path)
+
+
+def test_a_second_interrupt_ends_at_once(tmp_path: Path) -> None:
+    stop = GracefulStop(str(tmp_path))
+    stop._receive(signal.SIGINT, None)
+    with pytest.raises(KeyboardInterrupt):
+        stop._receive(signal.SIGINT, None)
+
+
+def test_a_changed_rate_is_not_kept_in_silence(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    last = [LastCheckpoint(str(tmp_path))]
+    first = tiny.tiny_trainer(tmp_path, max_epochs=1, callbacks=last)
+    first.fit(tiny.tiny_model(Recipe(lr=1e-2)), tiny.tiny_walls())
+    changed = tiny.tiny_model(Recipe(lr=5e-3, schedule="constant"))
+    again = tiny.tiny_trainer(tmp_path, max_epochs=2)
+    with caplog.at_level("INFO"):
+        again.fit(changed, tiny.tiny_walls(), ckpt_path=str(tmp_path / "last.ckpt"), weights_only=True)
+    assert again.optimizers[0].param_groups[0]["lr"] == 1e-2
+    (said,) = [record.getMessage() for record in caplog.records if "resumed run" in record.getMessage()]
+    assert "keeps the checkpoint's optim.lr 0.01 (not 0.005)" in said
+    assert "the new optim.schedule constant (it was step)" in said
+    assert "start from its weights with init_from=" in said
+
+
+def test_an_optimizer_that_does_not_fit_is_refused() -> None:
+    before = Recipe().to_plain()
+    assert Recipe().resumed_from(before) is None
+    for changed in (Recipe(optimizer="adamw"), Recipe(freeze=["pose"]), Recipe(encoder_lr=1e-5)):
+        with pytest.raises(ConfigError, match=r"init_from= instead of resume="):
+            changed.resumed_from(before)
+
+
+def test_where_a_run_resumes_from(tmp_path: Path) -> None:
+    assert resume_path(None, tmp_path) is None
+    assert resume_path("auto", tmp_path) is None
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    last.parent.mkdir()
+    last.touch()
+    assert resume_path("auto", tmp_path) == str(last)
+    assert resume_path("auto", tmp_path, "other.ckpt") == str(last)  # a requeued job that began warm
+    with pytest.raises(ConfigError, match=r"resume= and init_from= are both set"):
+        resume_path("a.ckpt", tmp_path, "b.ckpt")
+
+
+def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Path, config: Any, walls: Any) -> None:
+    from saunet.checkpoint import atomic_save
+    from saunet.training.assemble import assemble
+
+    with torch.no_grad():
+        next(model.depth.parameters()).fill_(0.5)
+    weights = {key: value for key, value in model.state_dict().items() if not key.startswith("pose.layers.0.")}
+    atomic_save({"saunet": model.record, "state_dict": weights}, tmp_path / "a.ckpt")
+    other = assemble(config, walls)
+    said = warm_start(other, tmp_path / "a.ckpt")
+    count = len(other.depth.state_dict())
+    assert f"{count} of {count} tensors of the depth network" in said
+    assert f"{len(other.pose.state_dict()) - 2} of {len(other.pose.state_dict())} tensors of the pose" in said
+    assert torch.equal(next(other.depth.parameters()), next(model.depth.parameters()))
+    atomic_save({"saunet": model.record, "state_dict": {"depth.x": torch.zeros(1)}}, tmp_path / "b.ckpt")
+    with pytest.raises(CheckpointError, match=r"nothing of .*b\.ckpt fits the depth network"):
+        warm_start(other, tmp_path / "b.ckpt")
+
+
+def test_a_writer_that_dies_midway_leaves_the_previous_checkpoint(tmp_path: Path) -> None:
+    code = (
+        "import os, sys, torch\n"
+        "from saunet.checkpoint import atomic_save\n"
+        "path = sys.argv[1]\n"
+        "atomic_save({'epoch': 1}, path)\n"
+        "def die(content, stream):\n"
+        "    stream.write(b'half'); stream.flush(); os._exit(9)\n"
+        "torch.save = die\n"
+        "atomic_save({'epoch': 2}, path)\n"
+    )
+    path = tmp_path / "last.ckpt"
+    done = subprocess.run([sys.executable, "-c", code, str(path)], check=False, capture_output=True)
+    assert done.returncode == 9
+    assert torch.load(path, weights_only=True) == {"epoch": 1}
+
+
+@pytest.mark.parametrize(
+    ("seed", "data", "words"),
+    [
+        (5, {}, "with seed 0 and this run has 5"),
+        (0, {"batch_size": 2}, "with data.batch_size 4 and this run has 2"),
+        (0, {"offsets": (-2, 2)}, r"with training frames \(SHA-256 of their names\)"),
+    ],
+)
+def test_a_resumed_run_sees_the_same_samples(seed: int, data: dict[str, Any], words: str, tmp_path: Path) -> None:
+    first = tiny.tiny_trainer(tmp_path, max_epochs=1, callbacks=[LastCheckpoint(str(tmp_path))])
+    first.fit(tiny.tiny_model(), tiny.tiny_walls())
+    model = tiny.tiny_model()
+    model.seed = seed
+    again = tiny.tiny_trainer(tmp_path, max_epochs=2)
+    with pytest.raises(CheckpointError, match=words):
+        again.fit(model, tiny.tiny_walls(**data), ckpt_path=str(tmp_path / "last.ckpt"), weights_only=True)
+
+
+def test_a_checkpoint_without_settings_is_resumed(tmp_path: Path) -> None:
+    first = tiny.tiny_trainer(tmp_path, max_epochs=1, callbacks=[LastCheckpoint(str(tmp_path))])
+    first.fit(tiny.tiny_model(), tiny.tiny_walls())
+    old = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    del old["saunet_training"]["settings"]
+    torch.save(old, tmp_path / "old.ckpt")
+    again = tiny.tiny_trainer(tmp_path, max_epochs=2)
+    model = tiny.tiny_model()
+    model.seed = 5
+    again.fit(model, tiny.tiny_walls(), ckpt_path=str(tmp_path / "old.ckpt"), weights_only=True)
+    assert again.current_epoch == 2
+
+
+def test_changed_networks_and_objectives_are_named(model: Any) -> None:
+    before = {"objective": {"_target_": "a.Saunet", "alpha": 10.0}, "model": model.record["model"]}
+    assert changes(before, before) is None
+    now = {
+        "objective": {"_target_": "a.Saunet", "alpha": 5.0},
+        "model": {**before["model"], "pose": {**before["model"]["pose"], "_target_": "b.Other"}},
+    }
+    said = changes(before, now)
+    assert said is not None
+    assert "goes on with the new objective.alpha 5.0 (it was 10.0), model.pose Other (it was PoseCNN);" in said
+    assert changes({"objective": {}, "model": {}}, now) is None
+
+
+def test_a_changed_objective_is_not_kept_in_silence(
+    config: dict[str, Any], walls: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    from saunet.training.assemble import assemble
+
+    few = {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 0}
+    first = tiny.tiny_trainer(tmp_path, **few, callbacks=[LastCheckpoint(str(tmp_path))])
+    first.fit(assemble(config, walls), walls)
+    config["objective"]["alpha"] = 3.0
+    again = tiny.tiny_trainer(tmp_path, **few)
+    with caplog.at_level("INFO"):
+        again.fit(assemble(config, walls), walls, ckpt_path=str(tmp_path / "last.ckpt"), weights_only=True)
+    assert "goes on with the new objective.alpha 3.0 (it was 10.0)" in caplog.text

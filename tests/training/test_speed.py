@@ -1,0 +1,108 @@
+"""Speed switches change no result: the same losses, gradients and statistics within rounding."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tiny
+import torch
+from lightning import Callback, LightningModule, Trainer
+
+import saunet
+from saunet.models.depth import DepthNet
+from saunet.training.optim import Recipe
+from saunet.training.speed import Speed, blocks
+
+STEPS = 50
+
+
+class Losses(Callback):
+    def __init__(self) -> None:
+        self.values: list[float] = []
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any) -> None:
+        self.values.append(float(outputs["loss"]))
+
+
+def losses(folder: Path, precision: str = "32-true", speed: Speed | None = None, **recipe: Any) -> list[float]:
+    """Return the losses of fifty steps."""
+    model = tiny.tiny_model(Recipe(**{"lr": 3e-3, "schedule": "constant", **recipe}), speed, dropout=0.0)
+    model.objective.terms["photometric"].noise = 0.0  # type: ignore[assignment]
+    seen = Losses()
+    trainer = tiny.tiny_trainer(
+        folder, max_steps=STEPS, max_epochs=-1, limit_val_batches=0, precision=precision, callbacks=[seen]
+    )
+    trainer.fit(model, tiny.tiny_walls())
+    assert len(seen.values) == STEPS
+    return seen.values
+
+
+def test_fifty_steps_in_bfloat16_follow_those_in_float32(tmp_path: Path) -> None:
+    exact, mixed = losses(tmp_path), losses(tmp_path, "bf16-mixed")
+    assert exact[-1] < 0.9 * exact[0]
+    assert mixed != exact
+    assert mixed == pytest.approx(exact, rel=0.05)
+
+
+def test_the_fused_optimizer_trains_alike(tmp_path: Path) -> None:
+    # Processors round differently, and fifty steps let it grow; one step is compared closely in test_optim.py.
+    assert losses(tmp_path, fused=True) == pytest.approx(losses(tmp_path), rel=1e-2)
+
+
+@pytest.fixture
+def network() -> DepthNet:
+    torch.manual_seed(0)
+    return DepthNet(saunet.build("encoder", "resnet18"), partial(saunet.build, "decoder", "unet"))
+
+
+def test_recomputed_activations_give_the_same_gradients_and_statistics(network: DepthNet) -> None:
+    twin = copy.deepcopy(network)
+    holder: Any = torch.nn.Module()
+    holder.depth, holder.pose, holder.objective = twin, None, None
+    Speed(checkpoint_activations=True).apply(holder)
+    assert len(blocks(twin.encoder)) == 8  # the residual blocks
+    image = torch.rand(2, 3, 64, 96)
+    for each in (network, twin):
+        each.train()
+        sum(disparity.mean() for disparity in each(image).disparity).backward()
+    assert twin.state_dict().keys() == network.state_dict().keys()
+    for (name, plain), (_, recomputed) in zip(network.named_parameters(), twin.named_parameters(), strict=True):
+        torch.testing.assert_close(plain.grad, recomputed.grad, msg=name)
+    for (name, plain), (_, recomputed) in zip(network.named_buffers(), twin.named_buffers(), strict=True):
+        assert torch.equal(plain, recomputed), name
+    with torch.no_grad():
+        torch.testing.assert_close(network(image).depth[0], twin(image).depth[0])
+
+
+COMPILED = """
+import json, sys
+sys.path[:0] = [sys.argv[1], sys.argv[1] + "/../helpers"]
+from pathlib import Path
+import tiny, test_speed
+from saunet.training.speed import Speed
+folder = Path(sys.argv[2])
+print(json.dumps([test_speed.losses(folder), test_speed.losses(folder, speed=Speed(compile=True))]))
+"""
+
+
+@pytest.mark.slow
+def test_fifty_compiled_steps_follow_those_in_eager_mode(tmp_path: Path) -> None:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "TORCHINDUCTOR_COMPILE_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", COMPILED, str(Path(__file__).parent), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    eager, compiled = json.loads(done.stdout.splitlines()[-1])
+    assert compiled == pytest.approx(eager, rel=0.02)

@@ -1,0 +1,37 @@
+"""Training from stereo pairs gives meters: the command of docs/scale.md, run, and its depth held against the truth."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import saunet
+from saunet.synthetic import SyntheticDrive
+
+PAGE = Path(__file__).parents[2] / "docs" / "scale.md"
+
+
+@pytest.mark.slow
+def test_stereo_training_is_metric(tmp_path: Path) -> None:
+    (command,) = re.findall(r"^saunet-train (.*data\.stereo=true.*)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    overrides = [*shlex.split(command), f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}"]
+    subprocess.run(
+        [sys.executable, "-m", "saunet.cli.train", *overrides], check=True, capture_output=True, timeout=1500
+    )
+    predictor = saunet.load(tmp_path / "checkpoints" / "last.ckpt")
+    for street in (0, 1):
+        drive = SyntheticDrive(seed=street, frames=40)
+        ratios = []
+        for frame in list(drive.indices)[::6]:
+            prediction, truth = predictor.predict(drive.image(frame)), drive.depth(frame)
+            assert prediction.metric
+            known = (truth > 0) & (truth < 80)
+            ratios.append(np.median(truth[known]) / np.median(prediction.depth[known]))
+        print(f"street {street}: {np.mean(ratios):.3f} ± {np.std(ratios):.3f}")
+        assert abs(np.mean(ratios) - 1) < 0.1

@@ -1,0 +1,127 @@
+"""A run that is asked to stop leaves, once it was resumed, the files of one that was not."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tiny
+import torch
+from lightning import Callback, Trainer
+from lightning.pytorch.loggers import CSVLogger
+from omegaconf import OmegaConf
+
+from saunet.config import config_dir
+from saunet.runs.run_record import Stopped
+from saunet.training.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
+from saunet.training.resume import keep_rows
+from saunet.training.stopping import GracefulStop
+
+BATCHES = 6  # an epoch's, of two epochs
+
+
+class Ask(Callback):
+    """Ask the process to stop during a batch, or during the first validation."""
+
+    def __init__(self, batch: int | None) -> None:
+        self.batch = batch
+
+    def on_train_batch_start(self, trainer: Trainer, *_: Any) -> None:
+        if trainer.fit_loop.total_batch_idx + 1 == self.batch:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+def train(folder: Path, asked: int | None = None, resume: bool = False, **settings: Any) -> Trainer:
+    logger = CSVLogger(str(folder), name=None, version="csv")
+    last = folder / "last.ckpt"
+    if resume:
+        keep_rows(logger, torch.load(last, weights_only=True)["global_step"])
+    callbacks = [
+        Ask(asked),
+        BestCheckpoint(str(folder)),
+        LastCheckpoint(str(folder)),
+        GracefulStop(str(folder)),
+        PicturePanel(str(folder / "pictures")),
+    ]
+    trainer = tiny.tiny_trainer(
+        folder, max_epochs=2, callbacks=callbacks, logger=logger, log_every_n_steps=1, **settings
+    )
+    trainer.fit(
+        tiny.tiny_model(tiny.RECIPE),
+        tiny.tiny_walls(batch_size=2),
+        ckpt_path=str(last) if resume else None,
+        weights_only=True,
+    )
+    return trainer
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "csv" / "metrics.csv").open() as file:
+        return [{key: value for key, value in row.items() if value} for row in csv.DictReader(file)]
+
+
+def same(left: Path, right: Path) -> None:
+    assert rows(left) == rows(right)
+    one, other = (torch.load(folder / "best.ckpt", weights_only=True) for folder in (left, right))
+    assert one["global_step"] == other["global_step"]
+    assert all(torch.equal(value, other["state_dict"][name]) for name, value in one["state_dict"].items())
+    pictures = [sorted(file.name for file in (folder / "pictures").iterdir()) for folder in (left, right)]
+    assert pictures[0] == pictures[1]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the uninterrupted training."""
+    folder = tmp_path_factory.mktemp("whole")
+    train(folder)
+    return folder
+
+
+@pytest.mark.parametrize(("asked", "after"), [(2, 2), (BATCHES, BATCHES)])
+def test_the_log_and_the_best_are_those_of_the_uninterrupted_run(
+    asked: int, after: int, whole: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(Stopped, match=rf"after step {after}, everything is saved"):
+        train(tmp_path, asked)
+    stopped = rows(tmp_path)
+    assert stopped == rows(whole)[: len(stopped)]
+    assert sum("train/loss" in row for row in stopped) == after  # the step at which it stopped is in the log
+    assert sum("val/abs_rel" in row for row in stopped) == after // BATCHES  # and so is the validation after it
+    assert (tmp_path / "best.ckpt").exists() == (after == BATCHES)
+    train(tmp_path, resume=True)
+    same(whole, tmp_path)
+
+
+def test_a_killed_run_knows_the_best_of_its_last_epoch_too(tmp_path: Path) -> None:
+    """The order of the config's callbacks is that of `train`: last.ckpt holds the best of the epoch that it closes."""
+    order = list(OmegaConf.load(config_dir() / "callbacks" / "default.yaml"))
+    assert order.index("best") < order.index("last")
+    trainer = train(tmp_path)
+    stored = torch.load(tmp_path / "last.ckpt", weights_only=True)["callbacks"]["BestCheckpoint"]
+    (best,) = (each for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint))
+    assert stored["best_model_score"] == best.best_model_score
+    assert stored["best_model_path"] == best.best_model_path
+
+
+def test_asked_in_its_last_step_a_training_is_complete(whole: Path, tmp_path: Path) -> None:
+    trainer = train(tmp_path, 2 * BATCHES)
+    assert trainer.global_step == 2 * BATCHES
+    same(whole, tmp_path)
+
+
+@pytest.mark.parametrize(("every", "after"), [(3, 4), (1, 4)])
+def test_a_validation_in_the_midst_of_an_epoch_is_made_before(every: int, after: int, tmp_path: Path) -> None:
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    train(whole, val_check_interval=every)
+    with pytest.raises(Stopped, match=rf"after step {after}, everything is saved"):
+        train(stopped, 3, val_check_interval=every)
+    seen = rows(stopped)
+    assert seen == rows(whole)[: len(seen)]
+    assert sum("val/abs_rel" in row for row in seen) == after // every
+    if every > 1:
+        train(stopped, resume=True, val_check_interval=every)
+        same(whole, stopped)
