@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 import saunet
 from saunet.errors import ConfigError
-from saunet.registry import REGISTRIES, Registry, encoders, instantiate
+from saunet.registry import REGISTRIES, Registry, Spec, encoders, instantiate
 
 
 class Widget:
@@ -111,3 +111,12 @@ def test_every_component_has_a_summary_and_a_pickling_class(kind: str) -> None:
     for entry in entries:
         assert entry.summary.endswith("."), f"{kind} {entry.name}: first docstring line must be a sentence"
         assert pickle.loads(pickle.dumps(entry.target)) is entry.target
+
+
+def test_a_spec_is_built_later_with_changes() -> None:
+    spec = Spec.of("encoder", "resnet18", weights=None)
+    assert spec.get("weights", "unset") is None
+    assert "frames" in spec.parameters
+    assert spec.changed(frames=2).build().features == spec.build().features
+    with pytest.raises(ConfigError, match="did you mean 'weights'"):
+        Spec.of("encoder", "resnet18", wieghts=None)

@@ -155,6 +155,52 @@ def registry(kind: str) -> Registry:
     return REGISTRIES[kind]
 
 
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """A component that will be built later: which one, and the parameters given for it so far.
+
+    Options of tools hold components this way, since a tool may decide some parameters itself (evaluation reads the
+    images at the size of the network).
+
+    Args:
+        node: Plain containers: ``_target_`` and parameters; nested components are nodes too.
+    """
+
+    node: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, kind: str, name: str, /, **kwargs: Any) -> Spec:
+        """Describe component ``name`` of a kind: ``Spec.of("data", "kitti", root="/data/kitti")``.
+
+        Raises:
+            ConfigError: for an unknown kind, name or parameter.
+        """
+        entry = registry(kind).entry(name)
+        _check_keys(f"{kind} '{name}'", entry.target, kwargs)
+        return cls({"_target_": entry.path, **entry.preset, **kwargs})
+
+    @property
+    def parameters(self) -> dict[str, inspect.Parameter]:
+        """Parameters that the component takes."""
+        return schema.parameters(_by_path(self.node["_target_"]).target)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return a parameter that was given, or a default."""
+        return self.node.get(key, default)
+
+    def changed(self, **changes: Any) -> Spec:
+        """Return the same component with other parameters."""
+        return Spec({**self.node, **changes})
+
+    def build(self, **changes: Any) -> Any:
+        """Build the component, with some parameters changed.
+
+        Raises:
+            ConfigError: if a key is not a parameter of it, or the component is not registered.
+        """
+        return instantiate({**self.node, **changes})
+
+
 def instantiate(node: Any) -> Any:
     """Build what a plain config describes: mappings with ``_target_`` become components, innermost first.
 
