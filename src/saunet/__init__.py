@@ -25,6 +25,11 @@ def build(kind: str, name: str, /, **kwargs: Any) -> Any:
 
     Raises:
         ConfigError: for an unknown kind, name or parameter.
+
+    Example:
+        >>> encoder = saunet.build("encoder", "resnet18")
+        >>> [feature.channels for feature in encoder.features]
+        [64, 64, 128, 256, 512]
     """
     return registry(kind).build(name, **kwargs)
 
@@ -32,8 +37,18 @@ def build(kind: str, name: str, /, **kwargs: Any) -> Any:
 def available(kind: str) -> list[str]:
     """Return the registered names of a kind, sorted.
 
+    Args:
+        kind: One of the kinds that `build` takes.
+
+    Returns:
+        The names.
+
     Raises:
         ConfigError: for an unknown kind.
+
+    Example:
+        >>> saunet.available("attention")
+        ['cbam', 'eca', 'gct', 'none', 'se']
     """
     return registry(kind).names()
 
@@ -54,6 +69,12 @@ def load(source: Any, *, device: str = "cpu", flip: bool = False, keep_aspect: b
     Raises:
         CheckpointError: if it is missing, broken, or not a saunet model.
         ConfigError: if a package is missing or the device does not exist.
+
+    Example:
+        >>> model = saunet.load("last.ckpt")
+        >>> image = np.zeros((96, 160, 3), np.uint8)  # height x width x RGB
+        >>> model.predict(image).depth.shape
+        (96, 160)
     """
     if not isinstance(source, str | Path) or not str(source):
         raise CheckpointError(f"saunet.load got {source!r}; give the path of a checkpoint or an exported folder")

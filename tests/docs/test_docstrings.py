@@ -1,161 +1,179 @@
-"""Every public name says what it is, what it takes, and what it raises; read from the source, so nothing is missed.
+"""The exported names are fully described, with examples that run; what has a docstring elsewhere has a sensible one.
 
-``Args:`` is asked of a function or method with three or more parameters whose type leaves open what they are: numbers,
-words, paths and the like. A type of our own or an array with its shape says it; so does a reference to the function
-that describes the same arguments. Arrays say their shape in the annotation or in words.
+Exported is what ``saunet.__all__`` names. Each says what it takes (``Args:``, or a sentence per field of a dataclass),
+returns and raises, the shape of its arrays, and shows an example. All else is internal: a docstring where one helps.
 """
 
 from __future__ import annotations
 
 import ast
+import dataclasses
+import doctest
+import inspect
 import re
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pytest
+import torch
+from tiny_checkpoint import write_checkpoint
+
+import saunet
 
 SOURCE = Path(__file__).parents[2] / "src" / "saunet"
-FILES = sorted(SOURCE.rglob("*.py"))
+EXPORTED = sorted(name for name in saunet.__all__ if name != "__version__")
 ERRORS = {"ConfigError", "DataError", "CheckpointError"}
 Function = ast.FunctionDef | ast.AsyncFunctionDef
-OPEN = 3
-"""Parameters of open types from which on they are described."""
-LIGHTNING = re.compile(r"on_\w+|setup|teardown|optimizer_step")
-"""Its hooks, whose arguments it describes."""
-DRIVE = {"image", "intrinsics", "depth", "pose"}
-"""What `saunet.data.drive.Drive` describes for all recordings."""
 SHAPED = r"(?:Float|Int|UInt|Bool|Num|Shaped)\d*\[(?:[^\[\]]|\[[^\]]*\])*\]"
 """An annotation of jaxtyping."""
 SHAPE = re.compile(
     r"\b\w+ x \w|\b[bnhwsc] (?:\d|[bnhwsc]\b)|\bscalar\b"
     r"|\b(?:one|two|each of the n) (?:\w+ )?(?:numbers?|values?|row|pixels)"
 )
-"""A shape in words, such as ``h x w x 3``, ``b 1 h w`` or one number a frame."""
-
-
-def _public(tree: ast.Module) -> Iterator[tuple[str, ast.ClassDef | Function, ast.ClassDef | None]]:
-    """Yield public classes, functions, and methods of public classes, with the class of a method."""
-    for node in tree.body:
-        if isinstance(node, ast.ClassDef | Function) and not node.name.startswith("_"):
-            yield node.name, node, None
-            if isinstance(node, ast.ClassDef):
-                for method in node.body:
-                    if isinstance(method, Function) and not method.name.startswith("_"):
-                        yield f"{node.name}.{method.name}", method, node
-
-
-def _parameters(function: Function) -> list[str]:
-    arguments = function.args
-    names = [a.arg for a in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)]
-    return [name for name in names if name not in ("self", "cls") and not name.startswith("_")]
+"""A shape in words, such as ``h x w x 3``, ``b 1 h w`` or one number per frame."""
 
 
 def _raised(function: Function) -> set[str]:
-    """Return the project's errors that a function's own body raises and does not catch itself."""
+    """Return the project's errors that a function's own body raises."""
     found = set()
     for node in ast.walk(function):
-        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and isinstance(node.exc.func, ast.Name):
-            found.add(node.exc.func.id)
+        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+            called = node.exc.func
+            found.add(called.id if isinstance(called, ast.Name) else getattr(called, "attr", ""))
     return found & ERRORS
 
 
-def _own_types() -> set[str]:
-    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in FILES)
-    return {node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
+def _says(text: str, name: str) -> bool:
+    return re.search(rf"^\s*{name}( \(.*\))?:", text, re.MULTILINE) is not None
 
 
-OWN = _own_types()
-
-
-def _annotated(function: Function) -> dict[str, str]:
+def _function_problems(name: str, function: Function, text: str, *, constructor: bool = False) -> list[str]:
     arguments = function.args
-    every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)
-    return {each.arg: ast.unparse(each.annotation).replace('"', "'") for each in every if each.annotation is not None}
-
-
-def _is_open(annotation: str) -> bool:
-    return not re.search(SHAPED, annotation) and not OWN & set(re.findall(r"\w+", annotation))
-
-
-def _arguments_missing(function: Function, text: str) -> bool:
-    """Tell whether a function should describe its arguments and does not."""
-    known = _annotated(function)
-    left_open = [name for name in _parameters(function) if _is_open(known.get(name, ""))]
-    told = "Args:" in text or re.search(r"arguments as in `|for the arguments", text)
-    return len(left_open) >= OPEN and not told and not LIGHTNING.fullmatch(function.name)
-
-
-def _shape_missing(function: Function, text: str) -> bool:
-    """Tell whether an array comes or goes of which neither the annotation nor the text says the shape."""
-    returned = ast.unparse(function.returns) if function.returns else ""
-    parts = [each for name, each in _annotated(function).items() if name in _parameters(function)]
-    bare = [re.sub(SHAPED, "", each) for each in (*parts, returned)]
-    arrays = [each for each in bare if re.search(r"\b(?:Tensor|NDArray|ndarray)\b", each)]
-    arrays = [each for each in arrays if not re.search(r"\b(?:dict|Mapping)\b", each)]  # weights by name
-    return bool(arrays) and not SHAPE.search(text)
-
-
-def _problems(path: Path) -> list[str]:
-    return _problems_of(path.read_text(encoding="utf-8"))
-
-
-def _problems_of(source: str) -> list[str]:
-    problems = []
-    tree = ast.parse(source)
-    if not ast.get_docstring(tree):
-        problems.append("the module has no docstring")
-    for name, node, owner in _public(tree):
-        text = ast.get_docstring(node) or ""
-        if not text:
-            problems.append(f"{name} has no docstring")
-            continue
-        if isinstance(node, ast.ClassDef):
-            init = next((f for f in node.body if isinstance(f, Function) and f.name == "__init__"), None)
-            if init is not None:
-                problems += [
-                    f"{name} does not describe its parameter {parameter}"
-                    for parameter in _parameters(init)
-                    if not re.search(rf"^\s*{parameter}( \(.*\))?:", text, re.MULTILINE)
-                ]
-                if _raised(init) and "Raises:" not in text:
-                    problems.append(f"{name} raises {sorted(_raised(init))} and does not say so")
-            continue
-        if _raised(node) and "Raises:" not in text:
-            problems.append(f"{name} raises {sorted(_raised(node))} and does not say so")
-        if _arguments_missing(node, text):
-            problems.append(f"{name} does not describe its arguments")
-        if _shape_missing(node, text) and not (owner is not None and node.name in DRIVE):
-            problems.append(f"{name} does not say the shape of an array")
-        if "Args:" in text:
-            problems += [
-                f"{name} describes some parameters, but not {parameter}"
-                for parameter in _parameters(node)
-                if not re.search(rf"^\s*{parameter}( \(.*\))?:", text, re.MULTILINE)
-            ]
+    every = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
+    own = {each.arg: ast.unparse(each.annotation) if each.annotation else "" for each in every}
+    own = {arg: kind.replace('"', "'") for arg, kind in own.items() if arg not in ("self", "cls")}
+    problems = [f"{name} does not describe its argument {arg}" for arg in own if not _says(text, arg)]
+    returned = ast.unparse(function.returns) if function.returns else "None"
+    if not constructor and returned != "None" and "Returns:" not in text and "Yields:" not in text:
+        problems.append(f"{name} does not say what it returns")
+    if _raised(function) and "Raises:" not in text:
+        problems.append(f"{name} raises {sorted(_raised(function))} and does not say so")
+    bare = [re.sub(SHAPED, "", each) for each in (*own.values(), returned)]
+    if any(re.search(r"\b(?:Tensor|NDArray|ndarray)\b", each) for each in bare) and not SHAPE.search(text):
+        problems.append(f"{name} does not say the shape of an array")
     return problems
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(SOURCE)))
-def test_public_names_are_documented(path: Path) -> None:
-    assert not _problems(path)
+def _class_problems(name: str, node: ast.ClassDef, text: str) -> list[str]:
+    problems = []
+    init = next((each for each in node.body if isinstance(each, Function) and each.name == "__init__"), None)
+    if init is not None:
+        problems += _function_problems(name, init, text, constructor=True)
+    for field, after in zip(node.body, [*node.body[1:], None], strict=True):
+        if init is None and isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+            described = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            if not (field.target.id.startswith("_") or described or _says(text, field.target.id)):
+                problems.append(f"{name} does not describe its field {field.target.id}")
+    for method in node.body:
+        if isinstance(method, Function) and not method.name.startswith("_"):
+            said = ast.get_docstring(method) or ""
+            if not said:
+                problems.append(f"{name}.{method.name} has no docstring")
+            if _raised(method) and "Raises:" not in said:
+                problems.append(f"{name}.{method.name} raises {sorted(_raised(method))} and does not say so")
+    return problems
+
+
+def _problems(name: str, source: str) -> list[str]:
+    """Return what the docstring of one exported class or function lacks."""
+    (node,) = ast.parse(textwrap.dedent(source)).body
+    assert isinstance(node, ast.ClassDef | Function), f"{name} is neither a class nor a function"
+    text = ast.get_docstring(node) or ""
+    if not text:
+        return [f"{name} has no docstring"]
+    problems = [] if ">>> " in text else [f"{name} has no example"]
+    if isinstance(node, ast.ClassDef):
+        return problems + _class_problems(name, node, text)
+    return problems + _function_problems(name, node, text)
+
+
+def test_exported_names_are_described() -> None:
+    problems = []
+    for name in EXPORTED:
+        thing: Any = getattr(saunet, name)
+        if inspect.isclass(thing) or callable(thing):
+            problems += _problems(name, inspect.getsource(inspect.unwrap(thing)))
+            if dataclasses.is_dataclass(thing) and (thing.__doc__ or "").startswith(f"{name}("):
+                problems.append(f"{name} has the docstring that dataclass makes up")
+    assert not problems, "\n".join(problems)
+
+
+def test_modules_say_what_they_hold() -> None:
+    silent = [
+        str(path.relative_to(SOURCE))
+        for path in sorted(SOURCE.rglob("*.py"))
+        if path.name != "__init__.py" and not ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+    assert not silent
+
+
+def _examples() -> Iterator[doctest.DocTest]:
+    finder = doctest.DocTestFinder(recurse=False)
+    for name in EXPORTED:
+        thing = getattr(saunet, name)
+        for each in finder.find(inspect.unwrap(thing), f"saunet.{name}", module=False, globs={}):
+            if each.examples:
+                yield each
+
+
+@pytest.fixture(scope="session")
+def examples_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as a user may have it: a trained model ``last.ckpt`` and a picture ``road.png``."""
+    folder = tmp_path_factory.mktemp("examples")
+    write_checkpoint(folder / "last.ckpt")
+    rows, columns = np.mgrid[:96, :160].astype(np.uint8)
+    cv2.imwrite(str(folder / "road.png"), np.stack([rows, columns, rows + columns], -1))
+    return folder
+
+
+@pytest.mark.parametrize("example", list(_examples()), ids=lambda example: example.name)
+def test_the_example_runs(
+    example: doctest.DocTest, examples_folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Examples import nothing but what they show; they may read ``last.ckpt`` and ``road.png``."""
+    for path in examples_folder.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    monkeypatch.chdir(tmp_path)
+    example.globs.update(saunet=saunet, torch=torch, np=np)
+    said: list[str] = []
+    options = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    result = doctest.DocTestRunner(optionflags=options).run(example, out=said.append, clear_globs=False)
+    assert not result.failed, "".join(said)
 
 
 @pytest.mark.parametrize(
-    ("signature", "text", "problem"),
+    ("source", "problem"),
     [
-        ("depth: Tensor", "Do it.", "f does not say the shape of an array"),
-        ("depth: Tensor", "Do it with depth, b 1 h w.", None),
-        ("depth: Float[Tensor, 'b 1 h w'], K: Float[Tensor, 'b 3 3'], T: Float[Tensor, 'b 4 4']", "Do it.", None),
-        ("depth, K, T", "Do it.", "f does not describe its arguments"),
-        ("name: str, path: Path, most: int", "Do it.", "f does not describe its arguments"),
-        ("name: str, path: Path, most: int", "Do it; arguments as in `g`.", None),
-        ("name: str, path: Path, scale: Scale", "Do it.", None),
-        ("name: str", "Do it.\n\n    Args:\n        title: A name.\n    ", "f describes some parameters, but not name"),
+        ("def f(a: int) -> None:\n    '''Do.\n\n    Args:\n        a: A.\n\n    >>> 1\n    '''", None),
+        ("def f(a: int) -> None:\n    '''Do.\n\n    >>> 1\n    '''", "argument a"),
+        ("def f(a: int) -> None:\n    '''Do.\n\n    Args:\n        a: A.\n    '''", "no example"),
+        ("def f() -> int:\n    '''Do.\n\n    >>> 1\n    '''", "what it returns"),
+        ("def f() -> None:\n    '''Do.\n\n    >>> 1\n    '''\n    raise DataError('x')", "raises"),
+        ("def f(x: Tensor) -> None:\n    '''Do.\n\n    Args:\n        x: X.\n\n    >>> 1\n    '''", "shape"),
+        ("def f(x: Tensor) -> None:\n    '''Do.\n\n    Args:\n        x: X, b 1 h w.\n\n    >>> 1\n    '''", None),
+        ("class A:\n    '''A.\n\n    >>> 1\n    '''\n    a: int = 1", "field a"),
+        ("class A:\n    '''A.\n\n    >>> 1\n    '''\n    a: int = 1\n    '''The a.'''", None),
+        ("class A:\n    '''A.\n\n    >>> 1\n    '''\n    def go(self): pass", "A.go has no docstring"),
+        ("class A:\n    '''A.\n\n    >>> 1\n    '''\n    def __init__(self, a: int) -> None: pass", "argument a"),
+        ("def f(): pass", "no docstring"),
     ],
 )
-def test_the_rule_finds_what_it_should(signature: str, text: str, problem: str | None) -> None:
-    function = f'def f({signature}) -> None:\n    """{text}"""\n'
-    found = _problems_of(f'"""A module."""\n{function}')
-    assert found == ([problem] if problem else [])
-    method = function.replace("def f(", "def f(self, ").replace("\n", "\n    ")
-    assert len(_problems_of(f'"""A module."""\nclass A:\n    """A class."""\n\n    {method}\n')) == len(found)
+def test_the_rule_finds_what_it_should(source: str, problem: str | None) -> None:
+    found = _problems("A" if source.startswith("class") else "f", source)
+    assert len(found) == (problem is not None)
+    if problem:
+        assert problem in found[0]
