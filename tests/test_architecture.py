@@ -25,8 +25,7 @@ ALLOWED: dict[str, set[str]] = {
     "metrics": {"errors", "types", "geometry"},
     "data": {"errors", "registry", "types", "io", "fingerprint", "geometry", "synthetic"},
     "synthetic": {"errors", "io", "data"},
-    "runs": {"errors", "io", "registry", "metrics", "checkpoint", "reporting", "__version__"},
-    "checkpoint": {"errors", "io", "registry", "models", "runs"},
+    "runs": {"errors", "io", "registry", "metrics", "models", "__version__"},
     "scale": {"errors", "types", "io", "geometry", "runs"},
     "training": {
         "errors",
@@ -39,10 +38,9 @@ ALLOWED: dict[str, set[str]] = {
         "losses",
         "prediction",
         "runs",
-        "checkpoint",
     },
     "prediction": {"errors", "types", "io", "metrics", "models", "runs", "exporting"},
-    "exporting": {"errors", "io", "metrics", "models", "prediction", "runs", "checkpoint"},
+    "exporting": {"errors", "io", "metrics", "models", "prediction", "runs"},
     "evaluation": {"errors", "types", "io", "tables", "fingerprint", "geometry", "losses", "metrics"},
     "reporting": {
         "errors",
@@ -52,7 +50,6 @@ ALLOWED: dict[str, set[str]] = {
         "prediction",
         "evaluation",
         "runs",
-        "checkpoint",
         "published",
         "tools",
         "__version__",
@@ -65,7 +62,7 @@ ALLOWED: dict[str, set[str]] = {
 THIRD_PARTY: dict[str, set[str]] = {
     "hydra": {"config", "cli"},
     "omegaconf": {"config", "roots", "cli"},
-    "lightning": {"training", "runs", "data", "cli", "config"},
+    "lightning": {"training", "data", "cli", "config"},
     "torchmetrics": {"metrics", "training"},
 }
 

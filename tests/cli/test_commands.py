@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import saunet
-from saunet.checkpoint import read_checkpoint
+from saunet.runs.checkpoint import read_checkpoint
 from saunet.tools.prepare.densify import densify
 from saunet.tools.prepare.recordings import kitti_recordings
 

@@ -15,7 +15,6 @@ import pytest
 from torch import nn
 
 import saunet
-from saunet.checkpoint import ModelRecord, atomic_save, build_networks
 from saunet.io.images import read_image
 from saunet.io.video import VideoReader
 from saunet.prediction.clips import VideoWriter
@@ -23,6 +22,7 @@ from saunet.prediction.files import predict_files
 from saunet.prediction.pointcloud import Camera, point_cloud, write_ply
 from saunet.prediction.video import predict_clip
 from saunet.roots import PredictConfig
+from saunet.runs.checkpoint import ModelRecord, atomic_save, build_networks
 
 
 @pytest.fixture(scope="module")

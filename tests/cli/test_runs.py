@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 import yaml
 
-from saunet.cli._sweep import summary
-from saunet.runs.run_record import RunRecord
+from saunet.runs.folder import RunRecord
+from saunet.runs.sweep import summary
 from saunet.training.stopping import GracefulStop
 
 Tool = Callable[..., Any]

@@ -16,13 +16,13 @@ import torch
 from omegaconf import OmegaConf
 
 import saunet
-from saunet.checkpoint import read_checkpoint, store_scale
 from saunet.cli._scale import apply_scale, scale_predictor
 from saunet.data.camera_file import CameraFile, write_camera
 from saunet.errors import CheckpointError, ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.prediction.pipeline import ImagePredictor
 from saunet.roots import EvaluateConfig, PredictConfig
+from saunet.runs.checkpoint import read_checkpoint, store_scale
 from saunet.runs.record import Scale
 from saunet.synthetic import SyntheticDrive
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import saunet
-from saunet.checkpoint import ModelRecord, Scale, atomic_save, build_networks
 from saunet.errors import CheckpointError, ConfigError, DataError
 from saunet.exporting import export, exporters
 from saunet.exporting.card import fingerprint
@@ -30,6 +29,7 @@ from saunet.io.images import write_image
 from saunet.models.depth import DepthNet
 from saunet.prediction.predictor import Predictor
 from saunet.registry import decoders, encoders
+from saunet.runs.checkpoint import ModelRecord, Scale, atomic_save, build_networks
 
 Picture = NDArray[np.uint8]
 Node = Callable[..., dict[str, Any]]

@@ -17,7 +17,7 @@ import tiny
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from saunet.runs.run_record import recording
+from saunet.runs.folder import recording
 from saunet.training.callbacks import LastCheckpoint
 from saunet.training.optim import Recipe
 from saunet.training.stopping import GracefulStop, ProcessWatch

@@ -23,8 +23,7 @@ from saunet.data.windows import Selection
 from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
 from saunet.geometry.pose import pose_matrix
 from saunet.registry import objectives
-from saunet.runs.storage import AtomicCheckpointIO
-from saunet.training.callbacks import LastCheckpoint
+from saunet.training.callbacks import AtomicCheckpointIO, LastCheckpoint
 from saunet.training.module import SelfSupervisedDepth
 from saunet.training.optim import Recipe
 from saunet.training.speed import Speed

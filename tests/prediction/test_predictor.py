@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 
 import saunet
-from saunet.checkpoint import ModelRecord, atomic_save, build_networks
 from saunet.errors import CheckpointError, ConfigError, DataError
 from saunet.io.images import write_image
 from saunet.models.depth import DepthNet
 from saunet.prediction.predictor import Predictor
+from saunet.runs.checkpoint import ModelRecord, atomic_save, build_networks
 from saunet.runs.record import Scale
 
 Picture = NDArray[np.uint8]

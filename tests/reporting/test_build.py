@@ -46,7 +46,7 @@ def everything(tmp_path: Path, sweep: Path) -> list[Path]:
 
 
 def _state(file: Path) -> dict[str, object]:
-    from saunet.checkpoint import read_checkpoint
+    from saunet.runs.checkpoint import read_checkpoint
 
     depth, _ = read_checkpoint(file).networks()
     return dict(depth.named_parameters())

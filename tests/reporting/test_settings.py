@@ -8,8 +8,8 @@ from pathlib import Path
 from made_runs import make_run
 
 from saunet.reporting.inputs import collect
-from saunet.runs.settings import differing, labels, ratio, sweeps_ratio
-from saunet.runs.summary import read_run
+from saunet.runs.folder import read_run
+from saunet.runs.sweep import differing, labels, ratio, sweeps_ratio
 
 
 def test_a_component_of_another_name_is_one_difference(tmp_path: Path) -> None:

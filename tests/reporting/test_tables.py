@@ -12,8 +12,8 @@ from saunet.reporting.figures import draw_ratio
 from saunet.reporting.groups import comparable
 from saunet.reporting.inputs import collect
 from saunet.reporting.tables import explained_table, runs_table, table1, table2, table3
-from saunet.runs.settings import labels
-from saunet.runs.summary import Run
+from saunet.runs.folder import Run
+from saunet.runs.sweep import labels
 
 
 def test_measured_rows_stand_apart_from_published_ones(tmp_path: Path) -> None:

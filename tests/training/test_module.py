@@ -17,11 +17,11 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor, nn
 
 import saunet
-from saunet.checkpoint import read_checkpoint
 from saunet.data.module import DepthDataModule
 from saunet.data.windows import Selection
 from saunet.errors import ConfigError
 from saunet.io.images import read_image
+from saunet.runs.checkpoint import read_checkpoint
 from saunet.training.assemble import assemble
 from saunet.training.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
 from saunet.training.module import SelfSupervisedDepth

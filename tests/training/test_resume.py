@@ -16,7 +16,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from saunet.errors import CheckpointError, ConfigError
-from saunet.runs.run_record import Stopped
+from saunet.runs.folder import Stopped
 from saunet.training.callbacks import LastCheckpoint
 from saunet.training.optim import Recipe
 from saunet.training.resume import resume_path, warm_start
@@ -133,7 +133,7 @@ def test_where_a_run_resumes_from(tmp_path: Path) -> None:
 
 
 def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Path, config: Any, walls: Any) -> None:
-    from saunet.checkpoint import atomic_save
+    from saunet.runs.checkpoint import atomic_save
     from saunet.training.assemble import assemble
 
     with torch.no_grad():
@@ -154,7 +154,7 @@ def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Pa
 def test_a_writer_that_dies_midway_leaves_the_previous_checkpoint(tmp_path: Path) -> None:
     code = (
         "import os, sys, torch\n"
-        "from saunet.checkpoint import atomic_save\n"
+        "from saunet.runs.checkpoint import atomic_save\n"
         "path = sys.argv[1]\n"
         "atomic_save({'epoch': 1}, path)\n"
         "def die(content, stream):\n"

@@ -16,7 +16,7 @@ from lightning.pytorch.loggers import CSVLogger
 from omegaconf import OmegaConf
 
 from saunet.config import config_dir
-from saunet.runs.run_record import Stopped
+from saunet.runs.folder import Stopped
 from saunet.training.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
 from saunet.training.resume import keep_rows
 from saunet.training.stopping import GracefulStop

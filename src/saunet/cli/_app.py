@@ -22,12 +22,14 @@ from omegaconf.errors import OmegaConfBaseException
 from saunet import schema
 from saunet.cli._folders import Folder, noted
 from saunet.cli._globs import expand_globs
-from saunet.cli._sweep import check_folder, summary, swept_folder
+from saunet.cli._runs import planned_jobs
+from saunet.cli._sweep import check_folder, swept_folder
 from saunet.config import config_dir, register_configs
 from saunet.errors import SaunetError, suggest, usable_device
 from saunet.registry import REGISTRIES
 from saunet.roots import ROOTS
-from saunet.runs.run_record import FILE, Stopped
+from saunet.runs.folder import FILE, Stopped, record_failed_start
+from saunet.runs.sweep import summary
 
 PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "predictions", "resume", "root")
 """Keys at the root of a tool's config that name files or folders."""
@@ -118,15 +120,19 @@ def _check_given(cfg: DictConfig) -> None:
 
 def _job(name: str, task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
     """Run one job of a sweep; what goes wrong is said at once and ends this job only."""
+    owned = False
     try:
         _check_given(cfg)
         if "output_dir" in cfg:
             check_folder(cfg.output_dir, HydraConfig.get().runtime.output_dir)
+        owned = True
         return task(cfg)
     except Exception as error:
         job = HydraConfig.get().job
         reason = sentence(error) or f"{type(error).__name__}: {error}"
         print(f"saunet-{name}: job {job.num} ({job.override_dirname}) failed: {reason}", file=sys.stderr)
+        if name == "train" and owned:
+            record_failed_start(cfg.output_dir, cfg.name, error, sentence)
         raise
 
 
@@ -139,7 +145,7 @@ def _end_sweep(other: str | None = None) -> bool:
     folder = swept_folder()
     if folder is None or (other and not any(folder.glob(f"**/{FILE}"))):
         return True
-    text, finished = summary(folder)
+    text, finished = summary(folder, planned_jobs(folder))
     print(text, file=sys.stdout if finished else sys.stderr)
     return finished
 

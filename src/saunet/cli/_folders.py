@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from saunet.runs.run_record import FILE
+from saunet.runs.folder import FILE
 
 HYDRA = ".hydra"
 

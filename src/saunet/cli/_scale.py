@@ -143,7 +143,7 @@ def _clip_batches(cfg: DictConfig, predictor: Any, method: str, offsets: Any) ->
 
 
 def _pose(cfg: DictConfig) -> tuple[Any, Any]:
-    from saunet.checkpoint import read_checkpoint
+    from saunet.runs.checkpoint import read_checkpoint
 
     checkpoint = read_checkpoint(cfg.checkpoint)
     pose = checkpoint.networks()[1]
@@ -183,8 +183,8 @@ def _needed(value: Any, key: str, method: str, what: str) -> Any:
 
 
 def _report(cfg: DictConfig, estimate: Any, folder: Path) -> Any:
-    from saunet.checkpoint import store_scale
     from saunet.io.atomic import write_json
+    from saunet.runs.checkpoint import store_scale
 
     print(estimate)
     folder.mkdir(parents=True, exist_ok=True)

@@ -107,8 +107,8 @@ class CheckpointSubject(Subject):
     """
 
     def __init__(self, cfg: DictConfig) -> None:
-        from saunet.checkpoint import read_checkpoint
         from saunet.evaluation.views import PoseNetwork
+        from saunet.runs.checkpoint import read_checkpoint
 
         checkpoint = read_checkpoint(cfg.checkpoint)
         record = checkpoint.record

@@ -29,21 +29,18 @@ def fit(cfg: DictConfig) -> tuple[Any, float | None]:
     from lightning import seed_everything
 
     from saunet.registry import instantiate
-    from saunet.runs.run_record import recording
-    from saunet.runs.storage import AtomicCheckpointIO
+    from saunet.runs.folder import recording
     from saunet.training.assemble import assemble
-    from saunet.training.callbacks import BestCheckpoint, SplitsRecorded
+    from saunet.training.callbacks import AtomicCheckpointIO, BestCheckpoint, SplitsRecorded
     from saunet.training.resume import check_resume, check_unused, keep_rows, resume_path, warm_start
     from saunet.training.stopping import way_on
 
-    def check() -> None:
-        config.check(cfg)
-        if not (cfg.resume or cfg.overwrite):
-            check_unused(cfg.output_dir)
-
-    with recording(cfg.output_dir, cfg.name, sentence, check) as record:
-        hydra = HydraConfig.get()
-        record.describe(config.plain(cfg), config.plain(hydra.runtime.choices), list(hydra.overrides.task))
+    config.check(cfg)
+    if not (cfg.resume or cfg.overwrite):
+        check_unused(cfg.output_dir)
+    hydra = HydraConfig.get()
+    known = {"config": config.plain(cfg), "choices": config.plain(hydra.runtime.choices)}
+    with recording(cfg.output_dir, cfg.name, sentence, overrides=list(hydra.overrides.task), **known) as record:
         resume = resume_path(cfg.resume, cfg.output_dir, cfg.init_from)
         seed_everything(cfg.seed, workers=True, verbose=False)
         data = instantiate(config.plain(cfg.data))

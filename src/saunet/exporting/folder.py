@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from saunet.checkpoint import Checkpoint, read_checkpoint
 from saunet.errors import CheckpointError, ConfigError
+from saunet.runs.checkpoint import Checkpoint, read_checkpoint
 from saunet.runs.record import ModelRecord
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"

@@ -5,6 +5,6 @@ from __future__ import annotations
 from saunet.reporting.build import Options, build
 from saunet.reporting.inputs import Inputs, Sweep, collect
 from saunet.reporting.output import write
-from saunet.runs.summary import Run, Score, read_run
+from saunet.runs.folder import Run, Score, read_run
 
 __all__ = ["Inputs", "Options", "Run", "Score", "Sweep", "build", "collect", "read_run", "write"]

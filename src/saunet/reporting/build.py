@@ -18,8 +18,8 @@ from saunet.reporting.inputs import Inputs
 from saunet.reporting.models import Seen, look
 from saunet.reporting.scenes import View, read_views, scene
 from saunet.reporting.speed import speed
-from saunet.runs.settings import differing, labels, sweeps_ratio
-from saunet.runs.summary import Run
+from saunet.runs.folder import Run
+from saunet.runs.sweep import differing, labels, sweeps_ratio
 
 Named = dict[str, Run]
 

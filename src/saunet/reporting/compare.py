@@ -19,8 +19,8 @@ from saunet.reporting.evaluations import read_evaluation
 from saunet.reporting.groups import Groups
 from saunet.reporting.inputs import Inputs
 from saunet.reporting.tables import ERRORS
-from saunet.runs.settings import differing, labels, values
-from saunet.runs.summary import SUBJECTS, Run
+from saunet.runs.folder import SUBJECTS, Run
+from saunet.runs.sweep import differing, labels, values
 
 
 def settings_table(runs: Mapping[str, Run]) -> Table:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from saunet.metrics.functional import ERROR_NAMES
-from saunet.reporting.files import read_json, read_mapping
-from saunet.runs.summary import Explained, Run, Score
+from saunet.runs.files import read_json, read_mapping
+from saunet.runs.folder import Explained, Run, Score
 
 
 @dataclass(frozen=True)

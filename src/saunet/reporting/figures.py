@@ -11,8 +11,8 @@ from typing import Any
 
 from saunet.reporting.curves import curve
 from saunet.reporting.groups import comparable
-from saunet.runs.settings import RATIO, ratio
-from saunet.runs.summary import Run
+from saunet.runs.folder import Run
+from saunet.runs.sweep import RATIO, ratio
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7b6fd0", "#444444")
 """Okabe and Ito's colors, which color-blind readers can tell apart, the yellow left out on white paper."""

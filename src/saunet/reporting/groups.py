@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
-from saunet.runs.summary import Explained, Run, Score
+from saunet.runs.folder import Explained, Run, Score
 
 SHOWN = 8
 """Digits of a fingerprint that a heading shows."""

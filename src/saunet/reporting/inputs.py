@@ -9,8 +9,8 @@ from pathlib import Path
 
 from saunet.errors import DataError, one_of
 from saunet.reporting.evaluations import Evaluation, belongs, read_evaluation
-from saunet.reporting.files import read_mapping
-from saunet.runs.summary import Run, Status, began, home, read_run, split_overrides
+from saunet.runs.files import read_mapping
+from saunet.runs.folder import Run, Status, began, home, read_run, split_overrides
 
 Jobs = Callable[[Path], "list[list[str]] | None"]
 """Returns the overrides of every job that a sweep folder was to hold; None where that cannot be told."""

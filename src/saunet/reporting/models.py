@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from saunet.checkpoint import read_checkpoint
 from saunet.errors import SaunetError
 from saunet.prediction.predictor import Predictor
 from saunet.reporting.scenes import View
-from saunet.runs.summary import Run
+from saunet.runs.checkpoint import read_checkpoint
+from saunet.runs.folder import Run
 from saunet.tools.benchmark.measure import count_parameters
 
 

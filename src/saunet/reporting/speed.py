@@ -8,10 +8,10 @@ from pathlib import Path
 from saunet.errors import DataError
 from saunet.published import published
 from saunet.reporting.document import Column, Missing, Row, Table
-from saunet.reporting.files import read_json
 from saunet.reporting.groups import Groups, chosen, comparable
 from saunet.reporting.models import Seen
-from saunet.runs.summary import Run
+from saunet.runs.files import read_json
+from saunet.runs.folder import Run
 
 Point = tuple[str, float, float]
 """Name with how it was timed, accuracy, seconds an image."""

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from saunet.published import published
 from saunet.reporting.document import Cell, Column, Missing, Row, Table
 from saunet.reporting.groups import Groups, chosen
-from saunet.runs.settings import RATIO, differing, ratio, values
-from saunet.runs.summary import Run, Score
+from saunet.runs.folder import Run, Score
+from saunet.runs.sweep import RATIO, differing, ratio, values
 
 ERRORS: tuple[Column, ...] = (
     Column("Abs Rel", 3, -1),

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from saunet.checkpoint import build_networks
 from saunet.data.module import DepthDataModule
 from saunet.errors import ConfigError, divisible, one_of
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import protocol
 from saunet.registry import instantiate
+from saunet.runs.checkpoint import build_networks
 from saunet.runs.record import ModelRecord, Scale
 from saunet.training.module import SelfSupervisedDepth
 from saunet.training.optim import Recipe

@@ -10,16 +10,18 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities import rank_zero_info
 from rich.console import Console
 
 from saunet.data.module import DepthDataModule
-from saunet.errors import CheckpointError, positive
+from saunet.errors import CheckpointError, ConfigError, positive
 from saunet.io.atomic import replacing
 from saunet.io.images import write_image
 from saunet.io.progress import watched
 from saunet.metrics.functional import RISING
-from saunet.runs.run_record import RunRecord
+from saunet.runs.checkpoint import atomic_save
+from saunet.runs.folder import RunRecord
 from saunet.training.module import EPOCH_LOSS
 from saunet.training.pictures import training_panel
 from saunet.types import EvalBatch
@@ -40,6 +42,25 @@ class SplitsRecorded(Callback):
         data = getattr(trainer, "datamodule", None)
         if trainer.is_global_zero and isinstance(data, DepthDataModule):
             self.record.write(splits=data.fingerprints())
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Lightning's own storage, but that every local file is complete or keeps its former content.
+
+    Lightning's writer passes over a refused permission in silence, so a run could end without a checkpoint. Addresses
+    such as ``s3://...`` are left to Lightning.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None) -> None:
+        """Write a checkpoint; if the system refuses, an older file of that name stays as it was."""
+        if storage_options is not None:
+            raise ConfigError(
+                f"storage_options is {storage_options!r}; checkpoints are stored without any, leave it out"
+            )
+        if "://" in str(path):
+            super().save_checkpoint(checkpoint, path)
+        else:
+            atomic_save(checkpoint, path)
 
 
 class LastCheckpoint(ModelCheckpoint):

@@ -14,8 +14,8 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor, distributed
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from saunet.checkpoint import atomic_save
 from saunet.errors import CheckpointError, SaunetError, one_of, positive
+from saunet.runs.checkpoint import atomic_save
 
 DUMPS = 5
 """Batches kept at most in one run, on each process."""

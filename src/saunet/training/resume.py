@@ -10,8 +10,8 @@ from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
-from saunet.checkpoint import load_weights, read_checkpoint
 from saunet.errors import CheckpointError, ConfigError
+from saunet.runs.checkpoint import load_weights, read_checkpoint
 from saunet.training.module import SelfSupervisedDepth
 
 

@@ -18,7 +18,7 @@ from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from torch import distributed
 
 from saunet.errors import SaunetError, positive
-from saunet.runs.run_record import Stopped, mark_lost
+from saunet.runs.folder import Stopped, mark_lost
 
 LAST = "last.ckpt"
 

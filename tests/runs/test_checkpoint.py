@@ -16,8 +16,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from saunet.checkpoint import ModelRecord, Scale, atomic_save, build_networks, load_weights, read_checkpoint
 from saunet.errors import CheckpointError, ConfigError
+from saunet.runs.checkpoint import ModelRecord, Scale, atomic_save, build_networks, load_weights, read_checkpoint
 
 Node = Callable[..., dict[str, Any]]
 
@@ -274,7 +274,7 @@ class TestAtomicSave:
         """A file size limit in a process of its own stands for a full disk."""
         code = (
             "import resource, signal, sys, torch\n"
-            "from saunet.checkpoint import atomic_save\n"
+            "from saunet.runs.checkpoint import atomic_save\n"
             "from saunet.errors import CheckpointError\n"
             "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
             "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"

@@ -7,13 +7,26 @@ import math
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from saunet.errors import ConfigError, DataError
-from saunet.runs.run_record import RunRecord, Stopped, first_process, git_state, mark_lost, read, recording, versions
+from saunet.runs.folder import (
+    RunRecord,
+    Stopped,
+    first_process,
+    git_state,
+    locked,
+    mark_lost,
+    read,
+    record_failed_start,
+    recording,
+    remove_partial_files,
+    versions,
+)
 
 
 def content(folder: Path) -> dict[str, Any]:
@@ -138,8 +151,70 @@ def test_versions_are_strings() -> None:
 
 
 def test_what_a_run_is_stands_in_its_record(tmp_path: Path) -> None:
-    with recording(tmp_path, "trial") as record:
-        record.describe({"optim": {"clip": math.inf, "betas": (0.9, -math.inf)}}, {"data": "kitti"}, ["seed=1"])
+    config = {"optim": {"clip": math.inf, "betas": (0.9, -math.inf)}}
+    with recording(tmp_path, "trial", config=config, choices={"data": "kitti"}, overrides=["seed=1"]):
+        pass
     after = content(tmp_path)
     assert after["config"] == {"optim": {"clip": ".inf", "betas": [0.9, "-.inf"]}}
     assert (after["choices"], after["overrides"]) == ({"data": "kitti"}, ["seed=1"])
+
+
+def test_a_failed_start_is_recorded_where_there_is_no_record(tmp_path: Path) -> None:
+    record_failed_start(tmp_path, "trial", ConfigError("seed is -1"), lambda error: None)
+    assert (content(tmp_path)["status"], content(tmp_path)["error"]) == ("failed", "seed is -1")
+    record_failed_start(tmp_path, "trial", ConfigError("seed is -2"), lambda error: None)
+    assert content(tmp_path)["error"] == "seed is -1"
+
+
+HOLD = """
+import sys
+from saunet.runs.folder import locked, recording
+with locked(sys.argv[1]), recording(sys.argv[1], "first"):
+    print("held", flush=True)
+    sys.stdin.readline()
+"""
+
+
+def test_a_second_run_in_a_folder_is_refused_until_the_first_ends_or_dies(tmp_path: Path) -> None:
+    for end in ("ends", "is killed"):
+        with subprocess.Popen(
+            [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as first:
+            assert first.stdout is not None
+            assert first.stdin is not None
+            assert first.stdout.readline() == "held\n"
+            with (
+                pytest.raises(ConfigError, match=rf"another run \(process {first.pid} on .*output_dir"),
+                locked(tmp_path),
+            ):
+                pass
+            assert content(tmp_path)["pid"] == first.pid
+            if end == "ends":
+                first.stdin.write("go on\n")
+                first.stdin.flush()
+            else:
+                first.kill()
+        with locked(tmp_path):
+            pass
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+def test_the_other_processes_of_a_run_need_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    with locked(tmp_path / "new"):
+        assert not (tmp_path / "new").exists()
+
+
+def test_partial_files_of_a_killed_run_are_removed_and_those_of_a_living_one_are_not(tmp_path: Path) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    (tmp_path / "checkpoints").mkdir()
+    dead = tmp_path / "checkpoints" / f".last.{gone.pid}.partial.ckpt"
+    alive = tmp_path / "checkpoints" / f".best.{os.getpid()}.partial.ckpt"
+    own = tmp_path / ".notes.partial.txt"
+    for file in (dead, alive, own):
+        file.touch()
+    assert remove_partial_files(tmp_path) == []  # of an unknown machine
+    RunRecord(tmp_path, "trial").start()
+    assert remove_partial_files(tmp_path) == [dead]
+    assert (dead.exists(), alive.exists(), own.exists()) == (False, True, True)

@@ -1,16 +1,19 @@
-"""What runs have in common and what not: differing config keys as columns, and short names made from them."""
+"""Several runs together: how a sweep's jobs ended, which config keys differ, and short names made from them."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from saunet.runs.summary import Run
+from saunet.runs.files import read_yaml
+from saunet.runs.folder import FILE, Run, mark_lost, read
 
 RATIO = "α/β"
 """A column of its own where the weights of SAU-Net eq. (14) differ."""
+_UNKNOWN = "overrides unknown"
 _SLOTS = ("model/encoder", "model/decoder", "model/pose", "objective", "data", "loss")
 _UNTOLD = ("output_dir", "callbacks", "logger", "resume", "name")
 """Keys of a config that say where a run writes and what it is called, not what it computes."""
@@ -128,3 +131,42 @@ def _flatten(prefix: str, node: Any, found: dict[str, str]) -> None:
             _flatten(f"{path}.", value, found)
         else:
             found[path] = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def summary(folder: Path, planned: Sequence[Sequence[str]] | None = None) -> tuple[str, bool]:
+    """Say how the jobs of a sweep ended, one line for each that did not finish; jobs that vanished are marked failed.
+
+    Args:
+        folder: The sweep's folder, with one ``run.json`` in each job's.
+        planned: The overrides of every job that was to run, where they are known: those that never started count too.
+
+    Returns:
+        The text, and whether there were jobs and all of them finished.
+    """
+    jobs = [path.parent for path in sorted(folder.glob(f"**/{FILE}"), key=_in_order)]
+    lines, finished = [], 0
+    for job in jobs:
+        mark_lost(job)
+        content = read(job) or {}
+        if content.get("status") == "finished":
+            finished += 1
+        else:
+            reason = content.get("error") or "its record cannot be read"
+            lines.append(f"  {job.relative_to(folder)} ({_overrides(job)}) {content.get('status', 'failed')}: {reason}")
+    started = [_overrides(job) for job in jobs]
+    all_jobs = [", ".join(job) for job in planned or []]
+    waiting = [each for each in all_jobs if each not in started] if _UNKNOWN not in started else []
+    lines += [f"  ({each}) not started" for each in waiting]
+    count = len(jobs) + len(waiting)
+    head = f"sweep: {finished} of {count} jobs finished; results: {folder}"
+    return "\n".join([head, *lines]), 0 < finished == count
+
+
+def _in_order(path: Path) -> tuple[int, str]:
+    name = path.parent.name
+    return (int(name) if name.isdecimal() else -1, str(path))
+
+
+def _overrides(job: Path) -> str:
+    given = read_yaml(job / ".hydra" / "overrides.yaml")
+    return ", ".join(map(str, given)) if isinstance(given, list) else _UNKNOWN

@@ -13,10 +13,10 @@ import torch
 from lightning import Trainer
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from saunet.checkpoint import read_checkpoint
 from saunet.data.module import DepthDataModule
 from saunet.errors import CheckpointError, ConfigError
-from saunet.runs.storage import AtomicCheckpointIO
+from saunet.runs.checkpoint import read_checkpoint
+from saunet.training.callbacks import AtomicCheckpointIO
 from saunet.training.module import SelfSupervisedDepth
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from made_runs import ERRORS, make_run
 
-from saunet.runs.summary import SIGN_OF_LIFE, read_run
+from saunet.runs.folder import SIGN_OF_LIFE, read_run
 
 
 def test_a_finished_run_tells_what_it_was(tmp_path: Path) -> None:

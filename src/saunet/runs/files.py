@@ -15,7 +15,7 @@ def read_json(path: Path) -> Any:
     """Return a JSON file's content; None if it is missing or broken."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
 
 
@@ -23,7 +23,7 @@ def read_yaml(path: Path) -> Any:
     """Return a YAML file's content as plain containers; None if it is missing or broken."""
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError):
+    except (OSError, ValueError, RecursionError, yaml.YAMLError):
         return None
 
 
