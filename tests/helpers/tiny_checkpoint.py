@@ -8,8 +8,8 @@ from typing import Any
 
 from torch import nn
 
-from saunet.checkpoint import ModelRecord, atomic_save, build_networks
 from saunet.registry import REGISTRIES
+from saunet.runs.checkpoint import ModelRecord, atomic_save, build_networks
 
 
 def _node(kind: str, name: str) -> dict[str, Any]:
