@@ -59,7 +59,7 @@ def street() -> SyntheticDrive:
 @pytest.fixture
 def recording(street: SyntheticDrive, tmp_path: Path) -> Path:
     """Both cameras' frames as folders."""
-    for drive, folder in ((street, "left"), (street.partner(), "right")):
+    for drive, folder in ((street, "left"), (street.stereo(), "right")):
         (tmp_path / folder).mkdir()
         for index in drive.indices:
             cv2.imwrite(str(tmp_path / folder / f"{index}.png"), drive.image(index)[..., ::-1])

@@ -19,14 +19,14 @@ def rendered():
 @pytest.fixture(scope="module")
 def root(rendered, tmp_path_factory):
     root = tmp_path_factory.mktemp("kitti") / "raw"
-    write_raw(root, [rendered], right=[rendered.right()], ground_truth=True)
+    write_raw(root, [rendered], right=[rendered.stereo()], ground_truth=True)
     return root
 
 
 def test_images_intrinsics_and_speed_come_back(rendered, root):
     raw = KittiRaw(root)
     (name,) = raw.drives
-    for camera, truth in (("left", rendered), ("right", rendered.right())):
+    for camera, truth in (("left", rendered), ("right", rendered.stereo())):
         drive = raw.drive(name, camera)
         assert list(drive.indices) == list(rendered.indices)
         assert np.array_equal(drive.image(2), truth.image(2))
@@ -38,7 +38,7 @@ def test_images_intrinsics_and_speed_come_back(rendered, root):
 @pytest.mark.parametrize("camera", ["left", "right"])
 def test_lidar_depth_is_the_rendered_depth(rendered, root, camera):
     raw = KittiRaw(root)
-    truth = (rendered if camera == "left" else rendered.right()).depth(1)
+    truth = (rendered if camera == "left" else rendered.stereo()).depth(1)
     measured = raw.drive(next(iter(raw.drives)), camera).depth(1)
     hit = (measured > 0) & (truth > 0)
     assert hit.sum() > 300
@@ -74,8 +74,8 @@ def test_the_data_module_trains_on_it(root):
 
 
 def test_odometry_poses_come_back(rendered, tmp_path):
-    write_odometry(tmp_path / "odometry", [rendered], right=[rendered.right()])
-    for camera, truth in (("color_left", rendered), ("color_right", rendered.right())):
+    write_odometry(tmp_path / "odometry", [rendered], right=[rendered.stereo()])
+    for camera, truth in (("color_left", rendered), ("color_right", rendered.stereo())):
         drive = OdometrySequence(tmp_path / "odometry", "00", camera)
         assert drive.intrinsics(0) == pytest.approx(truth.intrinsics(0), abs=1e-4)
         for index in (1, 4):

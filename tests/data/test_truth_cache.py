@@ -28,7 +28,7 @@ def test_the_same_depth_from_the_scan_and_from_the_folder(drive, tmp_path, monke
     cached = CachedTruth(drive, tmp_path / "cache")
     expected = drive.depth(1)
     np.testing.assert_array_equal(cached.depth(1), expected)
-    assert cached.path(1).is_file()
+    assert cached.truth_path(1).is_file()
     monkeypatch.setattr(type(drive), "depth", lambda self, index: pytest.fail("projected again"))
     again = cached.depth(1)
     np.testing.assert_array_equal(again, expected)
@@ -40,8 +40,7 @@ def test_it_is_the_drive_in_everything_else(drive, tmp_path):
     assert isinstance(cached, Drive)
     assert (cached.name, list(cached.indices)) == (drive.name, list(drive.indices))
     np.testing.assert_array_equal(cached.image(0), drive.image(0))
-    with pytest.raises(AttributeError):
-        _ = cached.nothing_of_the_kind
+    assert (cached.fps, cached.camera_height, cached.folder) == (drive.fps, drive.camera_height, drive.folder)
 
 
 def test_a_frame_without_scan_has_none(drive, tmp_path):
@@ -51,14 +50,14 @@ def test_a_frame_without_scan_has_none(drive, tmp_path):
 
 def test_whatever_the_depth_depends_on_changes_the_name(drive, tmp_path):
     cached = CachedTruth(drive, tmp_path / "cache")
-    names = {cached.path(0), cached.path(1)}
+    names = {cached.truth_path(0), cached.truth_path(1)}
     drive.depth_kind = "lidar_x"
-    names.add(cached.path(0))
+    names.add(cached.truth_path(0))
     drive.calibration = dataclasses.replace(drive.calibration, rectification=drive.calibration.rectification + 1e-9)
-    names.add(cached.path(0))
+    names.add(cached.truth_path(0))
     scan = drive.depth_file(0)
     os.utime(scan, ns=(scan.stat().st_atime_ns, scan.stat().st_mtime_ns + 1))
-    names.add(cached.path(0))
+    names.add(cached.truth_path(0))
     assert len(names) == 5
 
 
@@ -66,10 +65,10 @@ def test_whatever_the_depth_depends_on_changes_the_name(drive, tmp_path):
 def test_a_damaged_file_is_made_anew(drive, tmp_path, content):
     cached = CachedTruth(drive, tmp_path / "cache")
     cached.depth(0)
-    cached.path(0).write_bytes(content)
+    cached.truth_path(0).write_bytes(content)
     np.testing.assert_array_equal(cached.depth(0), drive.depth(0))
-    assert cached.path(0).stat().st_size > 100
-    assert [path.name for path in cached.path(0).parent.iterdir()] == [cached.path(0).name]
+    assert cached.truth_path(0).stat().st_size > 100
+    assert [path.name for path in cached.truth_path(0).parent.iterdir()] == [cached.truth_path(0).name]
 
 
 def test_a_folder_that_cannot_be_written_is_named(drive, tmp_path):
@@ -79,8 +78,8 @@ def test_a_folder_that_cannot_be_written_is_named(drive, tmp_path):
 
 
 def test_only_projected_truth_is_cached(drive, tmp_path):
-    drives = [drive, SyntheticDrive(seed=1, frames=1, height=64, width=96)]
-    assert cache_truths(drives, tmp_path) == 1
-    assert isinstance(drives[0], CachedTruth)
     improved = KittiRaw(tmp_path / "raw").drive(drive.name.split()[0], depth_kind="improved")
-    assert cache_truths([improved], tmp_path) == 0
+    drives = [drive, SyntheticDrive(seed=1, frames=1, height=64, width=96), improved]
+    cache_truths(drives, tmp_path / "cache")
+    assert [each.truth_path(0) is None for each in drives] == [False, True, True]
+    np.testing.assert_array_equal(drives[1].depth(0), SyntheticDrive(seed=1, frames=1, height=64, width=96).depth(0))

@@ -10,6 +10,7 @@ import math
 import cv2
 import numpy as np
 import pytest
+from drives import NumberDrive
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
@@ -91,11 +92,9 @@ def test_a_short_path_gets_shorter_segments_and_says_so():
     assert "odometry/99 l" in text
 
 
-class Recording:
-    name = "odometry/99 l"
-    indices = (4, 5, 6)
-
+class Recording(NumberDrive):
     def __init__(self, times, poses):
+        super().__init__("odometry/99 l", (4, 5, 6))
         self.times, self.poses = times, poses
 
     def time(self, index):

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
+from saunet.data.drive import Drive
 
-class NumberDrive:
+
+class NumberDrive(Drive):
     """Frames whose pixels are the frame number; K, depth and poses to match."""
 
     def __init__(self, name="day/drive l", indices=range(8), size=(20, 30), truth=True, truth_size=None):
-        self.name = name
+        self._name = name
         self._indices = list(indices)
         self.size = size
         self.truth = truth
         self.truth_size = truth_size or size
+
+    @property
+    def name(self):
+        return self._name
 
     @property
     def indices(self):

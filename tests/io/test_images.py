@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from drives import NumberDrive
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -239,26 +240,15 @@ def test_every_reader_names_what_is_missing_or_empty(tmp_path: Path, read: Calla
             read(tmp_path / "text.png")
 
 
-class PictureDrive:
+class PictureDrive(NumberDrive):
     """One frame that is an image file."""
 
-    name = "drive"
-    indices = (0,)
-
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__("drive", (0,))
+        self.file = path
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        return read_image(self.path)
-
-    def intrinsics(self, index: int) -> NDArray[np.float64]:
-        return np.eye(3)
-
-    def depth(self, index: int) -> None:
-        return None
-
-    def pose(self, index: int) -> None:
-        return None
+        return read_image(self.file)
 
 
 @pytest.mark.parametrize("size", [(16, 24), (40, 90), (64, 128), (20, 128)])

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import saunet
-from saunet.data.partners import measured_distance
+from saunet.data.stereo import measured_distance
 from saunet.data.windows import WindowDataset, collate
 from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from drives import NumberDrive
 from scipy.spatial.transform import Rotation
 from torch import nn
 
@@ -15,13 +16,11 @@ from saunet.prediction.odometer import Odometer, follow
 from saunet.runs.record import Scale
 
 
-class NumberedDrive:
+class NumberedDrive(NumberDrive):
     """Every pixel of a frame is its number."""
 
-    name = "numbered l"
-
     def __init__(self, frames, missing=()):
-        self.indices = [10 + i for i in range(frames) if i not in missing]
+        super().__init__("numbered l", [10 + i for i in range(frames) if i not in missing])
         self.read = []
 
     def image(self, index):

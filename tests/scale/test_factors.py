@@ -48,14 +48,14 @@ def test_camera_height_of_a_scene_without_road_is_unknown(street: SyntheticDrive
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_stereo_within_five_percent_from_either_camera(street: SyntheticDrive, side: str) -> None:
-    drive = street if side == "left" else street.partner()
-    T = torch.from_numpy(drive.T_partner_cam).float()[None]
-    factor = stereo_factors(depth_of(drive, 1), images(drive, 1), images(drive.partner(), 1), K_of(drive), T)
+    drive = street if side == "left" else street.stereo()
+    T = torch.from_numpy(drive.T_stereo_cam).float()[None]
+    factor = stereo_factors(depth_of(drive, 1), images(drive, 1), images(drive.stereo(), 1), K_of(drive), T)
     torch.testing.assert_close(factor, torch.tensor([1 / UNKNOWN]), rtol=0.05, atol=0)
 
 
 def test_stereo_of_images_that_do_not_match_is_unknown(street: SyntheticDrive) -> None:
-    T = torch.from_numpy(street.T_partner_cam).float()[None]
+    T = torch.from_numpy(street.T_stereo_cam).float()[None]
     gray = torch.full((1, 3, 96, 288), 0.5)
     assert stereo_factors(depth_of(street, 1), gray, gray, K_of(street), T).isnan().all()
 
@@ -81,7 +81,7 @@ def test_inputs_are_left_alone(street: SyntheticDrive) -> None:
     depth, picture = depth_of(street, 1), images(street, 1)
     copies: list[Any] = [depth.clone(), picture.clone()]
     height_factors(depth, K_of(street), 1.0)
-    stereo_factors(depth, picture, picture, K_of(street), torch.from_numpy(street.T_partner_cam).float()[None])
+    stereo_factors(depth, picture, picture, K_of(street), torch.from_numpy(street.T_stereo_cam).float()[None])
     assert torch.equal(depth, copies[0])
     assert torch.equal(picture, copies[1])
     assert np.isfinite(street.depth(1)).all()

@@ -24,7 +24,7 @@ def drive() -> SyntheticDrive:
 @pytest.fixture(scope="module")
 def raw(drive: SyntheticDrive, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("kitti") / "raw"
-    assert write_raw(root, [drive], right=[drive.right()], ground_truth=True) == [f"{DATE}/{DATE}_drive_0001_sync"]
+    assert write_raw(root, [drive], right=[drive.stereo()], ground_truth=True) == [f"{DATE}/{DATE}_drive_0001_sync"]
     return root / DATE
 
 
@@ -72,14 +72,14 @@ def test_lidar_lands_on_the_rendered_depth(raw: Path, drive: SyntheticDrive) -> 
 
 def test_lidar_lands_on_the_right_cameras_depth_too(raw: Path, drive: SyntheticDrive) -> None:
     scan = np.fromfile(raw / f"{DATE}_drive_0001_sync/velodyne_points/data/0000000000.bin", np.float32).reshape(-1, 4)
-    sparse, truth = project(raw, "03", scan, (60, 180)), drive.right().depth(0)
+    sparse, truth = project(raw, "03", scan, (60, 180)), drive.stereo().depth(0)
     both = (sparse > 0) & (truth > 0)
     ratio = np.abs(np.log(sparse[both] / truth[both]))
     assert np.median(ratio) < 0.02  # the rest are edges, hidden from one of the cameras
 
 
 def test_images_are_the_rendered_ones(raw: Path, drive: SyntheticDrive) -> None:
-    for camera, view in (("02", drive), ("03", drive.right())):
+    for camera, view in (("02", drive), ("03", drive.stereo())):
         path = raw / f"{DATE}_drive_0001_sync/image_{camera}/data/0000000001.png"
         np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], view.image(1))
 
@@ -161,10 +161,10 @@ def test_oxts_poses_can_be_had_back() -> None:
 
 def test_odometry_layout(drive: SyntheticDrive, tmp_path: Path) -> None:
     root = tmp_path / "odometry"
-    assert write_odometry(root, [drive], right=[drive.right()], first_sequence=6) == ["06"]
+    assert write_odometry(root, [drive], right=[drive.stereo()], first_sequence=6) == ["06"]
     sequence = root / "sequences/06"
     assert [p.name for p in sorted((sequence / "image_2").iterdir())] == ["000000.png", "000001.png", "000002.png"]
-    np.testing.assert_array_equal(cv2.imread(str(sequence / "image_3/000002.png"))[..., ::-1], drive.right().image(2))
+    np.testing.assert_array_equal(cv2.imread(str(sequence / "image_3/000002.png"))[..., ::-1], drive.stereo().image(2))
     calib = calibration(sequence / "calib.txt")
     assert list(calib) == ["P0", "P1", "P2", "P3"]
     assert calib["P3"][3] == pytest.approx(-0.54 * drive.intrinsics()[0, 0])

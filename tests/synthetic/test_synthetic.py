@@ -54,10 +54,10 @@ def test_true_depth_and_motion_explain_the_neighboring_frame(seed: int, step: in
 
 def test_true_depth_explains_the_right_camera() -> None:
     left = drive(1)
-    error, identity, valid = warped(left, left.right(), 0, 0)
+    error, identity, valid = warped(left, left.stereo(), 0, 0)
     assert np.median(error[valid]) < 0.012
     assert error[valid].mean() < 0.6 * identity[valid].mean()
-    np.testing.assert_allclose(np.linalg.inv(left.pose(0)) @ left.right().pose(0), translation(0.54, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.inv(left.pose(0)) @ left.stereo().pose(0), translation(0.54, 0, 0), atol=1e-12)
 
 
 def translation(*meters: float) -> np.ndarray:

@@ -27,8 +27,8 @@ def apply_scale(cfg: DictConfig, record: Any, network: Any, pose: Any, data: Any
         ConfigError: if the method is unknown or lacks what it needs.
         DataError: if no frame could be measured.
     """
-    from saunet.data.neighbors import mounting_height, surroundings
-    from saunet.data.partners import measured_distance
+    from saunet.data.neighbors import surroundings
+    from saunet.data.stereo import measured_distance
     from saunet.scale import METHODS, MetricDepth, MetricMotion, estimate_scale
 
     method, scale = _check(cfg), record.scale
@@ -44,7 +44,7 @@ def apply_scale(cfg: DictConfig, record: Any, network: Any, pose: Any, data: Any
             odometer=odometer if method == "speed" else None,
             most=cfg.scale.frames,
         )
-        height = mounting_height(data) if cfg.scale.camera_height is None else cfg.scale.camera_height
+        height = data.camera_height if cfg.scale.camera_height is None else cfg.scale.camera_height
         network.eval()
         estimate = estimate_scale(method, batches, lambda image: network(image).depth[0], pose, height)
         scale = _report(cfg, estimate, Path(cfg.output_dir))
@@ -59,17 +59,13 @@ def apply_scale(cfg: DictConfig, record: Any, network: Any, pose: Any, data: Any
 
 def _odometer(cfg: DictConfig, data: Any) -> Any:
     """Return the odometer of a table of speeds, which counts frames as they were recorded."""
-    from saunet.data.drive import ClockedDrive
     from saunet.scale.speeds import read_speeds
 
     table = read_speeds(cfg.scale.speeds)
     table.check_drives([drive.name for drive in data.datasets[cfg.split].drives])
 
     def distance(drive: Any, first: int, second: int) -> float:
-        fps = None
-        if isinstance(drive, ClockedDrive):
-            first, second, fps = drive.recorded(first), drive.recorded(second), drive.fps
-        return table.distance(drive.name, first, second, _fps(cfg, fps))
+        return table.distance(drive.name, drive.recorded(first), drive.recorded(second), _fps(cfg, drive.fps))
 
     return distance
 

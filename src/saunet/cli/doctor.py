@@ -34,7 +34,7 @@ def doctor(cfg: DictConfig) -> None:
     findings = diagnose(found)
     folder = Path(cfg.output_dir)
     name = HydraConfig.get().runtime.choices["data"]
-    place = f" at {data.root}" if hasattr(data, "root") else ""
+    place = f" at {data.root}" if data.root else ""
     manifest = manifest_of(found, findings, folder / "manifest.json")
     write_manifest(manifest.path, manifest)
     write_image(folder / "doctor.png", draw_sheet(found, findings, f"saunet-doctor: {name}{place}"))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saunet.data.clips import Clip, Recording
+from saunet.data.drive import Drive
 from saunet.data.frame_size import common_size
 from saunet.data.lens import Lens
 from saunet.data.motion import Motion, even_steps
@@ -20,8 +21,8 @@ LONGEST_STEP = 5.0
 """Seconds between two frames beyond which they are no neighbors: too much has moved meanwhile."""
 
 
-class CampusDrive:
-    """A clip of any camera, a `saunet.data.drive.Drive`.
+class CampusDrive(Drive):
+    """A clip of any camera.
 
     Frames are numbered anew from 0 in the order of time, without those that are left out; a number is skipped where
     frames on both sides are no neighbors (a broken image or a long stop between them).
@@ -45,16 +46,22 @@ class CampusDrive:
         parallax: float = 0.0,
         settings: str = "",
     ) -> None:
-        self.name = clip.name
         self.clip, self.recording, self._crop = clip, recording, crop
-        self.numbering = settings
+        self._settings = settings
         self._places, self._left_out = _choose(recording, motion, parallax)
         self._indices = sorted(self._places)
         self._still = frozenset(np.flatnonzero(motion.static()).tolist()) if motion else frozenset()
 
     @property
+    def name(self) -> str:
+        return self.clip.name
+
+    @property
+    def numbering(self) -> str:
+        return self._settings
+
+    @property
     def indices(self) -> Sequence[int]:
-        """Numbers of the frames, ascending."""
         return self._indices
 
     @property
@@ -126,14 +133,6 @@ class CampusDrive:
             DataError: if the frames do not belong to the camera.
         """
         return self._lens.K.copy()
-
-    def depth(self, index: int) -> NDArray[np.float32] | None:
-        """Return None: a camera alone knows no depth."""
-        return None
-
-    def pose(self, index: int) -> NDArray[np.float64] | None:
-        """Return None: a camera alone knows no pose."""
-        return None
 
     @functools.cached_property
     def _lens(self) -> Lens:

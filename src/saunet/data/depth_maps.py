@@ -60,10 +60,9 @@ class DepthMaps:
         if self.folder is not None:
             base = self.folder / (where.parent if where.name in ("l", "r") else where)
         else:
-            beside = getattr(drive, "folder", None)
-            if beside is None:
+            if drive.folder is None:
                 raise DataError(f"'{drive.name}' has no folder beside which depth maps could lie; set data.maps")
-            base = Path(beside)
+            base = drive.folder
         side = where.name if where.name in ("l", "r") else ""
         return base / f"depth_{self.kind}" / side
 

@@ -1,68 +1,228 @@
-"""What a recording must offer, so that training, evaluation and preparation can work on any data set."""
+"""What the library may ask of a recording: the one contract between data sets and everything that reads them."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 
-@runtime_checkable
-class Drive(Protocol):
+class Drive(ABC):
     """One continuous recording of one camera: what every data set is reduced to before training sees it.
 
-    Frames are addressed by their number in the recording; numbers may have gaps.
+    Subclass it and implement `name`, `indices`, `image` and `intrinsics`. Everything else has a default that says
+    "unknown" (None, False, an empty string); override what the data set knows. Frames are addressed by their index in
+    the recording; indices ascend with time and may have gaps.
     """
 
-    name: str
-    """Readable and unique in the data set, such as ``2011_09_26/2011_09_26_drive_0001_sync l``."""
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """Readable and unique in the data set, such as ``2011_09_26/2011_09_26_drive_0001_sync l``."""
 
     @property
+    @abstractmethod
     def indices(self) -> Sequence[int]:
-        """Numbers of the frames that exist, ascending."""
+        """Indices of the frames that exist, ascending."""
 
+    @abstractmethod
     def image(self, index: int) -> NDArray[np.uint8]:
         """Return the frame, h x w x 3, RGB."""
 
+    @abstractmethod
     def intrinsics(self, index: int) -> NDArray[np.float64]:
         """Return K, 3 x 3, in pixels of `image` (integer coordinates are pixel centers)."""
 
+    def has_depth(self, index: int) -> bool:
+        """Return whether `depth` gives a map; override it where that is known without reading one."""
+        return self.depth(index) is not None
+
     def depth(self, index: int) -> NDArray[np.float32] | None:
-        """Return ground-truth depth, h x w, meters, 0 where unknown; None where there is none."""
+        """Return ground-truth depth, h x w, meters, 0 where unknown; None if there is none."""
+        return None
+
+    def depth_key(self, index: int) -> str | None:
+        """Return a hash of all that `depth` is computed from, so that it can be cached; None if it is just read."""
+        return None
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
-        """Return T_world_cam, 4 x 4, meters (x right, y down, z forward); None where unknown."""
+        """Return T_world_cam, 4 x 4, meters (x right, y down, z forward); None if unknown."""
+        return None
 
-
-@runtime_checkable
-class StereoDrive(Drive, Protocol):
-    """A recording with a second camera beside it; both share one rectified image plane and one K."""
-
-    def partner(self) -> Drive:
-        """Return the other camera's recording of the same drive, with the same frame numbers."""
+    def time(self, index: int) -> float | None:
+        """Return when the frame was taken, seconds from any fixed origin; None if unknown."""
+        return None
 
     @property
-    def T_partner_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
-        """Where the partner is, 4 x 4, meters: a point of this camera times it is a point of the partner."""
-
-
-@runtime_checkable
-class MeasuredDrive(Drive, Protocol):
-    """A recording that knows how far the car went, from its speed or its poses."""
-
-    def distance(self, first: int, second: int) -> float | None:
-        """Return the meters traveled between two frames, at least 0; None where unknown."""
-
-
-@runtime_checkable
-class ClockedDrive(Drive, Protocol):
-    """A recording whose frame numbers are ours, and which knows the numbers and the rate of the file behind them."""
+    def timestamps(self) -> NDArray[np.float64] | None:
+        """`time` of each of `indices`, NaN where it is unknown; None if no time is known."""
+        times = np.array([self.time(index) for index in self.indices], dtype=np.float64)
+        return None if np.isnan(times).all() else times
 
     @property
     def fps(self) -> float | None:
-        """Frames a second as recorded; None where nobody says."""
+        """Frames per second as recorded; by default that of the median step of `timestamps`; None if unknown."""
+        times, numbers = self.timestamps, [self.recorded(index) for index in self.indices]
+        if times is None or len(times) < 2:
+            return None
+        step = float(np.nanmedian(np.diff(times) / np.diff(numbers)))
+        return 1 / step if step > 0 else None
+
+    def speed(self, index: int) -> float | None:
+        """Return the speed of the vehicle in m/s; None if unknown."""
+        return None
+
+    def distance(self, first: int, second: int) -> float | None:
+        """Return the meters traveled between two frames, at least 0; None if unknown.
+
+        By default the straight line between their poses.
+        """
+        T_world_first, T_world_second = self.pose(first), self.pose(second)
+        if T_world_first is None or T_world_second is None:
+            return None
+        return float(np.linalg.norm(T_world_second[:3, 3] - T_world_first[:3, 3]))
+
+    def stereo(self) -> Drive | None:
+        """Return the recording of the other camera of a rectified pair, which shares K and indices; None without one.
+
+        Raises:
+            DataError: if there is a second camera, but its files are missing or broken.
+        """
+        return None
+
+    @property
+    def T_stereo_cam(self) -> NDArray[np.float64] | None:  # noqa: N802 (frames in names)
+        """The pose of this camera in the other's frame, 4 x 4, meters: it maps points of this camera to the other."""
+        return None
+
+    def path(self, index: int) -> Path | None:
+        """Return the image file of a frame; None if it is not stored as one."""
+        return None
+
+    @property
+    def folder(self) -> Path | None:
+        """Folder of the recording, beside which depth maps may be stored; None if it has none."""
+        return None
+
+    @property
+    def frame_size(self) -> tuple[int, int] | None:
+        """(height, width) that every frame should have; None if unknown."""
+        return None
 
     def recorded(self, index: int) -> int:
-        """Return the number of a frame as recorded, from 0."""
+        """Return the number of a frame in the file it comes from, from 0, where `indices` count only chosen frames."""
+        return index
+
+    @property
+    def numbering(self) -> str:
+        """Settings that decide which frame an index stands for; empty if none do."""
+        return ""
+
+    @property
+    def origin(self) -> str:
+        """Whatever beside the image files decides the pixels of a frame (camera, crop), as text; empty if nothing."""
+        return ""
+
+    @property
+    def camera_height(self) -> float | None:
+        """Meters from the road to the camera; None if unknown."""
+        return None
+
+    @property
+    def condition(self) -> str | None:
+        """Weather or light, such as ``night``, by which results are grouped; None if unknown."""
+        return None
+
+
+class DriveProxy(Drive):
+    """A recording that passes every question on to another; a subclass overrides what differs.
+
+    Args:
+        drive: The recording to ask.
+    """
+
+    def __init__(self, drive: Drive) -> None:
+        self._drive = drive
+
+    @property
+    def name(self) -> str:
+        return self._drive.name
+
+    @property
+    def indices(self) -> Sequence[int]:
+        return self._drive.indices
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        return self._drive.image(index)
+
+    def intrinsics(self, index: int) -> NDArray[np.float64]:
+        return self._drive.intrinsics(index)
+
+    def has_depth(self, index: int) -> bool:
+        return self._drive.has_depth(index)
+
+    def depth(self, index: int) -> NDArray[np.float32] | None:
+        return self._drive.depth(index)
+
+    def depth_key(self, index: int) -> str | None:
+        return self._drive.depth_key(index)
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        return self._drive.pose(index)
+
+    def time(self, index: int) -> float | None:
+        return self._drive.time(index)
+
+    @property
+    def timestamps(self) -> NDArray[np.float64] | None:
+        return self._drive.timestamps
+
+    @property
+    def fps(self) -> float | None:
+        return self._drive.fps
+
+    def speed(self, index: int) -> float | None:
+        return self._drive.speed(index)
+
+    def distance(self, first: int, second: int) -> float | None:
+        return self._drive.distance(first, second)
+
+    def stereo(self) -> Drive | None:
+        return self._drive.stereo()
+
+    @property
+    def T_stereo_cam(self) -> NDArray[np.float64] | None:  # noqa: N802 (frames in names)
+        return self._drive.T_stereo_cam
+
+    def path(self, index: int) -> Path | None:
+        return self._drive.path(index)
+
+    @property
+    def folder(self) -> Path | None:
+        return self._drive.folder
+
+    @property
+    def frame_size(self) -> tuple[int, int] | None:
+        return self._drive.frame_size
+
+    def recorded(self, index: int) -> int:
+        return self._drive.recorded(index)
+
+    @property
+    def numbering(self) -> str:
+        return self._drive.numbering
+
+    @property
+    def origin(self) -> str:
+        return self._drive.origin
+
+    @property
+    def camera_height(self) -> float | None:
+        return self._drive.camera_height
+
+    @property
+    def condition(self) -> str | None:
+        return self._drive.condition

@@ -50,10 +50,9 @@ def check_frame(drive: Drive, frame: int, image: NDArray[np.uint8]) -> None:
     Raises:
         DataError: naming the frame's file, if it has another size.
     """
-    size = getattr(drive, "frame_size", None)
+    size = drive.frame_size
     if size is not None and image.shape[:2] != size:
-        path = getattr(drive, "path", None)
-        what = path(frame) if callable(path) else f"frame {frame}"
+        what = drive.path(frame) or f"frame {frame}"
         raise DataError(
             f"{what} is {image.shape[1]}x{image.shape[0]} (width x height) where the frames of '{drive.name}' are "
             f"{size[1]}x{size[0]}; frames of a recording share one size"

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from saunet.data.depth_maps import place
-from saunet.data.drive import Drive, MeasuredDrive, StereoDrive
+from saunet.data.drive import Drive, DriveProxy
 from saunet.errors import ConfigError, DataError, in_range, one_of, positive
 from saunet.geometry.camera import scale_intrinsics
 from saunet.io.images import read_image
@@ -118,7 +118,7 @@ class ImageCache:
         Raises:
             DataError: if its images have another size now, or its frames another camera or other numbers.
         """
-        size = getattr(drive, "frame_size", None)
+        size = drive.frame_size
         made_from, now = frames["native"], list(size) if size else frames["native"]
         remedy = f"delete {self.home(drive)} and complete the cache: {self._command()}"
         if made_from != now:
@@ -126,7 +126,7 @@ class ImageCache:
                 f"the copies of '{drive.name}' in the cache come from images of {made_from[0]}x{made_from[1]} and they "
                 f"are {now[0]}x{now[1]} (height x width) now; {remedy}"
             )
-        if frames.get("origin", "") != origin(drive):
+        if frames.get("origin", "") != drive.origin:
             raise DataError(
                 f"the copies of '{drive.name}' in the cache were made from other files, with another camera or with "
                 f"other settings (data.fps, parallax, static, crop, max_width), which changes what its frames are; use "
@@ -147,15 +147,13 @@ class ImageCache:
         if not frames:
             raise DataError(f"the cache at {self.folder} does not hold '{drive.name}'; complete it: {self._command()}")
         self.check_origin(drive, frames)
-        # Not isinstance: that would ask the drive where its partner is, and a recording of one camera may not know.
-        kind = CachedStereoDrive if hasattr(type(drive), "partner") else CachedDrive
         missing = sorted(f"{frame:010d}" for frame in needed if f"{frame:010d}" not in frames["frames"])
         if missing:
             raise DataError(
                 f"the cache at {self.folder} lacks {len(missing)} frames of '{drive.name}', the first {missing[0]}; "
                 f"complete it: {self._command()}"
             )
-        return kind(drive, self, frames)
+        return CachedDrive(drive, self, frames)
 
     def _command(self) -> str:
         return f"saunet-prepare cache root=... folder={self.folder} (data=... data.root=... where it is not KITTI raw)"
@@ -168,16 +166,11 @@ class ImageCache:
             raise _damaged(path) from reason
 
 
-def origin(drive: Drive) -> str:
-    """Return what a recording's frames depend on beside their files, as it says itself; empty where that is nothing."""
-    return str(getattr(drive, "origin", ""))
-
-
 def _damaged(path: Path) -> DataError:
     return DataError(f"{path} is damaged; delete it and run saunet-prepare cache again")
 
 
-class CachedDrive:
+class CachedDrive(DriveProxy):
     """A recording whose images are the cache's; in everything else the recording itself.
 
     Args:
@@ -187,37 +180,20 @@ class CachedDrive:
     """
 
     def __init__(self, drive: Drive, cache: ImageCache, frames: dict[str, Any]) -> None:
-        self.name = drive.name
-        self._drive, self._cache = drive, cache
+        super().__init__(drive)
+        self._cache = cache
         self.originals: tuple[int, int] = (frames["native"][0], frames["native"][1])
         """(height, width) of the images that the copies were made from."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name == "_drive":  # while unpickling there is no drive to ask yet
-            raise AttributeError(name)
-        return getattr(self._drive, name)
 
     @property
     def frame_size(self) -> tuple[int, int]:
         """(height, width) of the copies."""
         return self._cache.settings.height, self._cache.settings.width
 
-    @property
-    def indices(self) -> Sequence[int]:
-        """Numbers of the frames that exist, ascending."""
-        return self._drive.indices
-
-    def depth(self, index: int) -> NDArray[np.float32] | None:
-        """Return ground-truth depth as the recording does, at its size."""
-        return self._drive.depth(index)
-
-    def pose(self, index: int) -> NDArray[np.float64] | None:
-        """Return T_world_cam as the recording does."""
-        return self._drive.pose(index)
-
-    def distance(self, first: int, second: int) -> float | None:
-        """Return the meters traveled between two frames as the recording does; None where it does not know."""
-        return self._drive.distance(first, second) if isinstance(self._drive, MeasuredDrive) else None
+    def stereo(self) -> CachedDrive | None:
+        """Return the other camera's recording, read from the cache too."""
+        other = self._drive.stereo()
+        return None if other is None else self._cache.drive(other)
 
     def path(self, index: int) -> Path:
         """Return the file of a smaller frame."""
@@ -265,20 +241,3 @@ def check_enlarged(
     if any(min(each[0], size[0]) > copies[0] or min(each[1], size[1]) > copies[1] for each in room):
         raise ConfigError(f"{told}; {fix}")
     warnings.warn(f"{told}; {fix}", stacklevel=2)
-
-
-class CachedStereoDrive(CachedDrive):
-    """A recording with a stereo partner, both read from the cache."""
-
-    def partner(self) -> CachedDrive:
-        """Return the other camera's recording."""
-        return self._cache.drive(self._stereo.partner())
-
-    @property
-    def T_partner_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
-        """Where the other camera is, 4 x 4, meters."""
-        return self._stereo.T_partner_cam
-
-    @property
-    def _stereo(self) -> StereoDrive:
-        return cast(StereoDrive, self._drive)  # ImageCache.drive chose this class for it

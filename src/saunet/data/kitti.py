@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import os
 import re
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from saunet.data.calibration import KittiCalibration, read_calibration
+from saunet.data.drive import Drive
 from saunet.data.frame_size import common_size
 from saunet.data.intrinsics import check_intrinsics
 from saunet.data.lidar import lidar_depth, read_scan
@@ -31,13 +33,16 @@ CAMERA_HEIGHT = 1.65
 FRAME_SECONDS = 0.1
 """Time between frames: the scanner turns ten times a second and triggers the cameras."""
 
+PROJECTION = 1
+"""Version of the LiDAR projection, part of `KittiDrive.depth_key`; raise it when cached maps become wrong."""
+
 _DATE = re.compile(r"\d{4}_\d{2}_\d{2}")
 _DRIVE = re.compile(r"(\d{4}_\d{2}_\d{2})_drive_\d{4}_sync")
 _FRAME = re.compile(r"(\d+)\.(png|jpg|jpeg)", re.IGNORECASE)
 
 
-class KittiDrive:
-    """One camera of one KITTI raw drive, a `saunet.data.drive.Drive`.
+class KittiDrive(Drive):
+    """One camera of one KITTI raw drive.
 
     Args:
         folder: The drive's folder, ``.../<date>/<date>_drive_NNNN_sync``; it may be absent: then it has no frames.
@@ -51,8 +56,6 @@ class KittiDrive:
 
     camera_height = CAMERA_HEIGHT
     """Meters from the road to the camera."""
-    fps = 1 / FRAME_SECONDS
-    """Frames a second."""
 
     def __init__(
         self,
@@ -64,14 +67,20 @@ class KittiDrive:
         self.number, side = CAMERAS[one_of("camera", camera, CAMERAS)]
         one_of("depth kind", depth_kind, DEPTH_KINDS)
         self.depth_kind: DepthKind = depth_kind
-        self.folder, self.calibration = folder, calibration
-        self.name = f"{folder.parent.name}/{folder.name} {side}"
+        self._folder, self._side, self.calibration = folder, side, calibration
         self._files = frame_files(folder / f"image_{self.number:02d}" / "data")
         self._indices = sorted(self._files)
 
     @property
+    def name(self) -> str:
+        return f"{self._folder.parent.name}/{self._folder.name} {self._side}"
+
+    @property
+    def folder(self) -> Path:
+        return self._folder
+
+    @property
     def indices(self) -> Sequence[int]:
-        """Numbers of the frames that exist, ascending."""
         return self._indices
 
     def path(self, index: int) -> Path:
@@ -146,9 +155,19 @@ class KittiDrive:
             "lidar_x" if self.depth_kind == "lidar_x" else "camera_z",
         )
 
-    def pose(self, index: int) -> NDArray[np.float64] | None:
-        """Return None: raw recordings come without camera poses."""
-        return None
+    def depth_key(self, index: int) -> str | None:
+        """Return a hash of scan (path, size, time of change), calibration, image size and kind of depth."""
+        if self.depth_kind == "improved" or not self.has_depth(index):
+            return None
+        scan, calibration = self.depth_file(index), self.calibration
+        state = scan.stat()
+        digest = hashlib.sha256(
+            repr((PROJECTION, self.depth_kind, str(scan.absolute()), state.st_size, state.st_mtime_ns)).encode()
+        )
+        digest.update(repr(self.native_size).encode())
+        for matrix in (calibration.projections[self.number], calibration.rectification, calibration.T_cam_velo):
+            digest.update(np.asarray(matrix, dtype=np.float64).tobytes())
+        return digest.hexdigest()
 
     def speed(self, index: int) -> float | None:
         """Return the car's speed in m/s; None where there is no OXTS record.
@@ -167,19 +186,19 @@ class KittiDrive:
             return None
         return FRAME_SECONDS * (sum(speeds) - (speeds[0] + speeds[-1]) / 2)  # the trapezoidal rule
 
-    def partner(self) -> KittiDrive:
+    def stereo(self) -> KittiDrive:
         """Return the other color camera's recording; it has no frames where its images are missing."""
-        return self._partner
+        return self._stereo
 
     @functools.cached_property
-    def _partner(self) -> KittiDrive:
+    def _stereo(self) -> KittiDrive:
         other = "right" if self.number == CAMERAS["left"][0] else "left"
         return KittiDrive(self.folder, self.calibration, other, self.depth_kind)
 
     @functools.cached_property
-    def T_partner_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
+    def T_stereo_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
         """Where the other color camera is, 4 x 4, meters, by the calibration of the date."""
-        return self.calibration.T_cam_cam(self._partner.number, self.number)
+        return self.calibration.T_cam_cam(self._stereo.number, self.number)
 
     def depth_file(self, index: int) -> Path:
         """Return the file that a frame's ground truth comes from, whether or not it exists."""

@@ -10,7 +10,6 @@ from typing import Any
 
 from lightning.pytorch.utilities import rank_zero_warn
 
-from saunet.data.drive import Drive
 from saunet.data.windows import Selection
 from saunet.errors import DataError
 from saunet.io.atomic import write_json
@@ -30,7 +29,7 @@ class Manifest:
 
     Args:
         leave_out: Drive -> reason -> frame numbers.
-        numbering: Drive -> how its frames were numbered; see `numbering`.
+        numbering: Drive -> how its frames were numbered; see `Drive.numbering`.
         facts: Whatever else was found, free-form.
         path: The file it was read from, for messages.
         test_only: Those of its drives that neither training nor validation read when it was made.
@@ -73,10 +72,10 @@ class Manifest:
             DataError: if the drive's frames are numbered otherwise than when the manifest was made.
         """
         name = selection.drive.name
-        if name in self.numbering and self.numbering[name] != numbering(selection.drive):
+        if name in self.numbering and self.numbering[name] != selection.drive.numbering:
             raise DataError(
                 f"{self.path} was made for '{name}' with {self.numbering[name] or 'other settings'} and it is now read "
-                f"with {numbering(selection.drive) or 'other settings'}, which counts its frames differently; "
+                f"with {selection.drive.numbering or 'other settings'}, which counts its frames differently; "
                 "run saunet-doctor again with the settings of this run, or set data.manifest=null"
             )
         kept, left_out = list(selection.frames), dict(selection.left_out)
@@ -88,11 +87,6 @@ class Manifest:
             kept = [frame for frame in kept if frame not in unwanted]
             left_out[f"{reason} (manifest)"] = before - len(kept)
         return Selection(selection.drive, kept, left_out)
-
-
-def numbering(drive: Drive) -> str:
-    """Return how a drive's frames are numbered, where that depends on settings; empty where it does not."""
-    return str(getattr(drive, "numbering", ""))
 
 
 def write_manifest(path: str | Path, manifest: Manifest) -> None:

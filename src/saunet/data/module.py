@@ -17,10 +17,10 @@ from torch.utils.data import DataLoader
 
 from saunet.data.depth_maps import DepthMaps
 from saunet.data.drive import Drive
-from saunet.data.image_cache import CachedDrive, ImageCache, check_enlarged
+from saunet.data.image_cache import ImageCache, check_enlarged
 from saunet.data.manifest import read_manifest
-from saunet.data.partners import Odometer
 from saunet.data.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, evenly, share
+from saunet.data.stereo import Odometer
 from saunet.data.transforms import Augment, Prepare
 from saunet.data.unreadable import SkippingWindows, readable
 from saunet.data.windows import Selection, Usage, WindowDataset, check_offsets, collate, find_windows
@@ -46,7 +46,7 @@ class DepthDataModule(LightningDataModule):
         seed: Decides order and augmentation.
         target_depth: Training batches carry the depth of the target, for losses that use it.
         with_pose: Batches carry the true motion.
-        stereo: Training and validation batches carry the stereo partner as one more source, which makes depth metric.
+        stereo: Training and validation batches carry the stereo view as one more source, which makes depth metric.
         cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
         manifest: File of frames to leave out of training and validation, as ``saunet-doctor`` writes it.
         on_error: A file that cannot be read: ``raise`` stops and names it. ``skip`` names and counts it and goes on: in
@@ -65,6 +65,13 @@ class DepthDataModule(LightningDataModule):
     """What kind of depth evaluation batches carry, as the protocols call it."""
     cacheable: bool = True
     """Whether ``saunet-prepare cache`` can make copies for it."""
+    root: str | None = None
+    """Where its files are; None if it reads none."""
+
+    @property
+    def camera_height(self) -> float | None:
+        """Meters from the road to the camera, the same for all recordings; None if unknown."""
+        return None
 
     def __init__(
         self,
@@ -188,7 +195,7 @@ class DepthDataModule(LightningDataModule):
         windows, usage = find_windows(selections, offsets, stereo)
         if not windows:
             found = "; ".join(str(drive) for drive in usage[:3]) or "no drives"
-            needed = [f"neighbors at {list(offsets)}"] * bool(offsets) + ["a stereo partner"] * stereo
+            needed = [f"neighbors at {list(offsets)}"] * bool(offsets) + ["a stereo view"] * stereo
             if needed:
                 advice = f"frames need {' and '.join(needed)}: check the data root, the split and the offsets"
             else:
@@ -217,7 +224,7 @@ class DepthDataModule(LightningDataModule):
 
     def _recordings(
         self, split: str, selections: Sequence[Selection], windows: Sequence[tuple[int, int]]
-    ) -> list[Drive | CachedDrive]:
+    ) -> list[Drive]:
         """Return the recordings; training and validation read the cache, so that tests do not depend on it."""
         if self.copies is None or split not in ("train", "val"):
             return [selection.drive for selection in selections]
@@ -225,13 +232,11 @@ class DepthDataModule(LightningDataModule):
         if self.on_error == "raise":  # else a copy that is missing is a sample to skip
             for position, frame in windows:
                 needed[position].update(frame + offset for offset in (0, *self.offsets))
-        drives = [
-            self.copies.drive(selection.drive, needed[position]) if position in needed else selection.drive
-            for position, selection in enumerate(selections)
-        ]
-        cached = [drive for drive in drives if isinstance(drive, CachedDrive)]
-        check_enlarged(self.copies, cached, (self.height, self.width), self._margin(split))
-        return drives
+        cached = {
+            position: self.copies.drive(selections[position].drive, frames) for position, frames in needed.items()
+        }
+        check_enlarged(self.copies, cached.values(), (self.height, self.width), self._margin(split))
+        return [cached.get(place, selection.drive) for place, selection in enumerate(selections)]
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Return shuffled training batches, the same for any number of devices."""

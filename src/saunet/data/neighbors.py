@@ -1,4 +1,4 @@
-"""Frames of a split with what measuring the scale needs beside them: neighbors, stereo partner, way traveled."""
+"""Frames of a split with what measuring the scale needs beside them: neighbors, stereo view, way traveled."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import torch
 from lightning.pytorch.utilities import move_data_to_device
 
 from saunet.data.module import DepthDataModule
-from saunet.data.partners import Odometer
 from saunet.data.sampling import evenly
+from saunet.data.stereo import Odometer
 from saunet.data.windows import Selection, WindowDataset, collate, find_windows
 from saunet.errors import ConfigError, DataError
 from saunet.types import EvalBatch
@@ -32,7 +32,7 @@ def surroundings(
         split: One of its splits; whether its own samples carry sources does not matter.
         device: Where the batches go.
         offsets: Time offsets of the sources.
-        stereo: Add the stereo partner as the last source.
+        stereo: Add the stereo view as the last source.
         odometer: Gives the distance traveled.
         most: Of more frames, only so many are read, evenly spread.
 
@@ -51,7 +51,7 @@ def surroundings(
     windows, usage = find_windows(selections, offsets, stereo)
     if not windows:
         raise DataError(
-            f"no frame of split '{split}' has neighbors at {list(offsets)}{' and a stereo partner' if stereo else ''} "
+            f"no frame of split '{split}' has neighbors at {list(offsets)}{' and a stereo view' if stereo else ''} "
             f"({'; '.join(map(str, usage[:3]))}); measure the scale in another way"
         )
     samples = WindowDataset(
@@ -65,9 +65,3 @@ def surroundings(
     )
     for index in range(len(samples)):
         yield data.prepare(move_data_to_device(collate(samples[index]), torch.device(device)))
-
-
-def mounting_height(data: DepthDataModule) -> float | None:
-    """Return the meters from the road to the camera, where the data set knows them."""
-    height: float | None = getattr(data, "camera_height", None)
-    return height

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saunet.data.calibration import read_matrices, zero_based
+from saunet.data.drive import Drive
 from saunet.data.frame_size import common_size
 from saunet.data.intrinsics import check_intrinsics
 from saunet.data.kitti import CAMERA_HEIGHT, frame_files
-from saunet.data.partners import distance_between
 from saunet.errors import DataError, one_of
 from saunet.io.images import read_image
 from saunet.io.trajectories import read_kitti
@@ -22,8 +22,8 @@ CAMERAS = {"gray_left": (0, "l"), "gray_right": (1, "r"), "color_left": (2, "l")
 """Camera name -> its number on disk and its letter in names."""
 
 
-class OdometrySequence:
-    """One camera of one sequence, a `saunet.data.drive.Drive`.
+class OdometrySequence(Drive):
+    """One camera of one sequence.
 
     Args:
         root: Folder that holds ``sequences`` and, where poses are known, ``poses``.
@@ -46,8 +46,7 @@ class OdometrySequence:
         if not folder.is_dir():
             there = ", ".join(sequences(root)) or "none"
             raise DataError(f"no sequence '{sequence}' at {folder.parent.absolute()}; sequences there: {there}")
-        self.name = f"odometry/{sequence} {side}"
-        self.origin = camera  # of which the name says only left or right
+        self._name = f"odometry/{sequence} {side}"
         self._images = folder / f"image_{number}"
         self._files = frame_files(self._images)
         if not self._files:
@@ -59,8 +58,8 @@ class OdometrySequence:
         if key not in matrices:
             raise DataError(f"{folder / 'calib.txt'} lacks {key}; expected a line '{key}: ' with 12 numbers")
         self._K = matrices[key][:, :3]
-        _, self.frame_size = common_size([self.path(index) for index in self._indices])
-        check_intrinsics(self._K, *self.frame_size, f"{folder / 'calib.txt'}: {key}")
+        _, self._size = common_size([self.path(index) for index in self._indices])
+        check_intrinsics(self._K, *self._size, f"{folder / 'calib.txt'}: {key}")
         # P = K [I | t] maps points of camera 0, so t is where camera 0 lies seen from this camera
         self._T_cam_cam0 = np.eye(4)
         self._T_cam_cam0[:3, 3] = np.linalg.solve(self._K, matrices[key][:, 3])
@@ -69,8 +68,19 @@ class OdometrySequence:
         self._times = _read_times(folder / "times.txt")
 
     @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def origin(self) -> str:
+        return self._given[2]  # of which the name says only left or right
+
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        return self._size
+
+    @property
     def indices(self) -> Sequence[int]:
-        """Numbers of the frames that exist, ascending."""
         return self._indices
 
     def path(self, index: int) -> Path:
@@ -85,19 +95,9 @@ class OdometrySequence:
         """Return K of this camera, 3 x 3, in pixels counted from zero."""
         return zero_based(self._K)
 
-    def depth(self, index: int) -> NDArray[np.float32] | None:
-        """Return None: the benchmark comes without depth."""
-        return None
-
     def time(self, index: int) -> float | None:
         """Return the seconds at which a frame was taken, by ``times.txt``; None where that is missing or shorter."""
         return float(self._times[index]) if 0 <= index < len(self._times) else None
-
-    @property
-    def fps(self) -> float | None:
-        """Frames a second, by the median step of ``times.txt``; None where that is missing."""
-        step = float(np.median(np.diff(self._times))) if len(self._times) > 1 else 0.0
-        return 1 / step if step > 0 else None
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """Return T_world_cam of this camera, 4 x 4, meters; None where the file of poses is missing or shorter."""
@@ -106,29 +106,24 @@ class OdometrySequence:
         pose: NDArray[np.float64] = self._poses[index] @ np.linalg.inv(self._T_cam_cam0)
         return pose
 
-    def distance(self, first: int, second: int) -> float | None:
-        """Return the meters between the poses of two frames; None where one is unknown."""
-        poses = self.pose(first), self.pose(second)
-        return None if poses[0] is None or poses[1] is None else distance_between(poses[0], poses[1])
-
-    def partner(self) -> OdometrySequence:
+    def stereo(self) -> OdometrySequence:
         """Return the other camera's recording of this sequence, of the same color.
 
         Raises:
             DataError: if its images or its calibration are missing.
         """
-        return self._partner
+        return self._stereo
 
     @functools.cached_property
-    def _partner(self) -> OdometrySequence:
+    def _stereo(self) -> OdometrySequence:
         root, sequence, camera = self._given
         other = camera.replace("left", "right") if "left" in camera else camera.replace("right", "left")
         return OdometrySequence(root, sequence, other)
 
     @functools.cached_property
-    def T_partner_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
-        """Where the partner is, 4 x 4, meters, by the sequence's calibration."""
-        T: NDArray[np.float64] = self._partner._T_cam_cam0 @ np.linalg.inv(self._T_cam_cam0)
+    def T_stereo_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
+        """By the sequence's calibration."""
+        T: NDArray[np.float64] = self._stereo._T_cam_cam0 @ np.linalg.inv(self._T_cam_cam0)
         return T
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 
 from saunet.data.drive import Drive
-from saunet.data.kitti import KittiDrive
 from saunet.data.static import MIN_FLOW, static_by_flow
 from saunet.data.windows import Selection
 from saunet.errors import DataError
@@ -47,7 +46,7 @@ def has_speed(selection: Selection, skip_unreadable: bool = False) -> bool:
 def _speed(drive: Drive, frame: int, skip_unreadable: bool) -> float | None:
     """Return the speed in m/s; None where it is unknown, with ``skip_unreadable`` also for a broken record."""
     try:
-        return drive.speed(frame) if isinstance(drive, KittiDrive) else None
+        return drive.speed(frame)
     except DataError as error:
         if not skip_unreadable:
             raise

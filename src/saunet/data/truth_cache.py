@@ -6,23 +6,18 @@ image size, and which coordinate counts as depth. So there is nothing to invalid
 
 from __future__ import annotations
 
-import hashlib
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.data.kitti import KittiDrive
+from saunet.data.drive import Drive, DriveProxy
 from saunet.errors import DataError
 from saunet.io.atomic import replacing
 
-FORMAT = 1
-"""Part of every name; raised when the projection or the layout of the files changes."""
 
-
-class CachedTruth:
+class CachedTruth(DriveProxy):
     """A drive whose projected ground truth is kept in a folder; in everything else the drive itself.
 
     Args:
@@ -30,13 +25,9 @@ class CachedTruth:
         folder: Where maps are kept, shared by all recordings; made when the first is written.
     """
 
-    def __init__(self, drive: KittiDrive, folder: Path) -> None:
-        self._drive, self._folder = drive, folder
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name == "_drive":  # while unpickling there is no drive to ask yet
-            raise AttributeError(name)
-        return getattr(self._drive, name)
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        super().__init__(drive)
+        self._folder = folder
 
     def depth(self, index: int) -> NDArray[np.float32] | None:
         """Return ground truth as the drive does, from the folder where it is there already.
@@ -44,9 +35,9 @@ class CachedTruth:
         Raises:
             DataError: if a scan is broken, or the folder cannot be written to.
         """
-        if not self._drive.has_depth(index):
-            return None
-        path = self.path(index)
+        path = self.truth_path(index)
+        if path is None:
+            return self._drive.depth(index)
         depth = _read(path)
         if depth is None:
             depth = self._drive.depth(index)
@@ -54,35 +45,15 @@ class CachedTruth:
                 _write(path, depth)
         return depth
 
-    def path(self, index: int) -> Path:
-        """Return the file of a frame's map."""
-        drive = self._drive
-        scan, calibration = drive.depth_file(index), drive.calibration
-        state = scan.stat()
-        digest = hashlib.sha256(
-            repr((FORMAT, drive.depth_kind, str(scan.absolute()), state.st_size, state.st_mtime_ns)).encode()
-        )
-        digest.update(repr(drive.native_size).encode())
-        for matrix in (calibration.projections[drive.number], calibration.rectification, calibration.T_cam_velo):
-            digest.update(np.asarray(matrix, dtype=np.float64).tobytes())
-        name = digest.hexdigest()
-        return self._folder / name[:2] / f"{name[2:32]}.npz"
+    def truth_path(self, index: int) -> Path | None:
+        """Return the file of a frame's map; None where the drive's ground truth is not computed."""
+        key = self._drive.depth_key(index)
+        return None if key is None else self._folder / key[:2] / f"{key[2:32]}.npz"
 
 
-def cache_truths(drives: list[Any], folder: str | Path) -> int:
-    """Replace, in a list of drives, those with projected ground truth by ones that keep it.
-
-    Improved ground truth is a picture already, and rendered drives keep themselves.
-
-    Returns:
-        How many were replaced.
-    """
-    count = 0
-    for place, drive in enumerate(drives):
-        if isinstance(drive, KittiDrive) and drive.depth_kind != "improved":
-            drives[place] = CachedTruth(drive, Path(folder).expanduser())
-            count += 1
-    return count
+def cache_truths(drives: list[Drive], folder: str | Path) -> None:
+    """Replace the drives of a list by ones that keep what ground truth they compute."""
+    drives[:] = [CachedTruth(drive, Path(folder).expanduser()) for drive in drives]
 
 
 def _read(path: Path) -> NDArray[np.float32] | None:

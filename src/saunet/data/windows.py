@@ -19,8 +19,8 @@ from torch.utils.data import Dataset
 from saunet.data.depth_maps import DepthMaps
 from saunet.data.drive import Drive
 from saunet.data.frame_size import check_frame
-from saunet.data.partners import Odometer, partner_frames, partner_image
 from saunet.data.resize import resize_depth
+from saunet.data.stereo import Odometer, other_view, stereo_image
 from saunet.errors import ConfigError, DataError
 from saunet.fingerprint import fingerprint
 from saunet.geometry.camera import scale_intrinsics
@@ -71,19 +71,19 @@ def find_windows(
     Args:
         selections: Drives with the frames wanted of each.
         offsets: Time offsets of the source frames; empty for single frames.
-        stereo: Ask for the stereo partner of each frame too.
+        stereo: Ask for the stereo view of each frame too.
 
     Returns:
         The windows as (position in ``selections``, frame number), and one `Usage` a drive.
 
     Raises:
-        DataError: if a drive has no stereo partner and one is asked for.
+        DataError: if a drive has no stereo view and one is asked for.
     """
     windows, usage = [], []
     for position, selection in enumerate(selections):
         drive = selection.drive
         existing = set(drive.indices)
-        paired = partner_frames(drive) if stereo else existing
+        paired = set(other_view(drive)[0].indices) if stereo else existing
         left_out = dict(selection.left_out)
         used = 0
         for frame in selection.frames:
@@ -92,7 +92,7 @@ def find_windows(
             elif any(frame + offset not in existing for offset in offsets):
                 left_out["without neighbor"] = left_out.get("without neighbor", 0) + 1
             elif frame not in paired:
-                left_out["without stereo partner"] = left_out.get("without stereo partner", 0) + 1
+                left_out["without stereo view"] = left_out.get("without stereo view", 0) + 1
             else:
                 windows.append((position, frame))
                 used += 1
@@ -117,7 +117,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         with_depth: Yield ground truth at its native size where the drive has it.
         with_target_depth: Yield depth at the size of the frames (zeros where the drive has none).
         with_pose: Yield true motion; every drive must know it.
-        stereo: Yield the stereo partner as the last source, and where it is.
+        stereo: Yield the stereo view as the last source, and where it is.
         odometer: Gives the distance traveled; None yields none.
         maps: Depth maps made beforehand, by the key under which they are yielded at the size of the frames.
 
@@ -178,7 +178,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         drive = self.drives[position]
         named = {f"frame {frame + offset}": drive.image(frame + offset) for offset in (0, *self.offsets)}
         if self.stereo:
-            named[f"the stereo partner of frame {frame}"], T_stereo_tgt = partner_image(drive, frame)
+            named[f"the stereo view of frame {frame}"], T_stereo_tgt = stereo_image(drive, frame)
         check_frame(drive, frame, named[f"frame {frame}"])
         images = list(named.values())
         native = images[0].shape

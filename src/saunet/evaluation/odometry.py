@@ -116,7 +116,7 @@ def path_of(drive: Any, predicted: Float64[ndarray, "n 4 4"]) -> Path3d:
     Where the recording does not say when, frames are taken to be a tenth of a second apart.
     """
     numbers = list(drive.indices)
-    times = [drive.time(number) for number in numbers] if hasattr(drive, "time") else [None]
+    times = [drive.time(number) for number in numbers]
     poses = [drive.pose(number) for number in numbers]
     return Path3d(
         drive.name,

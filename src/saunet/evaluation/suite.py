@@ -185,7 +185,7 @@ def passes(protocols: Sequence[Rules], own: str) -> dict[str, list[Rules]]:
 def _conditions(data: EvaluationData, split: str) -> Callable[[str], str]:
     """Return how images are grouped: by the condition that their recording names, or else by recording."""
     dataset = data.datasets[split]
-    named = {drive.name: getattr(drive, "condition", None) for drive in dataset.drives}
+    named = {drive.name: drive.condition for drive in dataset.drives}
     by_image = {
         dataset.name(place): named[dataset.drives[position].name] for place, (position, _) in enumerate(dataset.windows)
     }

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.data.partners import distance_between
+from saunet.data.drive import Drive
 from saunet.errors import ConfigError, DataError, one_of, positive
 from saunet.io.atomic import replacing
 from saunet.synthetic.render import Camera, cast
@@ -55,8 +55,8 @@ class Settings:
             raise ConfigError(f"camera_height is {self.camera_height} m; it must be at least {3 * KERB_HEIGHT:.2f} m")
 
 
-class SyntheticDrive:
-    """One camera's recording of a drive through a generated street; implements `saunet.data.drive.Drive`.
+class SyntheticDrive(Drive):
+    """One camera's recording of a drive through a generated street.
 
     Args:
         seed: Which street and which drive through it; equal settings give equal bytes.
@@ -88,13 +88,33 @@ class SyntheticDrive:
         cache: Path | str | None = None,
     ) -> None:
         self.settings = Settings(seed, frames, height, width, moving_cars, camera_height, focal, baseline, camera)
-        self.name = f"synthetic/{seed:06d} {camera[0]}"
         self._cache = None if cache is None else Path(cache)
         self._frames: dict[int, Frame] = {}
 
     @property
+    def name(self) -> str:
+        return f"synthetic/{self.settings.seed:06d} {self.settings.camera[0]}"
+
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        return self.settings.height, self.settings.width
+
+    @property
+    def camera_height(self) -> float:
+        return self.settings.camera_height
+
+    def time(self, index: int) -> float:
+        return FRAME_SECONDS * index
+
+    @property
+    def fps(self) -> float:
+        return 1 / FRAME_SECONDS
+
+    def has_depth(self, index: int) -> bool:
+        return True
+
+    @property
     def indices(self) -> Sequence[int]:
-        """Numbers of the frames: 0 ... frames - 1."""
         return range(self.settings.frames)
 
     @functools.cached_property
@@ -135,30 +155,22 @@ class SyntheticDrive:
             T_world_cam[:3, 3] += T_world_cam[:3, 0] * self.settings.baseline
         return T_world_cam
 
-    def right(self) -> SyntheticDrive:
-        """Return the right camera's recording of the same drive."""
-        return self._seen_by("right")
-
-    def partner(self) -> SyntheticDrive:
+    def stereo(self) -> SyntheticDrive:
         """Return the other camera's recording of the same drive: always the same object, so it is rendered once."""
-        return self._partner
+        return self._stereo
 
     @functools.cached_property
-    def _partner(self) -> SyntheticDrive:
+    def _stereo(self) -> SyntheticDrive:
         twin = self._seen_by("right" if self.settings.camera == "left" else "left")
-        twin.__dict__["_partner"] = self
+        twin.__dict__["_stereo"] = self
         return twin
 
     @property
-    def T_partner_cam(self) -> F64:  # noqa: N802 (frames in names)
+    def T_stereo_cam(self) -> F64:  # noqa: N802 (frames in names)
         """Where the other camera is, 4 x 4, meters: ``baseline`` to the side."""
         T = np.eye(4)
         T[0, 3] = -self.settings.baseline if self.settings.camera == "left" else self.settings.baseline
         return T
-
-    def distance(self, first: int, second: int) -> float:
-        """Return the meters between the poses of two frames."""
-        return distance_between(self.pose(first), self.pose(second))
 
     def _seen_by(self, camera: str) -> SyntheticDrive:
         twin = SyntheticDrive(**{**asdict(self.settings), "camera": camera}, cache=self._cache)

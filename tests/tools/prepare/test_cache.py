@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from drives import NumberDrive
 from prepare_tree import name
 
 from saunet.data.image_cache import CacheSettings, ImageCache
@@ -213,17 +214,9 @@ def test_frames_of_two_sizes_are_named_or_skipped(tree, tmp_path):
 
 
 def test_frames_of_two_sizes_are_named_where_the_recording_does_not_know_its_size(tmp_path):
-    class Drive:
-        name = "x"
-        indices = (0, 1)
-
+    class Drive(NumberDrive):
         def image(self, index):
             return np.zeros((20 + 2 * index, 60, 3), np.uint8)
-
-        def intrinsics(self, index):
-            return np.eye(3)
-
-        depth = pose = intrinsics
 
     with pytest.raises(DataError, match=r"have different sizes: 20x60 \(frame 0\) and 22x60 \(frame 1\)"):
         build_cache([(Drive(), [0, 1])], tmp_path / "cache", SMALL)

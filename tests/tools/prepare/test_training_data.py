@@ -111,7 +111,7 @@ def test_the_other_camera_comes_from_the_cache_too(tree, tmp_path):
     data.setup("fit")
     sample = data.datasets["train"][0]
     assert sample["frames"].shape[0] == 2
-    assert data.datasets["train"].drives[0].partner().image(0).shape == (10, 36, 3)
+    assert data.datasets["train"].drives[0].stereo().image(0).shape == (10, 36, 3)
     assert sample["T_stereo_tgt"][0, 3] == pytest.approx(-0.5)
 
 

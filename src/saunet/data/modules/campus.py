@@ -66,6 +66,8 @@ class CampusDataModule(DepthDataModule):
     protocol = "campus"
     ground_truth = "none"
 
+    root: str
+
     def __init__(
         self,
         *,

@@ -11,9 +11,9 @@ from saunet.data import splits
 from saunet.data.depth_maps import DENSE_KINDS, DepthMaps
 from saunet.data.kitti import CAMERA_HEIGHT, CAMERAS, DEPTH_KINDS, DepthKind, KittiRaw
 from saunet.data.module import DepthDataModule
-from saunet.data.partners import measured_distance
 from saunet.data.splits import Frame
 from saunet.data.static_frames import has_speed, moving
+from saunet.data.stereo import measured_distance
 from saunet.data.windows import Selection, reach
 from saunet.errors import ConfigError, DataError, in_range, one_of, suggest
 from saunet.registry import datamodules
@@ -67,6 +67,8 @@ class KittiDataModule(DepthDataModule):
     """
 
     camera_height = CAMERA_HEIGHT
+
+    root: str
 
     def __init__(
         self,
@@ -177,7 +179,7 @@ class KittiDataModule(DepthDataModule):
             for drive, frames, _ in selections:
                 existing = set(drive.indices)
                 dense = maps.kind != "teacher"
-                wanted.append((drive, [f for f in frames if f in existing and (not dense or drive.has_depth(f))]))  # type: ignore[attr-defined]
+                wanted.append((drive, [f for f in frames if f in existing and (not dense or drive.has_depth(f))]))
             what = "teacher checkpoint=..." if maps.kind == "teacher" else f"densify kinds=[{maps.kind}]"
             folder = f" folder={maps.folder}" if maps.folder else ""
             maps.check(wanted, f"saunet-prepare {what} root={self.root}{folder}")
@@ -267,10 +269,10 @@ def _group(
 
 
 def _has_truth(selection: Selection) -> bool:
-    return any(selection.drive.has_depth(frame) for frame in selection.frames)  # type: ignore[attr-defined]
+    return any(selection.drive.has_depth(frame) for frame in selection.frames)
 
 
 def _with_truth(selection: Selection) -> Selection:
     existing = set(selection.drive.indices)
-    have = [f for f in selection.frames if f not in existing or selection.drive.has_depth(f)]  # type: ignore[attr-defined]
+    have = [f for f in selection.frames if f not in existing or selection.drive.has_depth(f)]
     return Selection(selection.drive, have, {"without ground truth": len(selection.frames) - len(have)})

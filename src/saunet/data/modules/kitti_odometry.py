@@ -48,6 +48,8 @@ class KittiOdometryDataModule(DepthDataModule):
     neighbors = ("train", "val", "test")
     camera_height = CAMERA_HEIGHT
 
+    root: str
+
     def __init__(
         self,
         *,

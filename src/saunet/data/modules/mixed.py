@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 import inspect
 import math
 from collections.abc import Mapping, Sequence, Set
 from functools import partial
 from typing import Any, Literal
 
-from saunet.data.drive import Drive
+from saunet.data.drive import Drive, DriveProxy
 from saunet.data.module import DepthDataModule
-from saunet.data.partners import measured_distance
+from saunet.data.stereo import measured_distance
 from saunet.data.windows import Selection
 from saunet.errors import ConfigError
 from saunet.registry import datamodules
@@ -121,7 +120,7 @@ class MixedDataModule(DepthDataModule):
     def camera_height(self) -> float | None:
         """Meters from the road to the camera, where all sources in use agree; else None."""
         names = {*self._names["train"], *self._names["test"]}
-        heights = {getattr(self.sources[name], "camera_height", None) for name in names}
+        heights = {self.sources[name].camera_height for name in names}
         return heights.pop() if len(heights) == 1 else None
 
     @property
@@ -145,9 +144,7 @@ class MixedDataModule(DepthDataModule):
                 selection = Selection(*each)
                 if source.manifest is not None and split in ("train", "val"):
                     selection = source.manifest.apply(selection, self.offsets if split in self.neighbors else ())
-                drive = copy.copy(selection.drive)
-                drive.name = f"{name}/{selection.drive.name}"
-                selections.append(selection._replace(drive=drive))
+                selections.append(selection._replace(drive=_Named(f"{name}/{selection.drive.name}", selection.drive)))
         return selections
 
     def _check_manifests(self, names: Set[str]) -> None:
@@ -178,6 +175,18 @@ class MixedDataModule(DepthDataModule):
         for key in SHARED:
             setattr(source, key, getattr(self, key))
         return source
+
+
+class _Named(DriveProxy):
+    """A recording under another name."""
+
+    def __init__(self, name: str, drive: Drive) -> None:
+        super().__init__(drive)
+        self._name = name
+
+    @property
+    def name(self) -> str:
+        return self._name
 
 
 def _as_kept(value: Any) -> Any:

@@ -51,6 +51,7 @@ class SyntheticDataModule(DepthDataModule):
     """
 
     protocol = "synthetic"
+    camera_height: float = 1.65
     cacheable = False  # it renders, once, into a cache of its own
     ground_truth = "exact"
 
@@ -121,7 +122,7 @@ class SyntheticDataModule(DepthDataModule):
                 )
                 for number in range(self.counts[name])
             ]
-            pairs = [drive.partner() for drive in self._drives[name]] if self.stereo and name in self.neighbors else []
+            pairs = [drive.stereo() for drive in self._drives[name]] if self.stereo and name in self.neighbors else []
             _render([*self._drives[name], *pairs], name, show=self._place()[0] == 0)
         return self._drives[name]
 

@@ -6,13 +6,11 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from saunet.data.drive import Drive
-from saunet.data.manifest import numbering
 from saunet.data.module import DepthDataModule
 from saunet.data.motion import relative_change, shrink
 from saunet.data.sampling import evenly
@@ -151,7 +149,7 @@ def survey(
             drives[drive.name] = drive
             wanted.setdefault(drive.name, set()).update(frame + offset for offset in (0, *dataset.offsets))
     for name in wanted:
-        found.numbering[name] = numbering(drives[name])
+        found.numbering[name] = drives[name].numbering
     trained = {drive.name for split in ("train", "val") if split in datasets for drive in datasets[split].drives}
     found.test_only = frozenset(wanted.keys() - trained) if trained else frozenset()
     everything = [(name, frame) for name, numbers in wanted.items() for frame in sorted(numbers)]
@@ -262,9 +260,9 @@ def _facts(
 
 
 def _file_bytes(drive: Drive, index: int) -> int | None:
-    path = getattr(drive, "path", None)
+    path = drive.path(index)
     try:
-        return Path(path(index)).stat().st_size if callable(path) else None
+        return None if path is None else path.stat().st_size
     except OSError:
         return None
 
@@ -277,8 +275,7 @@ def _look_at_camera(found: Survey, drive: Drive, index: int) -> None:
         found.camera_problems.append(str(error))
         return
     if sizes:
-        fps, height = getattr(drive, "fps", None), getattr(drive, "camera_height", None)
-        found.cameras.append(CameraFacts(drive.name, K, sizes.most_common(1)[0][0], fps, height))
+        found.cameras.append(CameraFacts(drive.name, K, sizes.most_common(1)[0][0], drive.fps, drive.camera_height))
 
 
 def _read_truths(found: Survey, dataset: WindowDataset) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from saunet.data.drive import Drive
 from saunet.data.frame_size import check_frame
-from saunet.data.image_cache import FRAMES, SETTINGS, CacheSettings, ImageCache, origin
+from saunet.data.image_cache import FRAMES, SETTINGS, CacheSettings, ImageCache
 from saunet.errors import DataError
 from saunet.io.atomic import write_bytes, write_json
 from saunet.io.images import resize
@@ -92,11 +92,11 @@ class _Copy:
 
 def _state(drive: Drive, frame: int) -> list[int] | None:
     """Return bytes and time of change (ns) of a frame's original file; None where there is none to ask."""
-    path = getattr(drive, "path", None)
-    if not callable(path):
+    path = drive.path(frame)
+    if path is None:
         return None
     try:
-        found = Path(path(frame)).stat()
+        found = path.stat()
     except OSError:  # reading it says what is wrong
         return None
     return [found.st_size, found.st_mtime_ns]
@@ -183,6 +183,6 @@ def _finish(home: Path, drive: Drive, known: dict[str, Any], entries: dict[int, 
     originals |= {f"{frame:010d}": state for frame, (_, _, _, state) in entries.items() if state}
     content: dict[str, Any] = {"native": list(*sizes), "frames": dict(sorted(frames.items()))}
     content |= {"originals": dict(sorted(originals.items()))} if originals else {}
-    content |= {"origin": origin(drive)} if origin(drive) else {}
+    content |= {"origin": drive.origin} if drive.origin else {}
     if content != known:
         write_json(home / FRAMES, content, indent=0)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
 
 from saunet.data import splits
-from saunet.data.drive import Drive, StereoDrive
+from saunet.data.drive import Drive
 from saunet.data.kitti import CAMERAS, DepthKind, KittiDrive, KittiRaw
 from saunet.data.module import DepthDataModule
+from saunet.data.stereo import other_view
 from saunet.errors import ConfigError, DataError, one_of, suggest
 
 Recording = tuple[KittiDrive, list[int]]
@@ -80,8 +80,8 @@ def module_recordings(data: DepthDataModule) -> list[tuple[Drive, Sequence[int]]
         for drive, *_ in data.select(split):
             drives.setdefault(drive.name, drive)
             if data.stereo:
-                partner = cast(StereoDrive, drive).partner()
-                drives.setdefault(partner.name, partner)
+                other, _ = other_view(drive)
+                drives.setdefault(other.name, other)
     return [(drive, drive.indices) for drive in drives.values() if len(drive.indices)]
 
 

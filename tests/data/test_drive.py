@@ -1,0 +1,97 @@
+"""The contract of a recording: complete defaults, proxies that forward all of it, and no probing anywhere."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drives import NumberDrive
+
+from saunet.data.drive import Drive, DriveProxy
+
+SOURCE = Path(__file__).parents[2] / "src" / "saunet"
+MEMBERS = {name for name in vars(Drive) if not name.startswith("_")}
+
+
+class Bare(Drive):
+    """The least that a data set has to say."""
+
+    name = "bare"
+    indices = (0, 2, 3)
+
+    def image(self, index):
+        return np.zeros((4, 6, 3), np.uint8)
+
+    def intrinsics(self, index):
+        return np.eye(3)
+
+
+def test_four_members_are_enough_and_the_rest_is_unknown():
+    drive = Bare()
+    unknown = {drive.depth(0), drive.pose(0), drive.time(0), drive.timestamps, drive.fps, drive.speed(0)}
+    unknown |= {drive.distance(0, 2), drive.stereo(), drive.T_stereo_cam, drive.path(0), drive.folder}
+    unknown |= {drive.frame_size, drive.camera_height, drive.condition, drive.depth_key(0)}
+    assert unknown == {None}
+    assert (drive.has_depth(0), drive.recorded(2), drive.numbering, drive.origin) == (False, 2, "", "")
+
+
+@pytest.mark.parametrize("missing", ["name", "indices", "image", "intrinsics"])
+def test_a_forgotten_member_is_an_error_at_once(missing):
+    members = {name: getattr(Bare, name) for name in ("name", "indices", "image", "intrinsics") if name != missing}
+    with pytest.raises(TypeError, match=missing):
+        type("Broken", (Drive,), members)()
+
+
+def test_what_follows_from_what_is_known():
+    class Timed(NumberDrive):
+        def time(self, index):
+            return None if index == 3 else 0.5 * index
+
+    drive = Timed(indices=(0, 1, 3, 4, 5))
+    np.testing.assert_array_equal(drive.timestamps, [0, 0.5, np.nan, 2, 2.5])
+    assert drive.fps == 2
+    assert drive.has_depth(0)
+    assert not Timed(truth=False).has_depth(0)
+    assert drive.distance(1, 4) == pytest.approx(np.hypot(0.3, 3))
+
+
+def test_a_proxy_forwards_every_member():
+    assert vars(DriveProxy).keys() >= MEMBERS
+
+    asked: list[str] = []
+
+    class Loud(NumberDrive):
+        def __getattribute__(self, name):
+            if name in MEMBERS:
+                asked.append(name)
+            return super().__getattribute__(name)
+
+    proxy = DriveProxy(Loud())
+    for name in sorted(MEMBERS):
+        asked.clear()
+        member = inspect.getattr_static(DriveProxy, name)
+        arguments = () if isinstance(member, property) else (1,) * (len(inspect.signature(member).parameters) - 1)
+        given = getattr(proxy, name)
+        _ = given if isinstance(member, property) else given(*arguments)
+        assert asked[0] == name
+
+
+def test_nothing_probes_a_recording():
+    """A member that a caller looks for by name is one that a typo in a data set silently switches off."""
+    found = []
+    for path in SOURCE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name) or len(node.args) < 2:
+                continue
+            called, target, word = node.func.id, ast.unparse(node.args[0]), ast.unparse(node.args[1])
+            member = isinstance(node.args[1], ast.Constant) and node.args[1].value in MEMBERS
+            probes = called in ("getattr", "hasattr") and (member or "drive" in target.lower())
+            sorts = called in ("isinstance", "issubclass") and any(
+                each.endswith(("Drive", "Sequence")) and each != "Sequence" for each in word.strip("()").split(", ")
+            )
+            if probes or sorts:
+                found.append(f"{path.relative_to(SOURCE)}: {ast.unparse(node)}")
+    assert not found
