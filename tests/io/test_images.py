@@ -62,7 +62,7 @@ def test_transparency_is_dropped(tmp_path: Path, picture: NDArray[np.uint8]) -> 
 
 def test_colormap_image(tmp_path: Path, picture: NDArray[np.uint8]) -> None:
     few = picture // 128 * 128
-    Image.fromarray(few).convert("P", colormap=Image.Colormap.ADAPTIVE).save(tmp_path / "x.png")
+    Image.fromarray(few).convert("P", palette=Image.Palette.ADAPTIVE).save(tmp_path / "x.png")
     assert np.abs(read_image(tmp_path / "x.png").astype(int) - few).max() <= 2
 
 
