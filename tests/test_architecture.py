@@ -26,6 +26,7 @@ ALLOWED: dict[str, set[str]] = {
     "data": {"errors", "registry", "types", "io", "fingerprint", "geometry", "synthetic"},
     "synthetic": {"errors", "io", "data"},
     "runs": {"errors", "io", "registry", "metrics", "models", "__version__"},
+    "weights": {"errors", "runs"},
     "scale": {"errors", "types", "io", "geometry", "runs"},
     "training": {
         "errors",
@@ -38,9 +39,10 @@ ALLOWED: dict[str, set[str]] = {
         "losses",
         "prediction",
         "runs",
+        "weights",
     },
-    "prediction": {"errors", "types", "io", "metrics", "models", "runs", "exporting"},
-    "exporting": {"errors", "io", "metrics", "models", "prediction", "runs"},
+    "prediction": {"errors", "types", "io", "metrics", "models", "runs", "weights", "exporting"},
+    "exporting": {"errors", "io", "metrics", "models", "prediction", "runs", "weights"},
     "evaluation": {"errors", "types", "io", "tables", "fingerprint", "geometry", "losses", "metrics"},
     "reporting": {
         "errors",

@@ -7,6 +7,7 @@ from typing import Any
 
 from saunet.errors import CheckpointError
 from saunet.registry import registry
+from saunet.weights.locate import DEFAULT, shipped
 
 __version__ = "0.1.0"
 __all__ = ["__version__", "available", "build", "load"]
@@ -38,7 +39,7 @@ def available(kind: str) -> list[str]:
     """Return the registered names of a kind, sorted.
 
     Args:
-        kind: One of the kinds that `build` takes.
+        kind: What `build` takes, or ``"weights"`` for the trained models that come with saunet.
 
     Returns:
         The names.
@@ -50,15 +51,16 @@ def available(kind: str) -> list[str]:
         >>> saunet.available("attention")
         ['cbam', 'eca', 'gct', 'none', 'se']
     """
-    return registry(kind).names()
+    return shipped() if kind == "weights" else registry(kind).names()
 
 
-def load(source: Any, *, device: str = "cpu", flip: bool = False, keep_aspect: bool = False) -> Any:
+def load(source: Any = DEFAULT, *, device: str = "cpu", flip: bool = False, keep_aspect: bool = False) -> Any:
     """Load a trained model for prediction: ``saunet.load("last.ckpt").predict(image)``.
 
     Args:
-        source: A checkpoint, a folder or ``model.onnx`` written by ``saunet-export``, or a model on the Hugging Face
-            hub (``hf://organization/name``).
+        source: A checkpoint, a folder or ``model.onnx`` written by ``saunet-export``, the name of a model that comes
+            with saunet (one of ``available("weights")``), or a model on the Hugging Face hub
+            (``hf://organization/name``).
         device: Where to run, such as ``"cpu"`` or ``"cuda"``.
         flip: Average with the prediction of the mirrored image.
         keep_aspect: Feed each image at its own aspect ratio.

@@ -87,7 +87,7 @@ class EvaluateConfig:
 class PredictConfig:
     """Root of ``saunet-predict``."""
 
-    checkpoint: str = MISSING
+    checkpoint: str = "street"
     input: str = MISSING
     output: str = MISSING
     outputs: list[str] | None = None

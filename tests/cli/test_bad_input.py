@@ -131,7 +131,8 @@ def test_a_full_gpu_is_one_sentence() -> None:
 
 
 def test_a_missing_value_is_asked_for(tool: Tool) -> None:
-    tool("predict", "input=x").says("checkpoint is not set; add checkpoint=... output=... to the command line")
+    tool("predict", "input=x").says("output is not set; add output=... to the command line")
+    tool("odometry").says("checkpoint is not set; add checkpoint=...")
 
 
 @pytest.mark.parametrize("name", ["evaluate", "predict"])

@@ -14,8 +14,6 @@ import pytest
 import saunet
 from saunet.cli import export as tool_module
 
-pytest.importorskip("safetensors", reason="export needs saunet[export]")
-
 
 @pytest.fixture
 def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> Callable[..., tuple[int, str, str]]:

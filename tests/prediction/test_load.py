@@ -16,14 +16,12 @@ import torch
 
 import saunet
 from saunet.errors import CheckpointError, ConfigError
-from saunet.exporting.exporters import write_safetensors
-from saunet.exporting.folder import read_model
-from saunet.prediction.load import locate
 from saunet.prediction.pointcloud import Camera
 from saunet.runs.checkpoint import ModelRecord, atomic_save, build_networks
+from saunet.weights.files import read_model, write_safetensors
+from saunet.weights.locate import locate
 
 Node = Callable[..., dict[str, Any]]
-pytest.importorskip("safetensors", reason="safetensors is not installed")
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from saunet.errors import CheckpointError, ConfigError
+from saunet.registry import poses
 from saunet.runs.folder import Stopped
 from saunet.training.callbacks import LastCheckpoint
 from saunet.training.optim import Recipe
@@ -143,12 +144,41 @@ def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Pa
     other = assemble(config, walls)
     said = warm_start(other, tmp_path / "a.ckpt")
     count = len(other.depth.state_dict())
-    assert f"{count} of {count} tensors of the depth network" in said
+    assert f"all {count} tensors of the depth network" in said
     assert f"{len(other.pose.state_dict()) - 2} of {len(other.pose.state_dict())} tensors of the pose" in said
+    assert "pose network (left as they were: layers.0.weight, not in it, and 1 more)" in said
     assert torch.equal(next(other.depth.parameters()), next(model.depth.parameters()))
     atomic_save({"saunet": model.record, "state_dict": {"depth.x": torch.zeros(1)}}, tmp_path / "b.ckpt")
     with pytest.raises(CheckpointError, match=r"nothing of .*b\.ckpt fits the depth network"):
         warm_start(other, tmp_path / "b.ckpt")
+
+
+def test_a_warm_start_from_a_shipped_model(
+    model: Any, tmp_path: Path, config: Any, walls: Any, node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from saunet.exporting.box import pack
+    from saunet.runs.checkpoint import atomic_save
+    from saunet.training.assemble import assemble
+    from saunet.weights import locate
+
+    monkeypatch.setattr(locate, "BOX", tmp_path)
+    atomic_save({"saunet": model.record, "state_dict": model.state_dict()}, tmp_path / "a.ckpt")
+    pack(tmp_path / "a.ckpt", tmp_path / "street")
+    model_config = config["model"]
+    other = assemble({**config, "model": {**model_config, "max_depth": 50.0}}, walls)
+    said = warm_start(other, "street")
+    assert "starting from street: all " in said
+    assert f"all {len(other.pose.state_dict())} tensors of the pose network" in said
+    assert "max_depth is 100 and here 50" in said
+    for part in ("depth", "pose"):
+        for own, theirs in zip(getattr(other, part).parameters(), getattr(model, part).parameters(), strict=True):
+            assert own.dtype == torch.float32
+            torch.testing.assert_close(own, theirs, rtol=1e-3, atol=1e-6)
+    pose = node("pose", "efficientnet_lite0")
+    said = warm_start(assemble({**config, "model": {**model_config, "pose": pose}}, walls), "street")
+    assert f"0 of {len(poses.build('efficientnet_lite0').state_dict())} tensors of the pose network" in said
+    assert "(left as they were: encoder.conv_stem.weight, not in it, and " in said
+    assert "(unused: layers.0.bias, and " in said
 
 
 def test_a_writer_that_dies_midway_leaves_the_previous_checkpoint(tmp_path: Path) -> None:

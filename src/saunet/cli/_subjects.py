@@ -108,9 +108,9 @@ class CheckpointSubject(Subject):
 
     def __init__(self, cfg: DictConfig) -> None:
         from saunet.evaluation.views import PoseNetwork
-        from saunet.runs.checkpoint import read_checkpoint
+        from saunet.weights.files import read_model
 
-        checkpoint = read_checkpoint(cfg.checkpoint)
+        checkpoint = read_model(cfg.checkpoint)
         record = checkpoint.record
         fixed = {"height": record.height, "width": record.width}
         super().__init__(cfg, {**fixed, "offsets": list(record.offsets)} if record.pose else fixed)

@@ -25,11 +25,11 @@ def odometry(cfg: DictConfig) -> None:
         write_path,
     )
     from saunet.evaluation.plot import draw_path
-    from saunet.exporting.folder import read_model
     from saunet.metrics.odometry import check_lengths, check_snippet
-    from saunet.prediction.load import locate
     from saunet.prediction.odometer import Odometer, follow
     from saunet.registry import instantiate
+    from saunet.weights.files import read_model
+    from saunet.weights.locate import locate
 
     lengths = list(cfg.lengths) if cfg.lengths else None
     check_snippet(cfg.snippet)

@@ -18,7 +18,7 @@ def predict(cfg: DictConfig) -> None:
     from saunet.cli._scale import scale_predictor
     from saunet.io.video import VIDEO_SUFFIXES
     from saunet.prediction.files import OUTPUTS
-    from saunet.prediction.load import load, locate
+    from saunet.prediction.load import load
     from saunet.prediction.video import CLIP_OUTPUTS
 
     is_camera = cfg.input.isdecimal() and not Path(cfg.input).exists()
@@ -47,7 +47,7 @@ def predict(cfg: DictConfig) -> None:
     if "trajectory" in outputs:
         from saunet.prediction.odometer import Odometer
 
-        odometer = Odometer.from_model(locate(cfg.checkpoint), predictor.scale, pick_device(cfg.device), cfg.batch_size)
+        odometer = Odometer.from_model(cfg.checkpoint, predictor.scale, pick_device(cfg.device), cfg.batch_size)
     each = _predict_clip if is_clip else _predict_recording
     each(cfg, predictor, source, outputs, {**shared, **shown, "odometer": odometer})
 

@@ -45,7 +45,7 @@ def model_card(
         f"| input | RGB, {record.width} x {record.height} (width x height); other sizes are resized |",
         f"| output | disparity in [1/{record.max_depth:g}, 1/{record.min_depth:g}]; depth is 1 / disparity |",
         f"| unit of depth | {unit_of(record.scale)} |",
-        *(f"| {slot} | {_describe(node)} |" for slot, node in parts.items() if node is not None),
+        *(f"| {slot} | {describe_node(node)} |" for slot, node in parts.items() if node is not None),
         "",
         "The whole configuration is in `config.json`.",
         "",
@@ -66,7 +66,7 @@ def model_card(
         "",
         "## Quality",
         "",
-        *_quality(metrics),
+        *quality_lines(metrics),
         "",
     ]
     if reports:
@@ -110,7 +110,8 @@ def fingerprint(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _quality(metrics: Mapping[str, Any] | None) -> list[str]:
+def quality_lines(metrics: Mapping[str, Any] | None) -> list[str]:
+    """Return the results of an evaluation as lines of a Markdown table."""
     if metrics is None:
         return ["No evaluation was given when this was exported (`evaluation=` the folder of a saunet-evaluate run)."]
     return [
@@ -128,9 +129,11 @@ def _number(value: Any) -> str:
     return f"{value:.3f}" if isinstance(value, int | float) else "-"
 
 
-def _describe(node: Mapping[str, Any]) -> str:
+def describe_node(node: Mapping[str, Any]) -> str:
     """Return ``Name(key=value, ...)`` of a config node, nested components by name."""
     name = str(node["_target_"]).rpartition(".")[2]
     values = {key: value for key, value in node.items() if not key.startswith("_")}
-    shown = (f"{key}={_describe(v) if isinstance(v, Mapping) and '_target_' in v else v}" for key, v in values.items())
+    shown = (
+        f"{key}={describe_node(v) if isinstance(v, Mapping) and '_target_' in v else v}" for key, v in values.items()
+    )
     return f"{name}({', '.join(shown)})"

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from saunet.errors import CheckpointError, ConfigError, DataError, one_of
 from saunet.exporting import exporters
 from saunet.exporting.card import model_card
-from saunet.exporting.folder import CONFIG, WEIGHTS, read_model, restored
 from saunet.exporting.parity import Parity, Run, compare, timed
 from saunet.io.atomic import replacing, write_bytes, write_json
 from saunet.io.images import network_input, read_image
@@ -26,6 +25,8 @@ from saunet.io.progress import bar
 from saunet.models.depth import DepthNet
 from saunet.prediction.sources import image_paths
 from saunet.runs.record import ModelRecord
+from saunet.weights.files import read_model, restored, write_safetensors
+from saunet.weights.locate import CARD, CONFIG, POSE, WEIGHTS
 
 FORMATS: tuple[str, ...] = ("onnx", "program", "compiled", "safetensors")
 """``onnx``: for onnxruntime, TensorRT and others. ``program`` (torch.export): for torch without saunet. ``compiled``
@@ -34,7 +35,7 @@ DEFAULT_FORMATS: tuple[str, ...] = ("onnx", "program", "safetensors")
 TOLERANCE = 1e-4
 """Largest difference to the original network that passes, as a share of the range of disparity."""
 FILES = {"onnx": "model.onnx", "program": "model.pt2", "compiled": "model.aoti.pt2", "safetensors": WEIGHTS}
-REPORT, CARD = "report.json", "README.md"
+REPORT = "report.json"
 
 _REAL_AT_MOST = 8
 _PLACES = ("root", "cache")
@@ -86,10 +87,9 @@ def export_model(
     metrics = read_metrics(evaluation) if evaluation is not None else None
     splits = _splits(read.path)
     network, pose = read.networks()
-    record = replace(read.record, data={key: value for key, value in read.record.data.items() if key not in _PLACES})
-    _check_finite(record)
+    record = public_record(read.record)
     network.eval()
-    random, real = _random(record), _real(record, images)
+    random, real = random_images(record), real_images(record, images)
     _clear(folder, overwrite)
     eager, span = exporters.run_eager(network), 1 / record.min_depth - 1 / record.max_depth
     reports, runs = list[Parity](), list[Run]()
@@ -101,7 +101,7 @@ def export_model(
                 takes = "any"
                 if name == "safetensors":
                     parts = {"depth": network} if pose is None else {"depth": network, "pose": pose}
-                    exporters.write_safetensors(_state(parts), temporary)
+                    write_safetensors(named_state(parts), temporary)
                 else:
                     takes = _EXPORTERS[name](network, record, temporary, batch)
                 size = temporary.stat().st_size / 2**20
@@ -161,7 +161,7 @@ def _splits(checkpoint: Path) -> Mapping[str, str]:
 
 def _clear(folder: Path, overwrite: bool) -> None:
     """Remove an earlier export, its config first: what is left of it must not be taken for the new model."""
-    names = (CONFIG, *FILES.values(), REPORT, CARD)
+    names = (CONFIG, *FILES.values(), POSE, REPORT, CARD)
     present = [name for name in names if (folder / name).exists()]
     if present and not overwrite:
         raise ConfigError(f"{folder} holds {present[0]} already; choose another output folder, or set overwrite=true")
@@ -172,31 +172,40 @@ def _clear(folder: Path, overwrite: bool) -> None:
             raise DataError(f"cannot replace {folder / name}: {reason.strerror or reason}") from reason
 
 
-def _check_finite(record: ModelRecord) -> None:
-    """Check that ``config.json`` can hold the record, before anything is written.
+def public_record(record: ModelRecord) -> ModelRecord:
+    """Return a model's record without the trainer's folders.
 
     Raises:
-        ConfigError: if a number in it is NaN or infinite.
+        ConfigError: if a number in it is NaN or infinite, which ``config.json`` could not hold.
     """
+    record = replace(record, data={key: value for key, value in record.data.items() if key not in _PLACES})
     try:
         json.dumps(record.to_plain(), allow_nan=False)
     except ValueError as reason:
         raise ConfigError(f"{CONFIG} cannot hold the model's settings ({reason}); give finite numbers") from reason
+    return record
 
 
-def _random(record: ModelRecord) -> list[NDArray[np.float32]]:
+def random_images(record: ModelRecord) -> list[NDArray[np.float32]]:
+    """Return two images of random colors at the network's size, each 1 3 h w, always the same."""
     images = np.random.default_rng(0).random((2, 1, 3, record.height, record.width), dtype=np.float32)
     return list(images)
 
 
-def _real(record: ModelRecord, images: str | Path | Sequence[str | Path]) -> list[NDArray[np.float32]]:
+def real_images(record: ModelRecord, images: str | Path | Sequence[str | Path]) -> list[NDArray[np.float32]]:
+    """Return at most eight of the images of files, folders or patterns at the network's size, each 1 3 h w.
+
+    Raises:
+        DataError: if there is none, or one cannot be read.
+    """
     several = [images] if isinstance(images, str | Path) else list(images)
     paths = [path for item in several for path in image_paths(item)]
     chosen = [paths[index] for index in np.linspace(0, len(paths) - 1, min(len(paths), _REAL_AT_MOST)).astype(int)]
     return [network_input(read_image(path), record.height, record.width)[None] for path in chosen]
 
 
-def _state(parts: Mapping[str, torch.nn.Module]) -> dict[str, torch.Tensor]:
+def named_state(parts: Mapping[str, torch.nn.Module]) -> dict[str, torch.Tensor]:
+    """Return the weights of networks under a checkpoint's names, such as ``depth.encoder.conv1.weight``."""
     return {f"{part}.{name}": value for part, module in parts.items() for name, value in module.state_dict().items()}
 
 

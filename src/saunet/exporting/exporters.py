@@ -121,20 +121,6 @@ def export_compiled(network: DepthNet, record: ModelRecord, path: str | Path, ba
     return takes
 
 
-def write_safetensors(state: dict[str, Tensor], path: str | Path) -> None:
-    """Write named tensors as safetensors.
-
-    Raises:
-        ConfigError: if the package is missing.
-    """
-    try:
-        from safetensors.torch import save
-    except ImportError as missing:
-        raise ConfigError("safetensors needs the package safetensors; run: pip install 'saunet[export]'") from missing
-    plain = {name: value.detach().cpu().contiguous() for name, value in state.items()}
-    Path(path).write_bytes(save(plain, {"format": "pt"}))  # save_file would let its owner alone read the file
-
-
 def run_eager(network: DepthNet) -> Run:
     """Return the network as a function of arrays."""
 

@@ -1,18 +1,12 @@
-"""One way to any trained model: a checkpoint, an exported folder or file, or a model on the Hugging Face hub."""
+"""One way to any trained model: shipped with saunet, a checkpoint, an exported folder or file, or on the hub."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from saunet.errors import CheckpointError, ConfigError
 from saunet.prediction.pipeline import ImagePredictor
-
-HUB = "hf://"
-_HUB_ID = re.compile(r"[\w.-]+/[\w.-]+(@[\w./-]+)?")
-_FILE_SUFFIXES = (".ckpt", ".onnx", ".safetensors", ".pt", ".pth", ".pt2")
-_WANTED = ("config.json", "model.safetensors", "model.onnx", "README.md")
-"""What is fetched from the hub: numbers and text, nothing that could be run."""
+from saunet.weights.locate import locate
 
 
 def load(source: str | Path, *, device: str = "cpu", flip: bool = False, keep_aspect: bool = False) -> ImagePredictor:
@@ -20,8 +14,8 @@ def load(source: str | Path, *, device: str = "cpu", flip: bool = False, keep_as
 
     Args:
         source: A checkpoint, a folder written by ``saunet-export``, a ``model.onnx`` (run by onnxruntime; torch is not
-            even imported), or a hub id: ``hf://organization/name``, or short ``organization/name``, with ``@revision``
-            where a certain one is meant.
+            even imported), the name of a shipped model such as ``street``, or a hub id: ``hf://organization/name``, or
+            short ``organization/name``, with ``@revision`` where a certain one is meant.
         device: Where to run, such as ``"cpu"`` or ``"cuda"``.
         flip: Average with the prediction of the mirrored image (twice the time, a little less error).
         keep_aspect: Feed each image at its own aspect ratio; an ONNX file has one fixed size and cannot.
@@ -46,43 +40,3 @@ def load(source: str | Path, *, device: str = "cpu", flip: bool = False, keep_as
     from saunet.prediction.predictor import Predictor
 
     return Predictor.from_checkpoint(path, device, flip, keep_aspect)
-
-
-def locate(source: str | Path) -> Path:
-    """Return the local path of a model, fetched from the hub where ``source`` is a hub id.
-
-    Raises:
-        CheckpointError: if it cannot be fetched.
-        ConfigError: if the package huggingface_hub is missing, or the id is not one.
-    """
-    text = str(source)
-    if text.startswith(HUB):
-        if not _HUB_ID.fullmatch(text[len(HUB) :]):
-            raise ConfigError(
-                f"'{text}' is not a hub id; give hf://organization/name or hf://organization/name@revision"
-            )
-        return _fetch(text[len(HUB) :])
-    path = Path(source)
-    local = path.exists() or path.parent.is_dir() or path.suffix.lower() in _FILE_SUFFIXES
-    if isinstance(source, Path) or local or not _HUB_ID.fullmatch(text):
-        return path
-    return _fetch(text)
-
-
-def _fetch(name: str) -> Path:
-    try:
-        from huggingface_hub import snapshot_download
-    except ImportError as missing:
-        raise ConfigError(
-            f"there is no file '{name}', and fetching it from the hub needs huggingface_hub; "
-            "check the path, or run: pip install 'saunet[hub]'"
-        ) from missing
-    repository, _, revision = name.partition("@")
-    try:
-        return Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(_WANTED)))
-    except Exception as reason:  # the hub's errors, the network's and the HTTP client's share no base class
-        first = next((line.strip() for line in str(reason).splitlines() if line.strip()), "")
-        raise CheckpointError(
-            f"cannot fetch '{name}' from the hub ({type(reason).__name__}: {first[:200]}); check the name and the "
-            "connection; what was fetched once is used without one"
-        ) from reason

@@ -12,11 +12,11 @@ from jaxtyping import Float64, UInt8
 from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, ConfigError, DataError, positive
-from saunet.exporting.folder import read_model
 from saunet.io.images import network_input
 from saunet.io.progress import bar
 from saunet.metrics.odometry import chain_motions
 from saunet.runs.record import Scale
+from saunet.weights.files import read_model
 
 
 class Odometer:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import csv
 import warnings
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.utilities import rank_zero_only
-from torch import nn
+from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, ConfigError
 from saunet.runs.checkpoint import load_weights, read_checkpoint
 from saunet.training.module import SelfSupervisedDepth
+from saunet.weights.files import read_model
 
 
 def resume_path(resume: str | None, output_dir: str | Path, init_from: str | None = None) -> str | None:
@@ -94,32 +96,54 @@ def keep_rows(logger: Logger, steps: int) -> None:
     writer.save()
 
 
-def warm_start(model: SelfSupervisedDepth, path: str | Path) -> str:
-    """Give a new training the weights of a checkpoint, as many as fit by name and shape.
+def warm_start(model: SelfSupervisedDepth, source: str | Path) -> str:
+    """Give a new training the weights of a trained model, as many as fit by name and shape.
 
     Args:
         model: The training.
-        path: A checkpoint of any saunet model.
+        source: Any saunet model: a checkpoint, an exported folder, or the name of a shipped model such as ``street``.
 
     Returns:
-        One sentence that says what was taken.
+        What was taken and what was not, in one sentence.
 
     Raises:
-        CheckpointError: if the file cannot be read, or nothing of its depth network fits.
+        CheckpointError: if the model cannot be read, or nothing of its depth network fits.
     """
-    checkpoint = read_checkpoint(Path(path).expanduser())
+    checkpoint = read_model(source)
     parts: list[tuple[str, nn.Module | None]] = [("depth", model.depth), ("pose", model.pose)]
-    counts = []
+    taken = []
     for name, network in parts:
+        given = checkpoint.weights(name)
         if network is None:
+            if given:
+                taken.append(f"not the {name} network, which this training does not have")
             continue
-        own, given = network.state_dict(), checkpoint.weights(name)
+        own = network.state_dict()
         fitting = {key: given[key] for key in own if key in given and given[key].shape == own[key].shape}
         if name == "depth" and not fitting:
             raise CheckpointError(
-                f"nothing of {path} fits the depth network (it has '{next(iter(given), 'no weights')}' where the model "
-                f"has '{next(iter(own))}'); choose the same model/encoder and model/decoder"
+                f"nothing of {source} fits the depth network (it has '{next(iter(given), 'no weights')}' where the "
+                f"model has '{next(iter(own))}'); choose the same model/encoder and model/decoder"
             )
         network.load_state_dict(fitting, strict=False)
-        counts.append(f"{len(fitting)} of {len(own)} tensors of the {name} network")
-    return f"starting from {path}: {', '.join(counts)}"
+        taken.append(_taken(name, own, given, fitting))
+    theirs, ours = checkpoint.record.to_plain()["model"], model.record.get("model", {})
+    for end in ("min_depth", "max_depth"):
+        if ours.get(end, theirs[end]) != theirs[end]:
+            taken.append(f"its {end} is {theirs[end]:g} and here {ours[end]:g}, so the same weights give other depths")
+    return f"starting from {source}: {'; '.join(taken)}"
+
+
+def _taken(name: str, own: Mapping[str, Tensor], given: Mapping[str, Tensor], fitting: Collection[str]) -> str:
+    """Say how much of a network was taken, and of the rest the first tensor."""
+    if len(fitting) == len(own) == len(given):
+        return f"all {len(own)} tensors of the {name} network"
+    rest = [key for key in own if key not in fitting]
+    text = f"{len(fitting)} of {len(own)} tensors of the {name} network"
+    if rest:
+        why = "another shape" if rest[0] in given else "not in it"
+        text += f" (left as they were: {rest[0]}, {why}{f', and {len(rest) - 1} more' if len(rest) > 1 else ''})"
+    unused = [key for key in given if key not in own]
+    if unused:
+        text += f" (unused: {unused[0]}{f', and {len(unused) - 1} more' if len(unused) > 1 else ''})"
+    return text
