@@ -10,6 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import saunet
+from saunet.cli.compose import structured
 from saunet.errors import ConfigError
 from saunet.registry import REGISTRIES, Registry, Spec, encoders, instantiate
 
@@ -48,7 +49,7 @@ def test_names_and_summary(widgets: Registry) -> None:
 
 
 def test_registering_twice_is_an_error(widgets: Registry) -> None:
-    with pytest.raises(ValueError, match="widget 'wide' is already registered by"):
+    with pytest.raises(ConfigError, match="widget 'wide' is already registered by"):
         widgets.register("wide")(Widget)
 
 
@@ -87,7 +88,7 @@ def test_a_signature_without_names_and_types_is_refused(signature: str) -> None:
 
 
 def test_instantiate_builds_nested_registered_components() -> None:
-    node = OmegaConf.to_container(OmegaConf.structured(encoders.node("resnet18")))
+    node = OmegaConf.to_container(OmegaConf.structured(structured(encoders.node("resnet18"))))
     assert type(instantiate(node)) is encoders.entry("resnet18").target
     assert type(instantiate({"inner": [node]})["inner"][0]) is encoders.entry("resnet18").target
 
@@ -98,7 +99,7 @@ def test_instantiate_refuses_what_is_not_registered() -> None:
 
 
 def test_instantiate_refuses_unknown_keys() -> None:
-    node = OmegaConf.to_container(OmegaConf.structured(encoders.node("resnet18")))
+    node = OmegaConf.to_container(OmegaConf.structured(structured(encoders.node("resnet18"))))
     assert isinstance(node, dict)
     with pytest.raises(ConfigError, match="'ResNet' has no parameter 'depht'"):
         instantiate({**node, "depht": 3})

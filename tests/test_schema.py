@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from saunet import schema
+from saunet.cli.compose import structured
 
 
 class Inner:
@@ -43,7 +44,7 @@ class Outer:
 
 @pytest.fixture
 def config() -> Any:
-    return OmegaConf.structured(schema.node(Outer, preset={"rate": 0.1}, late=("features",)))
+    return OmegaConf.structured(structured(schema.node(Outer, preset={"rate": 0.1}, late=("features",))))
 
 
 def test_defaults_presets_and_late_parameters(config: Any) -> None:
@@ -83,7 +84,7 @@ def test_right_values_pass(config: Any) -> None:
 
 
 def test_nodes_do_not_share_mutable_defaults() -> None:
-    made = schema.node(Outer)
+    made = structured(schema.node(Outer))
     first, second = made(), made()
     first.depths.append(9)
     assert second.depths == [2, 2]

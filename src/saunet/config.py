@@ -37,6 +37,8 @@ def register_configs(kinds: Collection[str] = tuple(REGISTRIES)) -> None:
     Args:
         kinds: Kinds of components, keys of `saunet.registry.REGISTRIES`; all by default. Their packages are imported.
     """
+    from saunet.cli.compose import structured
+
     store = ConfigStore.instance()
     for root in ROOTS:
         if root in (ModelConfig, ScaleConfig):  # parts of roots
@@ -47,20 +49,21 @@ def register_configs(kinds: Collection[str] = tuple(REGISTRIES)) -> None:
         if registry.group is None:
             continue
         for entry in registry:
-            store.store(group=registry.group, name=entry.name, node=registry.node(entry.name))
+            store.store(group=registry.group, name=entry.name, node=structured(registry.node(entry.name)))
 
 
 def register_training_configs() -> None:
     """Add the nodes that need Lightning to be imported: the trainer's own options and the optimization recipe."""
     from lightning import Trainer
 
+    from saunet.cli.compose import structured
     from saunet.training.optim import Recipe
     from saunet.training.speed import Speed
 
     store = ConfigStore.instance()
-    store.store(group="trainer", name="lightning", node=schema.node(Trainer, root="lightning.Trainer"))
-    store.store(group="optim", name="recipe", node=schema.node(Recipe))
-    store.store(group="speed", name="switches", node=schema.node(Speed))
+    store.store(group="trainer", name="lightning", node=structured(schema.node(Trainer, path="lightning.Trainer")))
+    store.store(group="optim", name="recipe", node=structured(schema.node(Recipe)))
+    store.store(group="speed", name="switches", node=structured(schema.node(Speed)))
 
 
 def plain(node: Any) -> Any:

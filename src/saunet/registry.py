@@ -7,7 +7,7 @@ class StratifiedTransformer(WindowEncoder): ...
 
 
 saunet.build("encoder", "stratified_small", drop_path=0.1)  # Python
-# saunet-train model/encoder=stratified_small model.encoder.drop_path=0.1   (command line)
+# saunet train model/encoder=stratified_small model.encoder.drop_path=0.1   (command line)
 ```
 """
 
@@ -17,11 +17,11 @@ import functools
 import importlib
 import inspect
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from saunet import schema
+from saunet import plugins, schema
 from saunet.errors import ConfigError, suggest
 
 C = TypeVar("C", bound=Callable[..., Any])
@@ -43,7 +43,7 @@ class Entry:
     @property
     def summary(self) -> str:
         """First line of the target's docstring."""
-        return (inspect.getdoc(self.target) or "").partition("\n")[0]
+        return schema.summary(self.target)
 
 
 class Registry:
@@ -57,21 +57,22 @@ class Registry:
     """
 
     def __init__(self, kind: str, group: str | None, home: str, late: tuple[str, ...] = ()) -> None:
-        self.kind, self.group, self.late = kind, group, late
-        self._home: str | None = home
+        self.kind, self.group, self.home, self.late = kind, group, home, late
+        self._imported = False
         self._entries: dict[str, Entry] = {}
 
     def register(self, name: str, /, **preset: Any) -> Callable[[C], C]:
         """Declare a class or function as component ``name``, with defaults that differ from its signature.
 
         Raises:
-            ValueError: if the name is taken.
+            ConfigError: if the name is taken.
             TypeError: if the signature cannot become a config schema, or the preset names no parameter.
         """
 
         def declare(target: C) -> C:
             if name in self._entries:
-                raise ValueError(f"{self.kind} '{name}' is already registered by {self._entries[name].path}")
+                taken = f"{self.kind} '{name}' is already registered by {self._entries[name].path}"
+                raise ConfigError(f"{taken}; give {target.__module__}.{target.__qualname__} another name")
             known = schema.parameters(target)
             for key in preset:
                 if key not in known:
@@ -117,18 +118,33 @@ class Registry:
     def __iter__(self) -> Iterator[Entry]:
         return iter([self._entries[name] for name in self.names()])
 
-    def node(self, name: str) -> type:
-        """Return the typed config node of ``name``."""
+    def node(self, name: str) -> schema.Node:
+        """Return the config keys of ``name``."""
         entry = self.entry(name)
         return schema.node(entry.target, entry.preset, self.late)
 
+    def registered(self) -> list[Entry]:
+        """Return what is registered so far; nothing is imported for it."""
+        return list(self._entries.values())
+
+    def by_path(self, path: str) -> Entry | None:
+        """Return the entry with an import path, None if it is not registered; imports nothing outside of the home."""
+        module = path.rpartition(".")[0]
+        if module == self.home or module.startswith(f"{self.home}."):
+            self._import_home() if module not in self._modules() else importlib.import_module(module)
+        return next((entry for entry in self._entries.values() if entry.path == path), None)
+
+    def _modules(self) -> list[str]:
+        package = importlib.import_module(self.home)
+        return [module.name for module in pkgutil.iter_modules(package.__path__, f"{self.home}.")]
+
     def _import_home(self) -> None:
-        if self._home is None:
+        if self._imported:
             return
-        home, self._home = self._home, None
-        package = importlib.import_module(home)
-        for module in pkgutil.iter_modules(package.__path__, f"{home}."):
-            importlib.import_module(module.name)
+        self._imported = True
+        for module in self._modules():
+            importlib.import_module(module)
+        plugins.load_installed()
 
 
 encoders = Registry("encoder", "model/encoder", "saunet.models.encoders")
@@ -164,9 +180,11 @@ class Spec:
 
     Args:
         node: Plain containers: ``_target_`` and parameters; nested components are nodes too.
+        name: The registered name, where it is known: several names can share a class.
     """
 
     node: Mapping[str, Any]
+    name: str | None = None
 
     @classmethod
     def of(cls, kind: str, name: str, /, **kwargs: Any) -> Spec:
@@ -177,7 +195,7 @@ class Spec:
         """
         entry = registry(kind).entry(name)
         _check_keys(f"{kind} '{name}'", entry.target, kwargs)
-        return cls({"_target_": entry.path, **entry.preset, **kwargs})
+        return cls({"_target_": entry.path, **entry.preset, **kwargs}, name)
 
     @property
     def parameters(self) -> dict[str, inspect.Parameter]:
@@ -190,7 +208,7 @@ class Spec:
 
     def changed(self, **changes: Any) -> Spec:
         """Return the same component with other parameters."""
-        return Spec({**self.node, **changes})
+        return Spec({**self.node, **changes}, self.name)
 
     def build(self, **changes: Any) -> Any:
         """Build the component, with some parameters changed.
@@ -226,14 +244,27 @@ def instantiate(node: Any) -> Any:
 
 
 def _by_path(path: str) -> Entry:
-    for owner in REGISTRIES.values():
-        for entry in owner:
-            if entry.path == path:
+    found = find(path)
+    if found is None:
+        raise ConfigError(f"'{path}' is not a registered component, so it is not built; {plugins.asked_for(path)}")
+    return found
+
+
+def find(path: str, kinds: Iterable[str] = ()) -> Entry | None:
+    """Return the registered component with an import path, None if there is none.
+
+    Args:
+        path: Such as ``saunet.models.encoders.resnet.ResNet``.
+        kinds: Where to look; everywhere by default.
+    """
+    owners = [REGISTRIES[kind] for kind in kinds or REGISTRIES]
+    for _ in range(2):
+        for owner in owners:
+            entry = owner.by_path(path)
+            if entry is not None:
                 return entry
-    raise ConfigError(
-        f"'{path}' is not a registered component, so it is not built; "
-        "import the module that registers it first, or see `saunet-components` for what is available"
-    )
+        plugins.load_installed()
+    return None
 
 
 def _check_keys(what: str, target: Callable[..., Any], kwargs: Mapping[str, Any]) -> None:

@@ -1,21 +1,87 @@
-"""Constructor signature -> typed Hydra schema.
+"""Signature -> plain description of the config keys that a component, or a tool's options, has.
 
-The parameters of a component *are* its config keys: names, types and defaults are read from ``__init__`` and become
-a dataclass that OmegaConf validates, so a misspelt key or a word where a number belongs fails while the config is
-composed.
+The parameters of a component *are* its config keys: names, types, defaults and the sentence in the docstring are read
+from its signature. Descriptions are plain data, so the command line can keep them in a file and check a configuration
+without importing what it configures.
 """
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import inspect
+import itertools
+import re
+import textwrap
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Optional, Union
+from typing import Any, Literal, Union
 
-_PRIMITIVES = (bool, int, float, str)
+REQUIRED = "???"
+"""Default of a key that must be given; OmegaConf's own mark."""
+_PRIMITIVES = {bool: "bool", int: "int", float: "float", str: "str", Path: "str"}
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Key:
+    """One config key.
+
+    Args:
+        name: The parameter's name.
+        type: ``bool``, ``int``, ``float``, ``str``, ``any``, ``list[...]`` or ``dict[...]`` of these, ``component`` for
+            a `saunet.registry.Spec`, ``node`` for nested keys; with a trailing ``?`` where None is allowed too.
+        default: Plain data; `REQUIRED` where there is none.
+        help: What it does, in a sentence.
+        choices: The values allowed, where they are few.
+        annotation: The type as Python writes it.
+        node: The nested keys of type ``node``.
+    """
+
+    name: str
+    type: str
+    default: Any = REQUIRED
+    help: str = ""
+    choices: tuple[Any, ...] = ()
+    annotation: str = ""
+    node: Node | None = None
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Node:
+    """The config keys of a class or function.
+
+    Args:
+        name: The class's name.
+        path: What to build, the config's ``_target_``; None for a tool's options.
+        summary: First line of the docstring.
+        keys: The keys in order.
+        partial: Whether parameters are missing that the caller supplies.
+    """
+
+    name: str
+    path: str | None
+    summary: str
+    keys: tuple[Key, ...]
+    partial: bool = False
+
+    def key(self, dotted: str) -> Key | None:
+        """Return the key ``a.b.c`` below this node, or None."""
+        first, _, rest = dotted.partition(".")
+        found = next((key for key in self.keys if key.name == first), None)
+        if not rest or found is None:
+            return found
+        return found.node.key(rest) if found.node else None
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> Node:
+        """Read what ``dataclasses.asdict`` wrote."""
+        keys = [
+            Key(**{**key, "choices": tuple(key["choices"]), "node": key["node"] and cls.from_plain(key["node"])})
+            for key in plain["keys"]
+        ]
+        return cls(**{**plain, "keys": tuple(keys)})
 
 
 def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
@@ -37,51 +103,74 @@ def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     return found
 
 
+def summary(target: Callable[..., Any]) -> str:
+    """Return the first line of a docstring."""
+    return (inspect.getdoc(target) or "").partition("\n")[0]
+
+
 def node(
     target: Callable[..., Any],
     preset: Mapping[str, Any] | None = None,
     late: Sequence[str] = (),
-    root: str | None = None,
-) -> type:
-    """Build the dataclass that stands for ``target`` in a config.
+    path: str | None = "",
+) -> Node:
+    """Describe the config keys of ``target``.
 
     Args:
         target: A class or function with an annotated signature.
         preset: Defaults that differ from the signature's.
-        late: Parameters that the caller gives at run time; they leave the schema, and the node is partial.
-        root: Import path to store as ``_target_``; the target's own by default.
-
-    Returns:
-        A dataclass type whose fields are ``_target_``, ``_convert_``, ``_partial_`` (with ``late``) and the parameters.
+        late: Parameters that the caller gives at run time; they are no keys, and the node is partial.
+        path: Import path to build from; the target's own by default, None for options, which are not built by path.
     """
     preset = dict(preset or {})
-    fields: list[tuple[str, Any, Any]] = [
-        ("_target_", str, dataclasses.field(default=root or f"{target.__module__}.{target.__qualname__}")),
-        ("_convert_", str, dataclasses.field(default="all")),
-    ]
-    if late:
-        fields.append(("_partial_", bool, dataclasses.field(default=True)))
+    said = _sentences(target)
+    fields = getattr(target, "__dataclass_fields__", {})
+    hidden = {name for name, field in fields.items() if not field.metadata.get("cli", True)}
+    keys = []
     for name, parameter in parameters(target).items():
-        if name in late:
+        if name in late or name in hidden:
             continue
+        default = _plain(preset.get(name, _default(target, parameter)))
         nested = _component(parameter.annotation)
+        kind, choices = _type(parameter.annotation)
         if nested is not None and name not in preset:
-            made = node(nested)
-            fields.append((name, made, dataclasses.field(default_factory=made)))
-            continue
-        default = preset.get(name, parameter.default)
-        fields.append((name, _config_type(parameter.annotation), _field(default)))
-    return dataclasses.make_dataclass(target.__qualname__, fields)
+            inner = node(nested, path=None if path is None else "")
+            keys.append(Key(name, "node", None, said.get(name, ""), node=inner))
+        else:
+            shown = inspect.formatannotation(parameter.annotation)
+            shown = re.sub(r"\b(typing|collections\.abc|pathlib)\.", "", shown)
+            keys.append(Key(name, kind, default, said.get(name, ""), choices, shown))
+    own = f"{target.__module__}.{target.__qualname__}" if path == "" else path
+    return Node(target.__qualname__, own, summary(target), tuple(keys), bool(late))
+
+
+def _default(target: Callable[..., Any], parameter: inspect.Parameter) -> Any:
+    field = getattr(target, "__dataclass_fields__", {}).get(parameter.name)
+    if field is not None and field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return REQUIRED if parameter.default is inspect.Parameter.empty else parameter.default
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, str | int | float | bool | None) else None
 
 
 def _component(annotation: Any) -> type | None:
-    """Return the class of a nested component (``Term`` or ``Term | None``), None for plain values."""
+    """Return the class of a nested component or nested options, None for plain values."""
     plain = _strip_optional(annotation)
-    if not inspect.isclass(plain) or plain in (*_PRIMITIVES, Path, Any, type(None)) or typing.get_origin(plain):
+    if not inspect.isclass(plain) or plain in (*_PRIMITIVES, Any, type(None)) or typing.get_origin(plain):
         return None
-    if plain.__module__ in ("builtins", "collections.abc", "typing"):
-        return None
-    return plain
+    return None if plain.__module__ in ("builtins", "collections.abc", "typing") or _is_spec(plain) else plain
+
+
+def _is_spec(annotation: Any) -> bool:
+    return getattr(annotation, "__name__", "") == "Spec" and annotation.__module__ == "saunet.registry"
 
 
 def _strip_optional(annotation: Any) -> Any:
@@ -92,37 +181,35 @@ def _strip_optional(annotation: Any) -> Any:
     return annotation
 
 
-def _config_type(annotation: Any) -> Any:
-    """Translate a Python annotation to the nearest type that OmegaConf checks."""
-    if annotation in _PRIMITIVES or annotation is Any:
-        return annotation
-    if annotation is Path:
-        return str
+def _type(annotation: Any) -> tuple[str, tuple[Any, ...]]:
+    """Return the name of a type as in `Key.type`, and the values allowed."""
+    if annotation in _PRIMITIVES:
+        return _PRIMITIVES[annotation], ()
+    if _is_spec(annotation):
+        return "component", ()
     plain = _strip_optional(annotation)
     if plain is not annotation:
-        inner = _config_type(plain)
-        return Any if inner is Any else Optional[inner]  # noqa: UP045 (OmegaConf wants the typing form)
+        inner, choices = _type(plain)
+        return (inner if inner == "any" else f"{inner}?"), choices
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Literal:
         kinds = {type(a) for a in arguments}
-        return kinds.pop() if len(kinds) == 1 else Any
-    if origin in (list, tuple, Sequence):
-        items = {_config_type(a) for a in arguments if a is not Ellipsis}
-        item = items.pop() if len(items) == 1 else Any
-        return list[item]  # type: ignore[valid-type]
-    if origin in (dict, Mapping):
-        value = _config_type(arguments[1])
-        return dict[str, value]  # type: ignore[valid-type]
-    return Any
+        return (_PRIMITIVES[kinds.pop()] if len(kinds) == 1 else "any"), arguments
+    if origin in (list, tuple, Sequence) or origin in (dict, Mapping):
+        values = {_type(a)[0] for a in arguments[origin in (dict, Mapping) :] if a is not Ellipsis}
+        return f"{'dict' if origin in (dict, Mapping) else 'list'}[{values.pop() if len(values) == 1 else 'any'}]", ()
+    return "any", ()
 
 
-def _field(default: Any) -> Any:
-    if default is inspect.Parameter.empty:
-        default = "???"  # OmegaConf's mark of a mandatory value
-    if isinstance(default, tuple):
-        default = list(default)
-    if isinstance(default, Path):
-        default = str(default)
-    if isinstance(default, list | dict | Mapping):
-        return dataclasses.field(default_factory=lambda: default.copy())  # type: ignore[union-attr]
-    return dataclasses.field(default=default)
+def _sentences(target: Callable[..., Any]) -> dict[str, str]:
+    """Return what is said of each parameter, in one line each: in ``Args:``, or in the string below a field."""
+    text = inspect.getdoc(target) or ""
+    section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.DOTALL | re.MULTILINE)
+    pieces = re.split(r"^    (\w+): ", section[1], flags=re.MULTILINE)[1:] if section else []
+    said = dict(zip(pieces[::2], pieces[1::2], strict=True))
+    if dataclasses.is_dataclass(target):
+        body = ast.parse(textwrap.dedent(inspect.getsource(target))).body[0].body  # type: ignore[attr-defined]
+        for field, below in itertools.pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(below, ast.Expr):
+                said[field.target.id] = str(ast.literal_eval(below.value))
+    return {name: " ".join(each.split()).replace("``", "") for name, each in said.items()}

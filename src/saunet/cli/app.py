@@ -1,0 +1,300 @@
+"""The command ``saunet``: which tools there are, and the way from a command line to a tool's function.
+
+A tool is a dataclass of options and a function that takes it, both in the room that owns the tool. Hydra composes the
+keys, they become the options once, the function is called, and what it returns is printed.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+from saunet import __version__, plugins
+from saunet.errors import ConfigError, SaunetError, suggest
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from saunet.cli.compose import Composed
+    from saunet.cli.table import Table
+
+
+@dataclass(frozen=True)
+class Tool:
+    """One tool of the command line.
+
+    Args:
+        summary: What it does, in a line.
+        options: Its options as ``module:Class``; empty for a tool with a command line of its own.
+        function: What is called with them, as ``module:function``.
+        examples: Command lines without ``saunet``.
+        positional: The key that plain words stand for; a trailing ``*`` takes several.
+        aliases: Short form -> key.
+    """
+
+    summary: str
+    options: str = ""
+    function: str = ""
+    examples: Sequence[str] = ()
+    positional: str | None = None
+    aliases: dict[str, str] = field(default_factory=dict)
+
+
+TOOLS: dict[str, Tool] = {
+    "train": Tool(
+        "train a depth network on driving video",
+        function="saunet.cli.train:main",
+        examples=("train experiment=selfsup data=kitti data.root=/data/kitti/raw",),
+    ),
+    "predict": Tool(
+        "depth of an image, a folder, a video or a camera, as pictures, points and videos",
+        function="saunet.cli.predict:main",
+        examples=("predict checkpoint=last.ckpt input=road.png output=out",),
+    ),
+    "evaluate": Tool(
+        "score a checkpoint, or predictions made elsewhere",
+        function="saunet.cli.evaluate:main",
+        examples=("evaluate checkpoint=last.ckpt data=kitti data.root=/data/kitti/raw",),
+    ),
+    "odometry": Tool(
+        "the camera's path through whole sequences, with its errors",
+        function="saunet.cli.odometry:main",
+        examples=("odometry checkpoint=last.ckpt data.root=/data/kitti/odometry",),
+    ),
+    "export": Tool(
+        "write a checkpoint as files to deploy or share, each checked against the network",
+        function="saunet.cli.export:main",
+        examples=("export checkpoint=last.ckpt output=exported",),
+    ),
+    "report": Tool(
+        "one page of tables, curves and pictures from finished runs; how runs differ",
+        function="saunet.cli.report:main",
+        examples=("report outputs/train",),
+    ),
+    "benchmark": Tool(
+        "parameters, FLOPs, time and memory of networks",
+        function="saunet.cli.benchmark:main",
+        examples=("benchmark models=[sau_net,street]",),
+    ),
+    "doctor": Tool(
+        "look at a data set before hours of training",
+        function="saunet.cli.doctor:main",
+        examples=("doctor data=kitti data.root=/data/kitti/raw",),
+    ),
+    "calibrate": Tool(
+        "make camera.yaml from a video or pictures of a board",
+        function="saunet.cli.calibrate:main",
+        examples=("calibrate print_board=board.png", "calibrate board.mp4 columns=10 rows=7 square=0.025"),
+    ),
+    "prepare": Tool(
+        "do once before training: dense depth, a teacher's depth, smaller copies of images",
+        function="saunet.cli.prepare:main",
+        examples=("prepare densify root=/data/kitti/raw",),
+    ),
+    "components": Tool(
+        "list every registered component with its keys",
+        function="saunet.cli.components:main",
+        examples=("components encoder",),
+    ),
+    "demo": Tool(
+        "the README's demo: train on rendered video, evaluate, draw",
+        function="saunet.cli.demo:main",
+        examples=("demo",),
+    ),
+}
+"""Every tool by name, in the order of ``saunet --help``."""
+
+
+@runtime_checkable
+class Partial(Protocol):
+    """A result of which some parts failed, each said in one sentence."""
+
+    @property
+    def failures(self) -> Sequence[str]:
+        """One sentence for each part that failed."""
+
+
+@runtime_checkable
+class Graded(Protocol):
+    """A result that decides the exit code."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all is well."""
+
+
+@runtime_checkable
+class Costed(Protocol):
+    """A result with a number that a search over sweeps minimizes."""
+
+    @property
+    def cost(self) -> float | None:
+        """The number; None if there is none."""
+
+
+def config_dir() -> Path:
+    """Return the folder of the YAML files: inside the installed package, or ``conf/`` of a source checkout.
+
+    Raises:
+        ConfigError: if neither exists (a broken installation).
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "conf", package.parents[1] / "conf"):
+        if (folder / "train.yaml").is_file():
+            return folder
+    raise ConfigError(f"no configuration files beside {package}; reinstall saunet")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of ``saunet``.
+
+    What a user can mend ends in one sentence and exit code 1; only a defect of the program shows a traceback.
+    ``HYDRA_FULL_ERROR=1`` shows it always.
+    """
+    given = list(sys.argv[1:] if argv is None else argv)
+    tool, *rest = given or ["--help"]
+    if tool in ("-h", "--help", "help"):
+        print(overview())
+    elif tool in ("-V", "--version", "version"):
+        print(f"saunet {__version__}")
+    elif tool in TOOLS:
+        run(tool, rest)
+    else:
+        hint = suggest(tool, TOOLS) or f"; the tools are {', '.join(TOOLS)}"
+        sys.exit(f"saunet: the first word is a tool, not '{tool}'{hint}")
+
+
+def overview() -> str:
+    """Return what ``saunet --help`` prints."""
+    width = max(map(len, TOOLS))
+    lines = [f"saunet {__version__}: self-supervised monocular depth", "", "usage: saunet TOOL [KEY=VALUE ...]", ""]
+    for name, tool in TOOLS.items():
+        lines += [f"  {name:{width}}  {tool.summary}", f"  {'':{width}}  $ saunet {tool.examples[0]}"]
+    return "\n".join([*lines, "", "`saunet TOOL --help` lists a tool's keys; --completion bash|zsh|fish sets up Tab."])
+
+
+def table() -> Table:
+    """Return the keys of all tools and components."""
+    from saunet.cli.table import read
+
+    return read({name: tool.options for name, tool in TOOLS.items() if tool.options})
+
+
+def run(name: str, argv: Sequence[str]) -> None:
+    """Run a tool with the words of a command line.
+
+    Raises:
+        SystemExit: with the exit code, unless all went well.
+    """
+    try:
+        code = _run(name, argv)
+    except KeyboardInterrupt:
+        code = _say(name, "interrupted", 130)
+    except Exception as error:
+        from saunet.cli.errors import sentence
+
+        # A process that DDP started inherits the variable.
+        debug = os.environ.get("HYDRA_FULL_ERROR") == "1" and "LOCAL_RANK" not in os.environ
+        said = None if debug else sentence(error, None if isinstance(error, SaunetError) else table())
+        if said is None:
+            raise
+        code = _say(name, said, 1)
+    if code:
+        raise SystemExit(code)
+
+
+def _run(name: str, argv: Sequence[str]) -> int:
+    from saunet.cli import compose, words
+
+    tool, conf = TOOLS[name], config_dir()
+    if not tool.options:
+        from saunet.cli.table import imported
+
+        sys.argv[1:] = argv  # it reads them itself
+        imported(tool.function)()
+        return 0
+    plugins.load(words.named(argv))
+    keys = table()
+    line = words.overrides(argv, name, keys, tool.positional, tool.aliases, conf)
+    flags = line.flags
+    if flags.help:
+        from saunet.cli.help import tool_help
+
+        print(tool_help(name, tool, keys, words.choices(line.overrides)))
+        return 0
+    config, overrides = flags.config_name or name, list(line.overrides)
+    with compose.hydra(name, keys, conf, flags.config_dir) as hydra:
+        if flags.cfg:
+            hydra.show_cfg(config, overrides, flags.cfg, flags.package, flags.resolve)
+            return 0
+        if flags.info:
+            hydra.show_info(flags.info, config, overrides)
+            return 0
+        composed = None if flags.multirun else compose.single(hydra, config, overrides)
+        if composed is None:
+            from saunet.cli.sweeps import sweep
+
+            return sweep(hydra, config, [*overrides, "hydra.mode=MULTIRUN"], functools.partial(job, name))
+    # What starts further processes runs this command again, with the same folder.
+    sys.argv[1:] = [name, *line.again, f"hydra.run.dir='{composed.folder}'"]
+    return call(name, composed, keys)[0]
+
+
+def call(name: str, composed: Composed, keys: Table) -> tuple[int, object]:
+    """Call a tool's function and print what it returns.
+
+    Returns:
+        The exit code, and the result.
+    """
+    from saunet.cli import compose
+    from saunet.cli.table import imported
+
+    tool = TOOLS[name]
+    options = compose.options(imported(tool.options), composed, keys)
+    result = imported(tool.function)(options)
+    said = "" if result is None else str(result)
+    if said:
+        print(said)
+    if isinstance(result, Partial):
+        for failure in result.failures:
+            print(f"saunet {name}: {failure}", file=sys.stderr)
+    return (result.exit_code if isinstance(result, Graded) else 0), result
+
+
+def job(name: str, cfg: DictConfig) -> object:
+    """Do one job of a sweep, perhaps in another process; what goes wrong is said at once and ends this job only.
+
+    Returns:
+        What a search minimizes, where the result has a ``cost``.
+    """
+    from hydra.core.hydra_config import HydraConfig
+
+    from saunet.cli import compose
+    from saunet.cli.errors import sentence
+    from saunet.cli.sweeps import check_folder
+
+    hydra = HydraConfig.get()
+    try:
+        plugins.load(cfg.plugins)
+        keys = table()
+        composed = compose.of_job(cfg, hydra)
+        if "output_dir" in composed.config:
+            check_folder(composed.config["output_dir"], composed.folder)
+        code, result = call(name, composed, keys)
+        if code:
+            raise ConfigError("some of it failed")
+    except Exception as error:
+        reason = sentence(error) or f"{type(error).__name__}: {error}"
+        print(f"saunet {name}: job {hydra.job.num} ({hydra.job.override_dirname}) failed: {reason}", file=sys.stderr)
+        raise
+    return result.cost if isinstance(result, Costed) else None
+
+
+def _say(name: str, message: str, code: int) -> int:
+    print(f"saunet {name}: {message}", file=sys.stderr)
+    return code

@@ -1,0 +1,82 @@
+"""What went wrong, in one sentence, where the user can mend it."""
+
+from __future__ import annotations
+
+import re
+
+from saunet.cli.table import Table
+from saunet.errors import SaunetError, suggest
+
+HIDDEN = ("base", "lightning")
+"""Members of config groups that others build on and nobody chooses."""
+
+
+def sentence(error: BaseException, table: Table | None = None) -> str | None:
+    """Return one sentence; None for a defect of the program.
+
+    Args:
+        error: What was raised.
+        table: Config keys, for the names that are allowed.
+    """
+    cause = error.__cause__
+    text = f"{error}\n{cause or ''}"
+    if isinstance(error, SaunetError):
+        return str(error)
+    if type(error).__name__ == "OutOfMemoryError":  # torch's, which is not imported for its name
+        return "the GPU's memory is too small for this; lower the batch size (in training data.batch_size) or the size"
+    spawned = re.search(r"^saunet\.errors\.\w+: (.*)", str(error), re.MULTILINE)
+    if spawned:  # raised in a process that was spawned: only its traceback's text arrives here
+        return spawned[1]
+    for each in (error, cause):
+        if type(each).__name__ == "MisconfigurationException":  # Lightning's word for a user's error
+            return _line(str(each))
+    missing = re.search(r"\b(wandb|mlflow)\b", text) if isinstance(error, ModuleNotFoundError) else None
+    if missing:
+        return f"logger={missing[1]} needs a package that is not installed; run `pip install 'saunet[track]'`"
+    if type(error).__name__ == "ProcessExitedException":  # a process that was spawned is gone
+        return f"{_line(str(error))}, so the run ends; resume with resume= and the run's last.ckpt"
+    room = type(error).__module__.partition(".")[0]
+    if room not in ("hydra", "omegaconf"):
+        if isinstance(error, OSError):
+            return f"cannot use {error.filename or 'a file'}: {error.strerror or error}; check the path and its rights"
+        return None
+    return _of_hydra(text, table)
+
+
+def _of_hydra(text: str, table: Table | None) -> str:
+    if "Config group override must be a string or a list" in text:
+        return "a group of the config cannot be null; choose logger=none, or set single members to null"
+    wanted = re.search(r"Could not find '([^']+)'", text)
+    listed = re.search(r"Available options in '([^']+)':\n(.*?)(?=\n\S|\Z)", text, re.DOTALL)
+    if wanted and listed:
+        options = [option for option in listed[2].split() if option not in HIDDEN]
+        name = wanted[1].rpartition("/")[2]
+        return f"unknown {listed[1]} '{name}'{suggest(name, options) or ';'} available: {', '.join(options)}"
+    ambiguous = re.search(r"Ambiguous value for argument '([^=]+)=(.*)'", text)
+    if ambiguous:
+        key, value = ambiguous.groups()
+        return f"{key}={value} has several values; add -m to run once for each, or write a list: {key}=[{value}]"
+    full_key = re.search(r"full_key: (\S+)", text)
+    unknown = re.search(r"Key '([\w-]+)' (?:is )?not in '(\w+)'", text)
+    if unknown:
+        node = table.by_name(unknown[2]) if table else None
+        allowed = [key.name for key in node.keys] if node else []
+        key = full_key[1] if full_key else unknown[1]
+        said = suggest(unknown[1], allowed).replace(f"'{unknown[1]}'", "")
+        return f"unknown key '{key}'{said or ';'} allowed: {', '.join(allowed)}" if allowed else f"unknown key '{key}'"
+    there = re.search(r"Could not append to config\. An item is already at '([^']+)'", text)
+    if there:
+        return f"+{there[1]}=... adds a key and there is one already; leave out the plus sign: {there[1]}=..."
+    typed = re.search(r"[Ee]rror parsing override '(.+?)'$", text, re.MULTILINE)
+    if typed:
+        given = typed[1]
+        key, _, value = given.partition("=")
+        return f"{given} cannot be read; put the value in quotes: '{key}=\"{value}\"'"
+    wrong = re.search(r"Value '.*' of type .*|Cannot (?:assign|convert) .*|Invalid value .*", text)
+    if wrong and full_key:
+        return f"{full_key[1]}: {wrong[0][0].lower()}{wrong[0][1:]}"
+    return _line(text)
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
