@@ -191,6 +191,10 @@ def _type(annotation: Any) -> tuple[str, tuple[Any, ...]]:
     if plain is not annotation:
         inner, choices = _type(plain)
         return (inner if inner == "any" else f"{inner}?"), choices
+    if typing.get_origin(annotation) in (Union, types.UnionType):
+        kinds = {_type(each)[0] for each in typing.get_args(annotation) if each is not type(None)}
+        if len(kinds) == 1:  # such as str | Path
+            return kinds.pop() + ("?" if type(None) in typing.get_args(annotation) else ""), ()
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Literal:
         kinds = {type(a) for a in arguments}

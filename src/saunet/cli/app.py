@@ -35,6 +35,8 @@ class Tool:
         examples: Command lines without ``saunet``.
         positional: The key that plain words stand for; a trailing ``*`` takes several.
         aliases: Short form -> key.
+        recorded: Whether the function is also given ``choices`` and ``overrides`` for the record of a run, and
+            ``describe``, which puts an error into one sentence.
     """
 
     summary: str
@@ -43,6 +45,7 @@ class Tool:
     examples: Sequence[str] = ()
     positional: str | None = None
     aliases: dict[str, str] = field(default_factory=dict)
+    recorded: bool = False
 
 
 TOOLS: dict[str, Tool] = {
@@ -117,6 +120,14 @@ class Partial(Protocol):
     @property
     def failures(self) -> Sequence[str]:
         """One sentence for each part that failed."""
+
+
+@runtime_checkable
+class Shown(Protocol):
+    """A result that prints itself; others are printed as text."""
+
+    def show(self) -> None:
+        """Print tables in colors and at the terminal's width."""
 
 
 @runtime_checkable
@@ -252,14 +263,17 @@ def call(name: str, composed: Composed, keys: Table) -> tuple[int, object]:
         The exit code, and the result.
     """
     from saunet.cli import compose
+    from saunet.cli.errors import sentence
     from saunet.cli.table import imported
 
     tool = TOOLS[name]
     options = compose.options(imported(tool.options), composed, keys)
-    result = imported(tool.function)(options)
-    said = "" if result is None else str(result)
-    if said:
-        print(said)
+    record = {"choices": composed.choices, "overrides": composed.overrides, "describe": sentence}
+    result = imported(tool.function)(options, **(record if tool.recorded else {}))
+    if isinstance(result, Shown):
+        result.show()
+    elif result is not None:
+        print(result)
     if isinstance(result, Partial):
         for failure in result.failures:
             print(f"saunet {name}: {failure}", file=sys.stderr)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Optional, TypeVar, Union, cast
@@ -50,7 +50,9 @@ def hydra(tool: str, table: Table, conf: Path, extra: str | None = None) -> Iter
     """
     store = ConfigStore.instance()
     root = table.tools[tool]
-    store.store(name=f"{tool}_schema", node=structured(dataclasses.replace(root, keys=(*root.keys, words.PLUGINS))))
+    # A group's members bring the types of its keys.
+    keys = [dataclasses.replace(key, type="any") if key.name in table.library else key for key in root.keys]
+    store.store(name=f"{tool}_schema", node=structured(dataclasses.replace(root, keys=(*keys, words.PLUGINS))))
     for group, nodes in table.groups().items():
         for name, node in nodes.items():
             store.store(group=group, name=name, node=structured(node))
@@ -179,38 +181,37 @@ def options(cls: Callable[..., T], composed: Composed, table: Table) -> T:
     """
     given = {key: value for key, value in composed.config.items() if key != words.PLUGINS.name}
     _check(given, "", table)
-    return _build(cls, given, composed, "")
+    return _build(cls, given, composed, table, "")
 
 
-def _build(cls: Callable[..., T], given: Mapping[str, object], composed: Composed, prefix: str) -> T:
+def _build(cls: Callable[..., T], given: Mapping[str, object], composed: Composed, table: Table, prefix: str) -> T:
     hints = typing.get_type_hints(cls)
     fields = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]  # a dataclass
     for key in given:
         if key not in fields:
             raise ConfigError(words.nearest(f"{prefix}{key}", [f"{prefix}{name}" for name in fields]))
-    made = {key: _value(hints[key], value, composed, f"{prefix}{key}") for key, value in given.items()}
+    made = {key: _value(hints[key], value, composed, table, f"{prefix}{key}") for key, value in given.items()}
     return cls(**made)
 
 
-def _value(annotation: object, value: object, composed: Composed, key: str) -> object:
+def _value(annotation: object, value: object, composed: Composed, table: Table, key: str) -> object:
     if value is None:
         return None
     if typing.get_origin(annotation) in (Union, types.UnionType):
         for each in typing.get_args(annotation):
-            if each is Spec or dataclasses.is_dataclass(each) or typing.get_origin(each) is tuple:
-                return _value(each, value, composed, key)
+            if each is Spec or dataclasses.is_dataclass(each) or typing.get_origin(each) in (tuple, Sequence, Mapping):
+                return _value(each, value, composed, table, key)
     if annotation is Spec:
         assert isinstance(value, Mapping)
         return Spec(value, composed.choices.get(key.replace(".", "/")))
     if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
         assert isinstance(value, Mapping)
-        return _build(annotation, value, composed, f"{key}.")
-    if isinstance(value, Mapping):
-        items = (typing.get_args(annotation) or (str, object))[-1]
-        return {str(name): _value(items, each, composed, f"{key}.{name}") for name, each in value.items()}
+        return _build(annotation, value, composed, table, f"{key}.")
+    if isinstance(value, Mapping) and key in table.library:  # a config group of arguments
+        return {name: each for name, each in value.items() if not str(name).startswith("_")}
     if annotation is Path:
         return Path(str(value))
-    if isinstance(value, list) and typing.get_origin(annotation) is not list:
+    if isinstance(value, list) and typing.get_origin(annotation) in (tuple, Sequence):
         return tuple(value)
     return value
 

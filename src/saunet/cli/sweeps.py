@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -13,13 +13,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from saunet.cli.errors import sentence
 from saunet.errors import ConfigError
-from saunet.io.atomic import write_json
-from saunet.runs import run_record
-
-FILE = "sweep.json"
-"""In a sweep's folder: the overrides of every job that it was to have."""
+from saunet.runs.folder import FILE
+from saunet.runs.sweep import PLAN, summary, write_plan
 
 
 def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[DictConfig], object]) -> int:
@@ -39,22 +35,29 @@ def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[DictCon
     folder = Path(str(OmegaConf.select(cfg, "hydra.sweep.dir"))).absolute()
     planned = _planned(cfg)
     HydraConfig.instance().cfg = None
+    if planned:
+        write_plan(folder, planned)
     failed: Exception | None = None
-    reason = ""
+    code = 1
     try:
         hydra.multirun(name, task, overrides)
     except KeyboardInterrupt:
-        reason = "interrupted"
+        code = 130
     except Exception as error:
-        failed, reason = error, sentence(error) or ""
-    started = [path.parent.parent for path in folder.glob("**/.hydra/overrides.yaml")]
-    if not started and failed:
+        failed = error
+    if not any(folder.glob("**/.hydra")) and failed:
+        for file in (PLAN, "multirun.yaml"):
+            (folder / file).unlink(missing_ok=True)
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
         raise failed
-    if planned and started:
-        write_json(folder / FILE, {"jobs": planned})
-    text, finished = summary(folder, started, planned, not reason)
+    if any(folder.glob(f"**/{FILE}")):
+        text, finished = summary(folder, planned)
+    else:  # of a tool that keeps no record of a run
+        finished = failed is None and code == 1
+        text = f"sweep: {f'{len(planned)} jobs finished' if finished else 'not all jobs finished'}; results: {folder}"
     print(text, file=sys.stdout if finished else sys.stderr)
-    return 0 if finished else 130 if reason == "interrupted" else 1
+    return 0 if finished else code
 
 
 def _planned(cfg: DictConfig) -> list[list[str]]:
@@ -81,42 +84,3 @@ def check_folder(output_dir: object, job: str) -> None:
             f"output_dir is '{output_dir}' and the jobs of a sweep must not share a folder; "
             f"leave it out and set hydra.sweep.dir={output_dir}, below which each job gets its own"
         )
-
-
-def summary(folder: Path, started: Sequence[Path], planned: Sequence[Sequence[str]], well: bool) -> tuple[str, bool]:
-    """Say how the jobs of a sweep ended, one line for each that did not finish; jobs that vanished are marked failed.
-
-    Args:
-        folder: The sweep's folder.
-        started: Folders of the jobs that began.
-        planned: The overrides of every job, where known.
-        well: Whether the sweep ended without an error; all that is known of tools that keep no record of a run.
-
-    Returns:
-        The text, and whether there were jobs and all of them finished.
-    """
-    recorded = any((job / run_record.FILE).is_file() for job in started)
-    lines, finished = [], 0
-    for job in sorted(started, key=_in_order):
-        run_record.mark_lost(job)
-        content = run_record.read(job) or {"status": "finished" if well and not recorded else "failed"}
-        if content.get("status") == "finished":
-            finished += 1
-        elif recorded:
-            reason = content.get("error") or "its record cannot be read"
-            said = ", ".join(_overrides(job))
-            lines.append(f"  {job.relative_to(folder)} ({said}) {content.get('status', 'failed')}: {reason}")
-    before = [_overrides(job) for job in started]
-    waiting = [list(job) for job in planned if list(job) not in before]
-    lines += [f"  ({', '.join(job)}) not started" for job in waiting]
-    count = len(started) + len(waiting)
-    head = f"sweep: {finished} of {count} jobs finished; results: {folder}"
-    return "\n".join([head, *lines]), 0 < finished == count
-
-
-def _in_order(path: Path) -> tuple[int, str]:
-    return (int(path.name) if path.name.isdecimal() else -1, str(path))
-
-
-def _overrides(job: Path) -> list[str]:
-    return [str(each) for each in OmegaConf.load(job / ".hydra" / "overrides.yaml")]

@@ -8,9 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from saunet.runs.files import read_yaml
+from saunet.io.atomic import write_json
+from saunet.runs.files import read_mapping, read_yaml
 from saunet.runs.folder import FILE, Run, mark_lost, read
 
+PLAN = "sweep.json"
+"""In a sweep's folder: the jobs that it was to have."""
 RATIO = "α/β"
 """A column of its own where the weights of SAU-Net eq. (14) differ."""
 _UNKNOWN = "overrides unknown"
@@ -131,6 +134,17 @@ def _flatten(prefix: str, node: Any, found: dict[str, str]) -> None:
             _flatten(f"{path}.", value, found)
         else:
             found[path] = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def write_plan(folder: Path, jobs: Sequence[Sequence[str]]) -> None:
+    """Write down the overrides of every job that a sweep is to have."""
+    write_json(folder / PLAN, {"jobs": [list(job) for job in jobs]})
+
+
+def read_plan(folder: Path) -> list[list[str]] | None:
+    """Return what `write_plan` wrote; None where that cannot be told, as with sweepers that search."""
+    jobs = read_mapping(folder / PLAN).get("jobs")
+    return [list(map(str, job)) for job in jobs if isinstance(job, list)] if isinstance(jobs, list) else None
 
 
 def summary(folder: Path, planned: Sequence[Sequence[str]] | None = None) -> tuple[str, bool]:
