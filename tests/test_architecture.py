@@ -57,7 +57,7 @@ ALLOWED: dict[str, set[str]] = {
         "tools",
         "__version__",
     },
-    "tools": {"errors", "io", "tables", "data", "prediction", "published"},
+    "tools": {"errors", "registry", "io", "tables", "data", "prediction", "published"},
     "roots": set(),
     "config": {"errors", "registry", "schema", "roots", "training", "cli"},
 }

@@ -127,13 +127,15 @@ def require_matplotlib(what: str, without: str) -> None:
 
 
 def usable_device(name: str | torch.device) -> torch.device:
-    """Return the device of a name, having tried it.
+    """Return the device of a name, having tried it; ``auto`` is a GPU if there is one, else the CPU.
 
     Raises:
         ConfigError: if there is no such device, or it cannot hold a tensor.
     """
     import torch
 
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
         torch.zeros(1, device=device)

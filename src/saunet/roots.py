@@ -208,7 +208,7 @@ class OdometryConfig:
 
 @dataclass
 class PrepareConfig:
-    """Root of ``saunet-prepare``; which keys belong to which job: ``saunet.cli.prepare.KEYS``."""
+    """Root of ``saunet-prepare``; see `saunet.tools.prepare.tool.PrepareOptions`."""
 
     job: str = MISSING
     data: Any = None

@@ -18,6 +18,7 @@ from lightning import Callback, LightningModule, Trainer
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from saunet.data.drive import Drive
 from saunet.data.module import DepthDataModule
 from saunet.data.windows import Selection
 from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
@@ -31,8 +32,11 @@ from saunet.training.stopping import GracefulStop
 from saunet.types import DepthPyramid
 
 
-class Wall:
+class Wall(Drive):
     """A camera that drives towards a textured wall."""
+
+    name = ""
+    indices = range(0)
 
     def __init__(self, name: str, frames: int = 8, seed: int = 0) -> None:
         self.name = name

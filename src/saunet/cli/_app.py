@@ -156,10 +156,6 @@ def pick_device(name: str) -> str:
     Raises:
         ConfigError: if there is no such device.
     """
-    import torch
-
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
     return str(usable_device(name))
 
 

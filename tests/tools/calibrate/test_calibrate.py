@@ -11,7 +11,7 @@ from board_views import SIZE, K, views
 from saunet.data.camera_file import read_camera, write_camera
 from saunet.errors import ConfigError, DataError
 from saunet.tools.calibrate.boards import Board
-from saunet.tools.calibrate.calibrate import calibrate, check_picture
+from saunet.tools.calibrate.solve import check_picture, solve
 
 
 def save(folder, pictures):
@@ -22,7 +22,7 @@ def save(folder, pictures):
 
 
 def test_the_camera_of_a_synthetic_chessboard_is_recovered(tmp_path):
-    result = calibrate(save(tmp_path / "pictures", views(Board(), 14)), Board())
+    result = solve(save(tmp_path / "pictures", views(Board(), 14)), Board())
     np.testing.assert_allclose(result.camera.K[[0, 1], [0, 1]], K[[0, 1], [0, 1]], rtol=0.005)
     np.testing.assert_allclose(result.camera.K[:2, 2], K[:2, 2], rtol=0.005)
     assert result.camera.image_size == SIZE
@@ -46,7 +46,7 @@ def test_charuco_in_a_video_and_distortion(tmp_path):
     for picture in views(board, 12, distortion):
         writer.write(picture)
     writer.release()
-    result = calibrate(tmp_path / "board.avi", board)
+    result = solve(tmp_path / "board.avi", board)
     np.testing.assert_allclose(result.camera.K[[0, 1], [0, 1]], K[[0, 1], [0, 1]], rtol=0.01)
     assert result.camera.distortion[0] == pytest.approx(-0.25, abs=0.05)
     assert result.camera.fps is None  # that of this video; other recordings of the camera have their own
@@ -77,20 +77,20 @@ def test_a_fisheye_is_calibrated_on_the_command_line(tmp_path):
 def test_what_cannot_be_trusted_is_refused(tmp_path):
     pictures = views(Board(), 12)
     few = save(tmp_path / "few", [*pictures[:3], np.full_like(pictures[0], 99)])
-    with pytest.raises(DataError, match=r"found in 3 of 4 pictures of .*few, needed are 8; check columns and rows"):
-        calibrate(few, Board())
+    with pytest.raises(DataError, match=r"found in 3 of 4 pictures.*at least 8.*columns and rows"):
+        solve(few, Board())
     alike = save(tmp_path / "alike", views(Board(), 9, tilt=0.0))
     with pytest.raises(DataError, match=r"alike is not to be trusted: a focal length of .* too alike: tilt the board"):
-        calibrate(alike, Board())
+        solve(alike, Board())
     bent = save(tmp_path / "bent", [_bent(picture) for picture in pictures])
     with pytest.raises(DataError, match=r"the reprojection error is .* pixels and at most 0.5 is accepted"):
-        calibrate(bent, Board(), max_error=0.5)
+        solve(bent, Board(), max_error=0.5)
     mixed = save(tmp_path / "mixed", [pictures[0], pictures[1][:400]])
     with pytest.raises(DataError, match=r"mixes pictures of 640x480 and 640x400"):
-        calibrate(mixed, Board())
+        solve(mixed, Board())
     (tmp_path / "none").mkdir()
     with pytest.raises(DataError, match=r"no images in .*none"):
-        calibrate(tmp_path / "none", Board())
+        solve(tmp_path / "none", Board())
 
 
 def _bent(picture):

@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 from campus_tree import CAMERA, frames, make_clip, make_video
 from kitti_tree import make_drive, name
+from tiny import Wall
 
 from saunet.data import splits
 from saunet.data.image_cache import CacheSettings
 from saunet.data.manifest import read_manifest, write_manifest
+from saunet.data.module import DepthDataModule
+from saunet.data.windows import Selection
 from saunet.io.video import VideoReader
 from saunet.registry import datamodules
-from saunet.tools.doctor import diagnose, draw_sheet, manifest_of, survey
+from saunet.tools.doctor.findings import diagnose, manifest_of
+from saunet.tools.doctor.sheet import draw_sheet
+from saunet.tools.doctor.survey import survey
 from saunet.tools.prepare.cache import build_cache
 from saunet.tools.prepare.recordings import kitti_recordings
 
@@ -221,3 +226,22 @@ def test_reading_a_cache_is_measured_by_its_files_and_offered_where_there_is_one
         text = "\n".join(map(str, diagnose(found)))
         assert "a core reads 10 images a second" in text
         assert ("make a cache of small images once" in text) == offered
+
+
+class _TwoFolders(DepthDataModule):
+    """A module whose training and validation recordings are called the same."""
+
+    ground_truth = "exact"
+    protocol = "synthetic"
+
+    def select(self, split):
+        count = 8 if split == "train" else 4
+        return [Selection(Wall("clip", frames=count, seed=count), range(count))]
+
+
+def test_different_recordings_of_one_name_are_kept_apart(tmp_path):
+    found, findings, text = look(_TwoFolders(height=32, width=48, batch_size=2, workers=0), splits=["train", "val"])
+    assert {frame.drive for frame in found.frames} == {"clip", "clip (val)"}
+    assert len(found.frames) == found.known == 12
+    assert "error: 'clip' is the name of different recordings" in text
+    assert not manifest_of(found, findings, tmp_path / "m.json").leave_out

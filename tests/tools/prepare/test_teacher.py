@@ -6,10 +6,10 @@ import pytest
 from prepare_tree import name
 
 from saunet.data.depth_maps import DepthMaps
-from saunet.errors import ConfigError, DataError
+from saunet.errors import DataError
 from saunet.prediction.pipeline import ImagePredictor
 from saunet.tools.prepare.recordings import kitti_recordings
-from saunet.tools.prepare.teacher import FileTeacher, ModelTeacher, source_of, teach
+from saunet.tools.prepare.teacher import FileTeacher, ModelTeacher, teach
 
 
 class Brightness(ImagePredictor):
@@ -75,8 +75,6 @@ def test_unknown_pixels_stay_unknown(tree, tmp_path):
 
 def test_what_cannot_work_is_one_sentence(tree, tmp_path):
     recordings = kitti_recordings(tree, ["left"])
-    with pytest.raises(ConfigError, match=r"either checkpoint=.* or input="):
-        source_of(None, None, "depth", "cpu")
     with pytest.raises(DataError, match=r"no \.npy or \.png files below"):
         FileTeacher(tmp_path / "nowhere")
     (tmp_path / "one").mkdir()

@@ -30,18 +30,9 @@ class BoardView:
 
 
 class Board:
-    """A flat calibration board.
+    """A flat calibration board; see `CalibrateOptions` for the parameters.
 
-    Args:
-        kind: ``chessboard``, or ``charuco``: a chessboard with markers, which may be partly hidden.
-        columns: Squares from left to right.
-        rows: Squares from top to bottom.
-        square: Side of a square in meters; it decides nothing but the unit of the poses.
-        marker: Side of a ChArUco marker as a share of the square.
-        dictionary: Name of the ArUco dictionary of the markers.
-
-    Raises:
-        ConfigError: for a board that cannot be.
+    ``square`` decides nothing but the unit of the poses.
     """
 
     def __init__(

@@ -1,19 +1,21 @@
-"""From measurements to sentences: what is wrong or noteworthy, and what to do about it."""
+"""From measurements to sentences and a manifest: what is wrong, what to do, and which frames to leave out."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
+from saunet.data.manifest import UNREADABLE, Manifest
 from saunet.data.motion import SAME_PICTURE
 from saunet.data.static import MIN_FLOW
 from saunet.errors import UnreadableError
-from saunet.tools.doctor.survey import ABSENT, BANDS, Survey
+from saunet.tools.doctor.survey import ABSENT, BANDS, FrameFacts, Survey
 
 Level = Literal["error", "warning", "note"]
 
@@ -22,7 +24,7 @@ DARK, BRIGHT = 0.08, 0.92
 FLAT = 0.03
 """Contrast under which a frame shows nothing (fog on the lens, a wall, a cap)."""
 _STILL_BAND = 0.5
-"""A band that moves less than this share of the whole picture is part of the car."""
+"""A band that moves less than this fraction of the whole picture is part of the car."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Finding:
 def diagnose(survey: Survey) -> list[Finding]:
     """Return what there is to say about a data set, errors first."""
     rules: list[Callable[[Survey], Iterator[Finding]]] = [
-        *(_splits, _unreadable, _sizes, _cameras, _neighbors, _leak, _parallax),
+        *(_splits, _names, _unreadable, _sizes, _cameras, _neighbors, _leak, _parallax),
         *(_doubled, _static, _bonnet, _light, _truth, _speed),
     ]
     found = [finding for rule in rules for finding in rule(survey)]
@@ -67,6 +69,15 @@ def _splits(survey: Survey) -> Iterator[Finding]:
         )
     if count is not None and "val" not in survey.windows and "val" not in survey.problems:
         yield Finding("warning", "nothing is held out for validation", "set data.val_share or name clips or drives")
+
+
+def _names(survey: Survey) -> Iterator[Finding]:
+    for name in survey.ambiguous:
+        yield Finding(
+            "error",
+            f"'{name}' is the name of different recordings in different splits, so a manifest cannot tell them apart",
+            "give each recording a name of its own",
+        )
 
 
 def _unreadable(survey: Survey) -> Iterator[Finding]:
@@ -293,3 +304,38 @@ def _speed(survey: Survey) -> Iterator[Finding]:
             f"{'make a cache of small images once (saunet-prepare cache), ' if survey.cacheable else ''}"
             "use more data.workers or a faster disk",
         )
+
+
+def manifest_of(survey: Survey, findings: Sequence[Finding], path: str | Path) -> Manifest:
+    """Return what ``data.manifest=`` reads: each frame that was read and is of no use, under the first reason."""
+    leave_out: dict[str, dict[str, list[int]]] = {}
+    for frame in survey.frames:
+        reason = _reason(frame)
+        if reason and frame.drive in survey.numbering:
+            leave_out.setdefault(frame.drive, {}).setdefault(reason, []).append(frame.index)
+    facts: dict[str, Any] = {
+        "read": f"{survey.judged} of {survey.known} frames read; only these are judged",
+        "splits": {
+            split: {"samples": count, "left_out": survey.left_out[split], "sha256": survey.fingerprints[split]}
+            for split, count in survey.windows.items()
+        },
+        "findings": [{"level": each.level, "text": each.text, "fix": each.fix} for each in findings],
+    }
+    numbering = {drive: survey.numbering[drive] for drive in leave_out}
+    return Manifest(leave_out, numbering, facts, Path(path), survey.test_only & leave_out.keys())
+
+
+def _reason(frame: FrameFacts) -> str | None:
+    if frame.problem:
+        return UNREADABLE
+    if frame.brightness < DARK:
+        return "dark"
+    if frame.brightness > BRIGHT:
+        return "bright"
+    if frame.contrast < FLAT:
+        return "flat"
+    if frame.change is not None and frame.change < SAME_PICTURE:
+        return "doubled"
+    if frame.flow is not None and frame.flow < MIN_FLOW:
+        return "static"
+    return None

@@ -72,7 +72,7 @@ class TruthFacts:
     drive: str
     index: int
     known: float
-    """Share of the pixels."""
+    """Fraction of the pixels."""
     low: float
     middle: float
     high: float
@@ -108,6 +108,9 @@ class Survey:
     pictures: list[tuple[str, NDArray[np.uint8]]] = field(default_factory=list)
     """A few frames with their names, 320 wide."""
     numbering: dict[str, str] = field(default_factory=dict)
+    """Recording -> how its frames are numbered; without those of ambiguous names."""
+    ambiguous: list[str] = field(default_factory=list)
+    """Names that different recordings share."""
     step: int = 1
     """Offset of the neighbor that motion is measured against."""
     cacheable: bool = False
@@ -128,14 +131,7 @@ def survey(
     frames: int = 1000,
     advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> Survey:
-    """Look at a data module: set its splits up, and read frames of all drives, evenly spread.
-
-    Args:
-        data: What to look at.
-        splits: Which of ``train``, ``val`` and ``test``.
-        frames: Frames to read at most; 0 reads all.
-        advance: Called with the number of frames read and to read.
-    """
+    """Set a data module's splits up, and read ``frames`` frames at most (0: all) of all recordings, evenly spread."""
     cacheable = data.cacheable and data.copies is None
     found = Survey(step=min((abs(offset) for offset in data.offsets), default=1), cacheable=cacheable)
     datasets = dict(_set_up(data, splits, found))
@@ -143,13 +139,15 @@ def survey(
         found.shared_frames = len(_read_by(datasets["train"]) & _read_by(datasets["val"]))
     drives: dict[str, Drive] = {}
     wanted: dict[str, set[int]] = {}
-    for dataset in datasets.values():
+    for split, dataset in datasets.items():
+        labels = [_label(drive, split, drives) for drive in dataset.drives]
         for position, frame in dataset.windows:
-            drive = dataset.drives[position]
-            drives[drive.name] = drive
-            wanted.setdefault(drive.name, set()).update(frame + offset for offset in (0, *dataset.offsets))
-    for name in wanted:
-        found.numbering[name] = drives[name].numbering
+            drives[labels[position]] = dataset.drives[position]
+            wanted.setdefault(labels[position], set()).update(frame + offset for offset in (0, *dataset.offsets))
+    found.ambiguous = sorted({drives[label].name for label in wanted if drives[label].name != label})
+    for label in wanted:
+        if drives[label].name not in found.ambiguous:
+            found.numbering[label] = drives[label].numbering
     trained = {drive.name for split in ("train", "val") if split in datasets for drive in datasets[split].drives}
     found.test_only = frozenset(wanted.keys() - trained) if trained else frozenset()
     everything = [(name, frame) for name, numbers in wanted.items() for frame in sorted(numbers)]
@@ -157,7 +155,7 @@ def survey(
     found.known, found.judged = len(everything), len(plan)
     _read_frames(found, drives, plan, advance)
     for name in wanted:
-        _look_at_camera(found, drives[name], min(wanted[name]))
+        _look_at_camera(found, name, drives[name], min(wanted[name]))
     for split in ("test", "val"):
         if split in datasets and not found.truths:
             _read_truths(found, datasets[split])
@@ -183,6 +181,16 @@ def _set_up(data: DepthDataModule, splits: Sequence[str], found: Survey) -> Iter
                 reason = ABSENT if gone and reason == "missing" else reason
                 found.left_out[split][reason] = found.left_out[split].get(reason, 0) + count
         yield split, dataset
+
+
+def _label(drive: Drive, split: str, drives: Mapping[str, Drive]) -> str:
+    """Return a recording's name; with the split behind it if another recording is called so."""
+    known = drives.get(drive.name)
+    if known is None or not known.indices:
+        return drive.name
+    first = known.indices[0]
+    same = list(known.indices) == list(drive.indices) and known.path(first) == drive.path(first)
+    return drive.name if same else f"{drive.name} ({split})"
 
 
 def _read_by(dataset: WindowDataset) -> set[tuple[str, int]]:
@@ -224,7 +232,7 @@ def _read_frames(
             continue
         seconds = time.perf_counter() - start
         small = shrink(image)
-        found.frames.append(_facts(drive, index, image.shape[:2], seconds, small, before))
+        found.frames.append(_facts(drive, name, index, image.shape[:2], seconds, small, before))
         if place in shown:
             found.pictures.append((f"{name} {index}", small))
         last = (name, index, small)
@@ -233,6 +241,7 @@ def _read_frames(
 
 def _facts(
     drive: Drive,
+    name: str,
     index: int,
     size: tuple[int, ...],
     seconds: float,
@@ -246,7 +255,7 @@ def _facts(
         change = relative_change(before, small)
         bands = np.array([band.mean() for band in np.array_split(lengths, BANDS)], dtype=np.float64)
     return FrameFacts(
-        drive.name,
+        name,
         index,
         (size[0], size[1]),
         seconds,
@@ -267,15 +276,15 @@ def _file_bytes(drive: Drive, index: int) -> int | None:
         return None
 
 
-def _look_at_camera(found: Survey, drive: Drive, index: int) -> None:
-    sizes = Counter(frame.size for frame in found.readable() if frame.drive == drive.name)
+def _look_at_camera(found: Survey, name: str, drive: Drive, index: int) -> None:
+    sizes = Counter(frame.size for frame in found.readable() if frame.drive == name)
     try:
         K = np.asarray(drive.intrinsics(index), dtype=np.float64)
     except DataError as error:
         found.camera_problems.append(str(error))
         return
     if sizes:
-        found.cameras.append(CameraFacts(drive.name, K, sizes.most_common(1)[0][0], drive.fps, drive.camera_height))
+        found.cameras.append(CameraFacts(name, K, sizes.most_common(1)[0][0], drive.fps, drive.camera_height))
 
 
 def _read_truths(found: Survey, dataset: WindowDataset) -> None:

@@ -22,8 +22,7 @@ from saunet.data.image_cache import FRAMES, SETTINGS, CacheSettings, ImageCache
 from saunet.errors import DataError
 from saunet.io.atomic import write_bytes, write_json
 from saunet.io.images import resize
-from saunet.tools.prepare.cleanup import remove_partial
-from saunet.tools.prepare.pool import OnError, Work
+from saunet.tools.prepare.pool import OnError, Work, remove_partial
 
 Entry = tuple[int, str, tuple[int, int], list[int] | None]
 """Bytes and SHA-256 of a copy; (height, width) of its original, and the `_state` of the original's file."""
@@ -41,18 +40,15 @@ class CacheReport:
     """Of those written now: copies that were there and damaged, or made from an original that has changed."""
     failures: tuple[str, ...]
     """One sentence for each frame that was skipped because its original is broken."""
+    folder: Path
+
+    def __str__(self) -> str:
+        again = f"{self.replaced} in place of damaged or outdated ones"
+        return f"{self.made} copies made ({again}), {self.verified} verified: {self.folder}"
 
 
 def encode(image: np.ndarray, settings: CacheSettings) -> bytes:
-    """Return a frame at the cache's size as the bytes of a file.
-
-    Args:
-        image: h x w x 3, RGB.
-        settings: Size, format and quality.
-
-    Raises:
-        DataError: if this OpenCV lacks the format.
-    """
+    """Return an RGB frame, h x w x 3, at the cache's size as the bytes of a file."""
     small = cv2.cvtColor(resize(image, settings.height, settings.width), cv2.COLOR_RGB2BGR)
     flag = cv2.IMWRITE_JPEG_QUALITY if settings.format == "jpg" else cv2.IMWRITE_WEBP_QUALITY
     done, data = cv2.imencode(f".{settings.format}", small, [flag, settings.quality])
@@ -109,14 +105,7 @@ def build_cache(
     workers: int = 0,
     on_error: OnError = "raise",
 ) -> CacheReport:
-    """Make, complete or check a cache. The recordings are only read.
-
-    Args:
-        recordings: Recordings of any data set, and the frames of each.
-        folder: Of the cache; made if missing.
-        settings: Size, format and quality of the copies.
-        workers: Processes; 0 works in this one.
-        on_error: A broken original: ``raise`` stops and names it, ``skip`` goes on without the frame.
+    """Make, complete or check a cache of some frames of each recording; the recordings are only read.
 
     Raises:
         DataError: if the folder holds something else or a cache of another version or other settings, a frame is
@@ -146,9 +135,8 @@ def build_cache(
     for place, left in enumerate(waiting):
         if left and lists[place]:  # some of its frames are broken and skipped
             _finish(homes[place], recordings[place][0], known[place], lists[place])
-    return CacheReport(
-        counts["made"] + counts["replaced"], counts["verified"], counts["replaced"], tuple(work.failures)
-    )
+    made = counts["made"] + counts["replaced"]
+    return CacheReport(made, counts["verified"], counts["replaced"], tuple(work.failures), Path(folder))
 
 
 def _open(folder: Path, settings: CacheSettings) -> ImageCache:

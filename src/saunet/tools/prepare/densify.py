@@ -12,40 +12,22 @@ from numpy import ndarray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
 
-from saunet.data.depth_maps import DENSE_KINDS, DepthMaps
+from saunet.data.depth_maps import DepthMaps
 from saunet.data.kitti import KittiDrive
-from saunet.errors import ConfigError, DataError, one_of
+from saunet.errors import DataError
 from saunet.io.colormaps import depth_to_png16
 from saunet.io.images import resize, write_image
-from saunet.tools.prepare.cleanup import remove_partial
 from saunet.tools.prepare.colorization import colorize
-from saunet.tools.prepare.pool import OnError, Work
+from saunet.tools.prepare.pool import Done, OnError, Work, remove_partial
 from saunet.tools.prepare.recordings import Recording
 
 DenseKind = Literal["linear", "colorization"]
-
-
-@dataclass(frozen=True, slots=True)
-class Done:
-    """What a preparation did."""
-
-    made: int
-    """Frames worked on now."""
-    before: int
-    """Frames that were finished before."""
-    without: int
-    """Frames that lack what is needed, such as a scan."""
-    failures: tuple[str, ...]
-    """One sentence for each frame that was skipped because a file is broken."""
 
 
 def interpolate(depth: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
     """Return depth interpolated linearly over the Delaunay triangles of the known pixels; 0 outside their hull.
 
     Where fewer than three pixels are known, or all lie on one line, nothing is added.
-
-    Args:
-        depth: Meters, 0 where unknown.
     """
     rows, columns = np.nonzero(depth)
     try:
@@ -57,21 +39,8 @@ def interpolate(depth: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
 
 
 def densify_map(kind: str, image: UInt8[ndarray, "_ _ 3"], depth: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
-    """Return a dense map of a kind, at the size of ``depth``.
-
-    Args:
-        kind: ``linear`` or ``colorization``.
-        image: The frame; only ``colorization`` looks at it.
-        depth: Meters, 0 where unknown.
-
-    Raises:
-        ConfigError: for another kind.
-        DataError: if nothing is known.
-    """
-    one_of("kind", kind, DENSE_KINDS)
-    if kind == "linear":
-        return interpolate(depth)
-    return colorize(resize(image, *depth.shape), depth)
+    """Return a dense map of a kind at the size of ``depth`` (meters, 0 where unknown)."""
+    return interpolate(depth) if kind == "linear" else colorize(resize(image, *depth.shape), depth)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,23 +69,11 @@ def densify(
     workers: int = 0,
     on_error: OnError = "raise",
 ) -> Done:
-    """Write the dense maps of recordings; what is there already is left alone.
-
-    Args:
-        recordings: From `saunet.tools.prepare.recordings.kitti_recordings`.
-        kinds: ``linear``, ``colorization`` or both.
-        folder: Where the maps go; None: beside each recording.
-        workers: Processes; 0 works in this one.
-        on_error: A broken scan or image: ``raise`` stops and names it, ``skip`` goes on.
+    """Write the dense maps of recordings (``folder`` None: beside each); what is there already is left alone.
 
     Raises:
-        ConfigError: for an unknown kind, or none.
         DataError: if no frame has a scan, a file is broken, or there are maps that were made differently.
     """
-    if not kinds:
-        raise ConfigError(f"kinds is empty; name at least one of {', '.join(DENSE_KINDS)}")
-    for kind in kinds:
-        one_of("kinds", kind, DENSE_KINDS)
     maps = tuple(DepthMaps(kind, folder) for kind in dict.fromkeys(kinds))
     work: Work[tuple[int, int], None] = Work(_Densify(tuple(drive for drive, _ in recordings), maps), workers, on_error)
     items, total, before = [], 0, 0

@@ -9,12 +9,14 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
 import cv2
 import torch
 
-from saunet.errors import DataError, one_of, positive
+from saunet.errors import DataError
 from saunet.io.progress import bar
 
 Item = TypeVar("Item")
@@ -22,30 +24,46 @@ Result = TypeVar("Result")
 OnError = Literal["raise", "skip"]
 
 
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What a preparation of depth maps did."""
+
+    made: int
+    """Frames worked on now."""
+    before: int
+    """Frames that were finished before."""
+    without: int | None
+    """Frames that lack a scan; None where none is needed."""
+    failures: tuple[str, ...]
+    """One sentence for each frame that was skipped because a file is broken."""
+
+    def __str__(self) -> str:
+        scans = "" if self.without is None else f" {self.without} have no scan,"
+        return f"{self.made} frames made, {self.before} were there,{scans} {len(self.failures)} skipped"
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove the temporary files of writers that were killed (see `saunet.io.atomic.replacing`).
+
+    Only one run may write into a folder at a time.
+    """
+    if folder.is_dir():
+        for path in folder.glob(".*.partial*"):
+            path.unlink(missing_ok=True)
+
+
 class Work(Generic[Item, Result]):
-    """What to do with each item, sent to every process once; items themselves should be small.
+    """What to do with each item; the function is sent to every process once, so that items can be small.
 
-    Args:
-        function: Called with one item; must pickle.
-        workers: Processes; 0 works in this one.
-        on_error: A `DataError` of an item: ``raise`` it and stop, or ``skip`` the item and remember the sentence.
-
-    Raises:
-        ConfigError: if a parameter is out of range.
+    With ``on_error="skip"`` an item's `DataError` becomes a sentence in ``failures``. No workers: in this process.
     """
 
     def __init__(self, function: Callable[[Item], Result], workers: int = 0, on_error: OnError = "raise") -> None:
-        self.function = function
-        self.workers = int(positive("workers", workers, allow_zero=True))
-        self.on_error = one_of("on_error", on_error, ("raise", "skip"))
+        self.function, self.workers, self.on_error = function, workers, on_error
         self.failures: list[str] = []
 
     def run(self, items: Sequence[Item], title: str) -> Iterator[tuple[Item, Result]]:
-        """Yield each item with its result, in the order in which they are done.
-
-        Raises:
-            DataError: of the first item that fails, with ``on_error="raise"``.
-        """
+        """Yield each item with its result, in the order in which they are done."""
         with bar() as shown:
             task = shown.add_task(title, total=len(items))
             for item, outcome in self._outcomes(items):

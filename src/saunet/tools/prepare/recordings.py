@@ -10,7 +10,7 @@ from saunet.data.drive import Drive
 from saunet.data.kitti import CAMERAS, DepthKind, KittiDrive, KittiRaw
 from saunet.data.module import DepthDataModule
 from saunet.data.stereo import other_view
-from saunet.errors import ConfigError, DataError, one_of, suggest
+from saunet.errors import ConfigError, DataError, suggest
 
 Recording = tuple[KittiDrive, list[int]]
 """A recording and the frames of it that are wanted."""
@@ -23,22 +23,12 @@ def kitti_recordings(
     split: str = "all",
     depth: DepthKind = "camera_z",
 ) -> list[Recording]:
-    """Find the recordings of a KITTI raw tree that have frames.
-
-    Args:
-        root: As the ``kitti`` data module's.
-        cameras: ``left``, ``right`` or both.
-        drives: Only these drives, by name or by the end of a name; all if empty.
-        split: ``all`` frames; the training and validation frames of a named split, with their neighbors in time; or
-            a file in Monodepth2's format.
-        depth: Kind of ground truth the recordings give.
+    """Find the recordings of a KITTI raw tree that have frames of a split (see `PrepareOptions`).
 
     Raises:
-        ConfigError: if a camera, drive or split is unknown.
+        ConfigError: if a drive or split is unknown.
         DataError: if there is no such recording, or a calibration is broken.
     """
-    for camera in cameras:
-        one_of("cameras", camera, CAMERAS)
     raw = KittiRaw(root)
     for drive in drives:
         if not any(name.endswith(drive) for name in raw.drives):
@@ -63,12 +53,7 @@ def kitti_recordings(
 def module_recordings(data: DepthDataModule) -> list[tuple[Drive, Sequence[int]]]:
     """Return the recordings that a data module trains and validates on, with all frames of each.
 
-    Args:
-        data: The data module, with the settings of the training; with ``stereo`` the other cameras come along.
-
-    Raises:
-        ConfigError: if the module cannot read prepared copies.
-        DataError: if its data are missing or broken.
+    With ``stereo`` the other cameras come along.
     """
     if not data.cacheable:
         raise ConfigError(

@@ -14,12 +14,10 @@ from numpy import ndarray
 from saunet.data.depth_maps import DepthMaps
 from saunet.data.kitti import KittiDrive
 from saunet.data.windows import sample_name
-from saunet.errors import ConfigError, DataError, one_of
+from saunet.errors import DataError
 from saunet.io.colormaps import depth_to_png16
 from saunet.io.images import read_depth, write_image
-from saunet.tools.prepare.cleanup import remove_partial
-from saunet.tools.prepare.densify import Done
-from saunet.tools.prepare.pool import OnError, Work
+from saunet.tools.prepare.pool import Done, OnError, Work, remove_partial
 from saunet.tools.prepare.recordings import Recording
 
 Values = Literal["depth", "disparity"]
@@ -42,11 +40,7 @@ class DepthSource(Protocol):
 
 
 class ModelTeacher:
-    """Depth as a model predicts it.
-
-    Args:
-        predictor: Such as `saunet.prediction.predictor.Predictor`.
-    """
+    """Depth as a model predicts it."""
 
     def __init__(self, predictor: Any) -> None:
         self.predictor = predictor
@@ -68,17 +62,11 @@ class FileTeacher:
     or without the date above it; without the drive, if all files lie in one folder); ``_depth`` or ``_disp`` may
     follow. ``.npy`` holds numbers, ``.png`` 16 bits of 1/256.
 
-    Args:
-        folder: The folder.
-        values: What the numbers are: ``depth``, or ``disparity`` (up to scale); 0 or less where unknown.
-
-    Raises:
-        ConfigError: for other values.
-        DataError: if the folder holds no such file.
+    With ``values="disparity"`` the numbers are inverse depth up to scale. 0 or less is unknown.
     """
 
     def __init__(self, folder: str | Path, values: Values = "depth") -> None:
-        self.folder, self.values = Path(folder).expanduser(), one_of("values", values, ("depth", "disparity"))
+        self.folder, self.values = Path(folder).expanduser(), values
         files = sorted(self.folder.rglob("*")) if self.folder.is_dir() else []
         self._files = {
             _plain(path.relative_to(self.folder).with_suffix("").as_posix()): path
@@ -93,11 +81,7 @@ class FileTeacher:
         return {"input": str(self.folder.resolve()), "values": self.values}
 
     def file(self, drive: KittiDrive, frame: int) -> Path:
-        """Return the file of a frame.
-
-        Raises:
-            DataError: if there is none.
-        """
+        """Return the file of a frame."""
         tree = f"image_{drive.number:02d}/data/{frame:010d}"
         names = [
             sample_name(drive.name, frame),
@@ -117,11 +101,7 @@ class FileTeacher:
         )
 
     def depth(self, drive: KittiDrive, frame: int) -> Float32[ndarray, "_ _"]:
-        """Read a frame's depth.
-
-        Raises:
-            DataError: if its file is missing, broken or of another shape.
-        """
+        """Read a frame's depth."""
         path = self.file(drive, frame)
         values = read_depth(path) if path.suffix.lower() == ".png" else _read_array(path)
         known = np.isfinite(values) & (values > 0)
@@ -133,13 +113,7 @@ class FileTeacher:
 def teach(
     recordings: Sequence[Recording], source: DepthSource, folder: str | None = None, on_error: OnError = "raise"
 ) -> Done:
-    """Write a teacher's depth for the frames of recordings; what is there already is left alone.
-
-    Args:
-        recordings: From `saunet.tools.prepare.recordings.kitti_recordings`.
-        source: The teacher.
-        folder: Where the maps go; None: beside each recording.
-        on_error: A frame that cannot be read: ``raise`` stops and names it, ``skip`` goes on.
+    """Write a teacher's depth for recordings (``folder`` None: beside each); what is there already is left alone.
 
     Raises:
         DataError: if a frame cannot be read or has no depth, or there are maps of another teacher.
@@ -155,7 +129,7 @@ def teach(
         items += [(position, frame) for frame in frames if frame not in there]
     work: Work[tuple[int, int], None] = Work(_writer(recordings, source, maps), 0, on_error)
     made = sum(1 for _ in work.run(items, "teacher"))
-    return Done(made, before, 0, tuple(work.failures))
+    return Done(made, before, None, tuple(work.failures))
 
 
 def _writer(recordings: Sequence[Recording], source: DepthSource, maps: DepthMaps) -> Callable[[tuple[int, int]], None]:
@@ -177,21 +151,7 @@ def _writer(recordings: Sequence[Recording], source: DepthSource, maps: DepthMap
 
 
 def source_of(checkpoint: str | None, files: str | None, values: Values, device: str) -> DepthSource:
-    """Return the teacher that is asked for: a checkpoint or a folder of files.
-
-    Args:
-        checkpoint: Of a trained model.
-        files: Folder of the depth or disparity that another system wrote.
-        values: What those files hold, ``depth`` or ``disparity``.
-        device: Where the model runs.
-
-    Raises:
-        ConfigError: if it is neither, or both.
-        CheckpointError: if the checkpoint cannot be read.
-        DataError: if the folder holds no such file.
-    """
-    if (checkpoint is None) == (files is None):
-        raise ConfigError("a teacher is either checkpoint=... (a trained model) or input=... (a folder of its depth)")
+    """Return the teacher that is asked for: a checkpoint, or a folder of files that another system wrote."""
     if files is not None:
         return FileTeacher(files, values)
     from saunet.prediction.predictor import Predictor

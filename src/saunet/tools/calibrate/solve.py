@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from saunet.data.camera_file import MODELS, CameraFile
+from saunet.data.camera_file import CameraFile
 from saunet.data.clips import frame_paths
 from saunet.data.lens import Lens
 from saunet.data.sampling import evenly
-from saunet.errors import DataError, one_of, positive
+from saunet.errors import DataError
 from saunet.io.images import read_image
 from saunet.io.video import VideoReader
 from saunet.tools.calibrate.boards import Board, BoardView
@@ -38,7 +38,7 @@ class Calibration:
     uncertainty: float
     """Standard deviation of the focal length over the focal length; NaN for a fisheye lens."""
     coverage: float
-    """Share of the image in which the board was seen."""
+    """Fraction of the image in which the board was seen."""
     views: tuple[BoardView, ...]
     looked_at: int
     dropped: int
@@ -47,7 +47,7 @@ class Calibration:
     """One of the pictures."""
 
 
-def calibrate(
+def solve(
     source: str | Path,
     board: Board,
     *,
@@ -58,21 +58,10 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a camera from a video or a folder of pictures of a board held in many places and tilts.
 
-    Args:
-        source: A video, or a folder of images.
-        board: What to look for.
-        model: ``pinhole`` (five numbers of distortion) or ``fisheye`` (four).
-        views: Pictures to use at most: those that differ most.
-        max_error: Reprojection error in pixels from which the result is refused.
-        advance: Called with the pictures looked at so far and their number.
-
     Raises:
         DataError: if the source cannot be read, the board is hardly seen, or the result cannot be trusted.
-        ConfigError: for an unknown model.
     """
-    one_of("model", model, MODELS)
-    positive("max_error", max_error)
-    most = max(FEWEST_VIEWS, int(positive("views", views)))
+    most = max(FEWEST_VIEWS, views)
     found: list[BoardView] = []
     looked_at, size, example = 0, (0, 0), None
     for image, total in _pictures(Path(source).expanduser(), 3 * most):
@@ -90,8 +79,9 @@ def calibrate(
         advance(looked_at, total)
     if len(found) < FEWEST_VIEWS or example is None:
         raise DataError(
-            f"a {board} was found in {len(found)} of {looked_at} pictures of {source}, needed are {FEWEST_VIEWS}; "
-            "check columns and rows (they count squares), keep the whole board in view, sharp and flat"
+            f"a {board} was found in {len(found)} of {looked_at} pictures of {source}; "
+            f"at least {FEWEST_VIEWS} are required: check columns and rows (they count squares), "
+            "keep the whole board in view, sharp and flat"
         )
     chosen = _most_different(found, size, most)
     K, distortion, error, uncertainty, used = _solve(chosen, size, model)

@@ -1,0 +1,148 @@
+"""The calibration tool: print a board, or make ``camera.yaml`` from a video or pictures of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from saunet.data.camera_file import MODELS, write_camera
+from saunet.errors import ConfigError, one_of, positive
+from saunet.io.images import write_image
+from saunet.io.progress import bar
+from saunet.tools.calibrate.boards import Board
+from saunet.tools.calibrate.solve import Calibration, check_picture, solve
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateOptions:
+    """What `calibrate` reads and writes; ``columns`` and ``rows`` count the board's squares.
+
+    Raises:
+        ConfigError: for a board that cannot exist, another wrong value, or neither ``input`` nor ``print_board``.
+
+    Example:
+        >>> saunet.CalibrateOptions(input="board.mp4", columns=8, rows=6).output
+        'camera.yaml'
+    """
+
+    input: str | None = None
+    """A video, or a folder of pictures, of the board held in many places and tilts."""
+    output: str = "camera.yaml"
+    """The camera file to write; a picture to check it by is written beside it."""
+    board: Literal["chessboard", "charuco"] = "chessboard"
+    """A ``charuco`` board has markers and may be partly hidden."""
+    columns: int = 10
+    """Squares from left to right."""
+    rows: int = 7
+    """Squares from top to bottom."""
+    square: float = 0.025
+    """Side of a square in meters."""
+    marker: float = 0.75
+    """Side of a ChArUco marker as a fraction of the square."""
+    dictionary: str = "DICT_4X4_100"
+    """Name of the markers' ArUco dictionary."""
+    lens: Literal["pinhole", "fisheye"] = "pinhole"
+    """The model: ``pinhole`` has five numbers of distortion, ``fisheye`` four. ``camera.yaml`` calls it ``model``."""
+    views: int = 40
+    """Pictures to use at most: those that differ most."""
+    max_error: float = 1.0
+    """Reprojection error in pixels above which the result is refused."""
+    camera_height: float | None = None
+    """Height of the camera above the road in meters, for the camera file."""
+    condition: str | None = None
+    """Weather or light, for the camera file."""
+    print_board: str | None = None
+    """Write a picture of the board to this file, and do nothing else."""
+    overwrite: bool = False
+    """Replace ``output`` if it exists."""
+
+    def __post_init__(self) -> None:
+        self.target()
+        if self.print_board:
+            return
+        if self.input is None:
+            raise ConfigError(
+                "input is not set; add input=board.mp4 (a video or a folder of pictures), or print_board=..."
+            )
+        if Path(self.output).exists() and not self.overwrite:
+            raise ConfigError(f"{self.output} exists; choose another output, or set overwrite=true")
+        one_of("lens", self.lens, MODELS)
+        positive("views", self.views)
+        positive("max_error", self.max_error)
+        if self.camera_height is not None:
+            positive("camera_height", self.camera_height)
+
+    def target(self) -> Board:
+        """Return the board."""
+        return Board(self.board, self.columns, self.rows, self.square, self.marker, self.dictionary)
+
+
+@dataclass(frozen=True)
+class CalibrateResult:
+    """What `calibrate` found and wrote; ``print`` shows it."""
+
+    written: Path
+    """The camera file, or the picture of the board."""
+    summary: str
+    calibration: Calibration | None = None
+    """None if a board was printed."""
+
+    def __str__(self) -> str:
+        return self.summary
+
+
+def calibrate(
+    options: CalibrateOptions, *, advance: Callable[[int, int | None], None] | None = None
+) -> CalibrateResult:
+    """Find a board in pictures, solve for the camera, say how good that is, and write ``camera.yaml``.
+
+    Args:
+        options: What to read, the board, and where to write.
+        advance: Called with the number of pictures looked at and their total; a progress bar if None.
+
+    Returns:
+        The calibration, the file, and a summary.
+
+    Raises:
+        DataError: if the pictures cannot be read, the board is hardly seen, or the result cannot be trusted.
+
+    Example:
+        >>> print(saunet.calibrate(saunet.CalibrateOptions(print_board="board.png", columns=8)))
+        chessboard of 8x7 squares (7x6 inner corners): board.png; print it, glue it to something flat, ...
+    """
+    board = options.target()
+    if options.print_board:
+        write_image(options.print_board, board.picture())
+        how = "print it, glue it to something flat, and measure a square"
+        return CalibrateResult(Path(options.print_board), f"{board}: {options.print_board}; {how}")
+    assert options.input is not None
+    with bar() as shown:
+        task = shown.add_task("looking for the board", total=None)
+        result = solve(
+            options.input,
+            board,
+            model=options.lens,
+            views=options.views,
+            max_error=options.max_error,
+            advance=advance or (lambda done, total: shown.update(task, completed=done, total=total)),
+        )
+    output = Path(options.output)
+    camera = replace(result.camera, camera_height=options.camera_height, condition=options.condition)
+    note = f"from {len(result.views)} views of a {board} in {Path(options.input).name}"
+    write_camera(output, camera, f"saunet-calibrate: {note}")
+    picture = output.with_name(f"{output.stem}_check.png")
+    write_image(picture, check_picture(result))
+    K = camera.K
+    known = "" if math.isnan(result.uncertainty) else f"; focal length known to {result.uncertainty:.2%}"
+    lines = [
+        f"{note} ({result.looked_at} looked at, {result.dropped} left out as misfits)",
+        f"reprojection error {result.error:.3f} px{known}",
+        f"fx {K[0, 0]:.2f}, fy {K[1, 1]:.2f}, cx {K[0, 2]:.2f}, cy {K[1, 2]:.2f}",
+    ]
+    if result.coverage < 0.6:
+        lines.append(f"the board was seen in {result.coverage:.0%} of the image only: hold it into the corners too")
+    lines.append(f"camera: {output}; look at {picture}: straight lines must be straight on its right side")
+    return CalibrateResult(output, "\n".join(lines), result)

@@ -1,0 +1,153 @@
+"""The preparation tool: dense depth from LiDAR, a teacher's depth, or a cache of smaller images, made once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal, get_args
+
+from saunet.data.depth_maps import DENSE_KINDS
+from saunet.data.image_cache import CacheSettings
+from saunet.data.kitti import CAMERAS
+from saunet.data.workers import available_cores
+from saunet.errors import ConfigError, one_of, positive, usable_device
+from saunet.registry import Spec
+from saunet.tools.prepare.cache import CacheReport, build_cache
+from saunet.tools.prepare.densify import DenseKind, densify
+from saunet.tools.prepare.pool import Done, OnError
+from saunet.tools.prepare.recordings import kitti_recordings, module_recordings
+from saunet.tools.prepare.teacher import Values, source_of, teach
+
+Job = Literal["densify", "teacher", "cache"]
+_KITTI = ("root", "cameras", "drives", "split")
+_SHARED = ("job", *_KITTI, "folder", "on_error")
+KEYS: dict[str, tuple[str, ...]] = {
+    "densify": (*_SHARED, "kinds", "depth", "workers"),
+    "teacher": (*_SHARED, "checkpoint", "input", "values", "device"),
+    "cache": (*_SHARED, "data", "height", "width", "format", "quality", "workers"),
+}
+"""Job -> the options that it reads."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrepareOptions:
+    """What `prepare` does: one of three jobs, each with options of its own.
+
+    Raises:
+        ConfigError: for a wrong value, or an option that the job does not have.
+
+    Example:
+        >>> options = saunet.PrepareOptions(job="densify", root="/data/kitti/raw", kinds=["linear"])
+        >>> options.cameras
+        ('left', 'right')
+    """
+
+    job: Job
+    """``densify`` (dense depth maps from LiDAR), ``teacher`` (another model's depth) or ``cache`` (smaller images)."""
+    data: Spec | None = None
+    """``cache``: the data module to make copies for; None reads the KITTI raw tree at ``root``."""
+    root: str | None = None
+    """Root of a KITTI raw tree."""
+    folder: str | None = None
+    """Where results go; None puts depth maps beside each recording. A cache needs a folder of its own."""
+    cameras: Sequence[str] = ("left", "right")
+    """``left``, ``right`` or both."""
+    drives: Sequence[str] = ()
+    """Only these drives, by name or by the end of a name; all if empty."""
+    split: str = "all"
+    """``all`` frames, those of a named split with their neighbors in time, or a file in Monodepth2's format."""
+    kinds: Sequence[DenseKind] = ("linear",)
+    """``densify``: ``linear``, ``colorization`` or both."""
+    depth: Literal["camera_z", "improved"] = "camera_z"
+    """``densify``: the ground truth to start from, ``camera_z`` (scans) or ``improved`` (KITTI's accumulated depth)."""
+    checkpoint: str | None = None
+    """``teacher``: the trained model that predicts the depth."""
+    input: str | None = None
+    """``teacher``: a folder of depth that another system predicted."""
+    values: Values = "depth"
+    """``teacher``: what those files hold, ``depth`` or ``disparity``."""
+    device: str = "auto"
+    """``teacher``: where the model runs; ``auto`` takes a GPU if there is one."""
+    height: int = 202
+    """``cache``: of the copies, in pixels."""
+    width: int = 672
+    """``cache``: of the copies, in pixels."""
+    format: Literal["jpg", "webp"] = "jpg"
+    """``cache``: ``jpg`` or ``webp``."""
+    quality: int = 95
+    """``cache``: of the compression, 1 to 100."""
+    workers: int | None = None
+    """Processes; 0 works in this one, None takes one per core."""
+    on_error: OnError = "raise"
+    """For a broken file: ``raise`` stops and names it, ``skip`` continues without the frame."""
+
+    def __post_init__(self) -> None:
+        for key in ("cameras", "drives", "kinds"):
+            object.__setattr__(self, key, tuple(getattr(self, key)))
+        one_of("job", self.job, KEYS)
+        given = [each.name for each in fields(self) if getattr(self, each.name) != each.default]
+        for key in given:
+            if key not in KEYS[self.job]:
+                owners = " and ".join(job for job, keys in KEYS.items() if key in keys)
+                raise ConfigError(f"{key} belongs to the job {owners}, not to {self.job}; leave it out")
+            if self.data is not None and key in _KITTI:
+                raise ConfigError(f"{key} is for KITTI raw trees; with data=..., set data.{key} or leave it out")
+        if self.data is None and self.root is None:
+            raise ConfigError("root is not set; add root=... (a KITTI raw tree)")
+        one_of("on_error", self.on_error, get_args(OnError))
+        if self.workers is not None:
+            positive("workers", self.workers, allow_zero=True)
+        for camera in self.cameras:
+            one_of("cameras", camera, CAMERAS)
+        one_of("depth", self.depth, ("camera_z", "improved"))
+        if not self.kinds:
+            raise ConfigError(f"kinds is empty; name at least one of {', '.join(DENSE_KINDS)}")
+        for kind in self.kinds:
+            one_of("kinds", kind, DENSE_KINDS)
+        one_of("values", self.values, get_args(Values))
+        if self.job == "teacher" and (self.checkpoint is None) == (self.input is None):
+            raise ConfigError("a teacher is either checkpoint=... (a trained model) or input=... (a folder of depth)")
+        if self.job == "cache":
+            if self.folder is None:
+                raise ConfigError("a cache needs a folder of its own; set folder=...")
+            CacheSettings(self.height, self.width, self.format, self.quality)
+
+
+def prepare(options: PrepareOptions) -> Done | CacheReport:
+    """Do one preparation; what exists already is checked and kept, so an interrupted job resumes.
+
+    Args:
+        options: The job and its options.
+
+    Returns:
+        What was made, what existed, and one sentence per frame that was skipped (``failures``); ``print`` shows it.
+
+    Raises:
+        DataError: if a recording cannot be read, or the folder holds something else.
+        CheckpointError: if the teacher's checkpoint cannot be read.
+        ConfigError: if a drive, split or data module does not fit.
+
+    Example:
+        >>> tree = saunet.PrepareOptions(job="densify", root="/nowhere")
+        >>> saunet.prepare(tree)
+        Traceback (most recent call last):
+        saunet.errors.DataError: no data root at /nowhere...
+    """
+    workers = available_cores() if options.workers is None else options.workers
+    if options.data is not None:
+        skips = options.on_error == "skip" and "on_error" in options.data.parameters
+        changes = {"on_error": "skip"} if skips else {}
+        recordings = module_recordings(options.data.build(**changes))
+    else:
+        assert options.root is not None
+        kitti = kitti_recordings(options.root, options.cameras, options.drives, options.split, options.depth)
+        if options.job == "densify":
+            return densify(kitti, options.kinds, options.folder, workers, options.on_error)
+        if options.job == "teacher":
+            device = str(usable_device(options.device))
+            source = source_of(options.checkpoint, options.input, options.values, device)
+            return teach(kitti, source, options.folder, options.on_error)
+        recordings = list(kitti)
+    settings = CacheSettings(options.height, options.width, options.format, options.quality)
+    return build_cache(recordings, Path(str(options.folder)), settings, workers, options.on_error)
