@@ -99,7 +99,7 @@ class PredictConfig:
     fps: float | None = None
     layout: str = "auto"
     memory: float = 0.95
-    codec: str = "mp4v"
+    codec: str = "h264"
     flip: bool = False
     keep_aspect: bool = False
     scale: ScaleConfig = field(default_factory=ScaleConfig)

@@ -16,8 +16,7 @@ from torch import nn
 
 import saunet
 from saunet.io.images import read_image
-from saunet.io.video import VideoReader
-from saunet.prediction.clips import VideoWriter
+from saunet.io.video import VideoReader, VideoWriter
 from saunet.prediction.files import predict_files
 from saunet.prediction.pointcloud import Camera, point_cloud, write_ply
 from saunet.prediction.video import predict_clip
@@ -79,8 +78,8 @@ def test_what_a_clip_looks_like_can_be_chosen(
         with VideoReader(tmp_path / "out" / f"{name}_disparity.mp4") as reader:
             assert reader.fps == pytest.approx(30)
             assert reader.width > reader.height
-    refused = tool("predict", f"checkpoint={checkpoint}", "input=drive.mp4", "output=out2", "codec=h264")
-    refused.says("codec is 'h264'", "allowed: mp4v, vp09")
+    refused = tool("predict", f"checkpoint={checkpoint}", "input=drive.mp4", "output=out2", "codec=avc1")
+    refused.says("codec is 'avc1'", "allowed: h264, mp4v, vp09")
 
 
 def test_number_of_frames(tool: Callable[..., Any], checkpoint: Path, video: Path, image: Path, tmp_path: Path) -> None:

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from saunet.errors import ConfigError, DataError
 from saunet.io.colormaps import RunningRange, colorize
 from saunet.io.images import read_image, write_image
-from saunet.io.video import VideoReader
-from saunet.prediction.clips import VideoWriter
+from saunet.io.video import CameraReader, VideoReader, VideoWriter
 from saunet.prediction.odometer import Odometer
 from saunet.prediction.predictor import Predictor
 from saunet.prediction.video import predict_clip
@@ -121,7 +120,7 @@ def test_interrupt_and_failure_keep_finished_frames_and_nothing_half(predictor: 
 def test_interrupting_a_camera_completes_everything(
     predictor: Predictor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, odometer: Odometer
 ) -> None:
-    class Camera(VideoReader):
+    class Camera(CameraReader):
         def __init__(self, source: int) -> None:
             self.fps, self.declared = 20.0, None
 
@@ -132,7 +131,7 @@ def test_interrupting_a_camera_completes_everything(
         def close(self) -> None:
             """Nothing to release."""
 
-    monkeypatch.setattr("saunet.prediction.clips.VideoReader", Camera)
+    monkeypatch.setattr("saunet.prediction.clips.CameraReader", Camera)
     summary = predict_clip(predictor, 0, tmp_path, ("mp4", "html", "trajectory"), camera=[90], odometer=odometer)
     assert summary.frames == 4
     assert names(tmp_path) == [
@@ -140,7 +139,7 @@ def test_interrupting_a_camera_completes_everything(
     ]  # fmt: skip
 
 
-class RunningCamera(VideoReader):
+class RunningCamera(CameraReader):
     """Gives frames until somebody stops it."""
 
     def __init__(self, source: int) -> None:
@@ -171,7 +170,7 @@ def ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type, str, lis
 
         monkeypatch.setattr(owner, method, pressed)
 
-    monkeypatch.setattr("saunet.prediction.clips.VideoReader", RunningCamera)
+    monkeypatch.setattr("saunet.prediction.clips.CameraReader", RunningCamera)
     yield press
     signal.signal(signal.SIGINT, before)
 
@@ -179,7 +178,6 @@ def ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type, str, lis
 @pytest.mark.parametrize(
     ("owner", "method"),
     [
-        (cv2.VideoWriter, "write"),
         (VideoWriter, "write"),
         (ViewerWriter, "add"),
         (Odometer, "add"),

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from saunet.io.images import read_depth, read_image
-from saunet.io.video import VideoReader
+from saunet.io.video import VideoReader, VideoWriter
 from saunet.models.depth import DepthNet
-from saunet.prediction.clips import VideoWriter
 from saunet.prediction.odometer import Odometer
 from saunet.prediction.video import predict_clip
 

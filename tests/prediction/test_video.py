@@ -9,16 +9,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from videos import write_video
 
 from saunet.errors import ConfigError, DataError
 from saunet.io.colormaps import RunningRange
 from saunet.io.images import write_image
-from saunet.io.video import VideoReader
-from saunet.prediction.clips import VideoWriter, open_clip
+from saunet.io.video import CameraReader, VideoReader, VideoWriter
 from saunet.prediction.predictor import Predictor
 from saunet.prediction.sinks import compose
 from saunet.prediction.video import render_video
@@ -41,51 +40,6 @@ def video(tmp_path: Path) -> Path:
     return tmp_path / "in.mp4"
 
 
-def test_what_is_written_is_read_back(video: Path) -> None:
-    with VideoReader(video) as reader:
-        assert (reader.height, reader.width, reader.declared) == (48, 96, 9)
-        assert reader.fps == pytest.approx(12)
-        frames = list(reader)
-    assert len(frames) == 9
-    assert max(np.abs(a.astype(int) - b).mean() for a, b in zip(frames, clip(9), strict=True)) < 4
-
-
-def test_color_channels_keep_their_order(tmp_path: Path) -> None:
-    red = np.zeros((32, 32, 3), np.uint8)
-    red[:, :, 0] = 220
-    with VideoWriter(tmp_path / "x.mp4", 10) as writer:
-        writer.write(red)
-    with VideoReader(tmp_path / "x.mp4") as reader:
-        frame = next(iter(reader)).mean(axis=(0, 1))
-    assert frame[0] > 180
-    assert frame[1:].max() < 40
-
-
-def test_codec_that_plays_in_browsers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with VideoWriter(tmp_path / "x.mp4", 12, "vp09") as writer:
-        for frame in clip(9):
-            writer.write(frame)
-    assert b"vp09" in (tmp_path / "x.mp4").read_bytes()
-    with VideoReader(tmp_path / "x.mp4") as reader:
-        frames = list(reader)
-    assert max(np.abs(a.astype(int) - b).mean() for a, b in zip(frames, clip(9), strict=True)) < 4
-    with pytest.raises(ConfigError, match="codec is 'avc1', allowed: mp4v, vp09"):
-        VideoWriter(tmp_path / "x.mp4", 12, "avc1")
-    monkeypatch.setattr(cv2.VideoWriter, "isOpened", lambda self: False)  # an OpenCV that lacks it
-    message = r"vp09, with which this OpenCV cannot write .*y\.mp4; set codec=mp4v"
-    with pytest.raises(ConfigError, match=message), VideoWriter(tmp_path / "y.mp4", 12, "vp09") as writer:
-        writer.write(next(clip(1)))
-    assert [path.name for path in tmp_path.iterdir()] == ["x.mp4"]
-
-
-def test_odd_sizes_are_made_even(tmp_path: Path) -> None:
-    with VideoWriter(tmp_path / "x.mp4", 10) as writer:
-        for frame in clip(3, 31, 45):
-            writer.write(frame)
-    with VideoReader(tmp_path / "x.mp4") as reader:
-        assert (reader.height, reader.width) == (32, 46)
-
-
 def test_side_by_side_from_file(predictor: Predictor, video: Path, tmp_path: Path) -> None:
     before = video.read_bytes()
     summary = render_video(predictor, video, tmp_path / "new" / "out.mp4")
@@ -103,7 +57,7 @@ def test_side_by_side_from_frames(predictor: Predictor, tmp_path: Path) -> None:
     )
     with VideoReader(summary.path) as reader:
         assert (reader.height, reader.width, reader.declared) == (48, 192, 4)
-        assert reader.fps == pytest.approx(7)
+        assert reader.fps == pytest.approx(7, rel=1e-3)
 
 
 def test_layouts() -> None:
@@ -141,45 +95,12 @@ def test_folder_of_images_and_truncated_ones(predictor: Predictor, tmp_path: Pat
     assert not (tmp_path / "out.mp4").exists()
 
 
-class TestBrokenSource:
-    def test_missing_empty_text(self, tmp_path: Path) -> None:
-        (tmp_path / "empty.mp4").touch()
-        (tmp_path / "text.mp4").write_text("no video here")
-        for name, message in (("absent.mp4", "no video at"), ("empty.mp4", "0 bytes"), ("text.mp4", "is not a video")):
-            with pytest.raises(DataError, match=message):
-                VideoReader(tmp_path / name)
-
-    def test_folder(self, tmp_path: Path) -> None:
-        with pytest.raises(DataError, match="no video at"):
-            VideoReader(tmp_path)
-        with pytest.raises(DataError, match="no images in"):
-            open_clip(tmp_path)
-
-    def test_no_frames(self, tmp_path: Path) -> None:
-        writer = cv2.VideoWriter(str(tmp_path / "x.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 32))
-        writer.release()
-        with pytest.raises(DataError, match=r"x\.avi (holds no frame|is not a video|is empty)"):
-            VideoReader(tmp_path / "x.avi")
-
-    def test_truncated_index_at_the_end(self, video: Path) -> None:
-        video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
-        with pytest.raises(DataError, match="is not a video that can be read, or is truncated"):
-            VideoReader(video)
-
-    def test_truncated_stream_gives_what_is_there_and_says_so(self, predictor: Predictor, tmp_path: Path) -> None:
-        writer = cv2.VideoWriter(str(tmp_path / "x.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (96, 48))
-        for frame in clip(20):
-            writer.write(frame)
-        writer.release()
-        data = (tmp_path / "x.avi").read_bytes()
-        (tmp_path / "x.avi").write_bytes(data[: len(data) * 6 // 10])
-        summary = render_video(predictor, tmp_path / "x.avi", tmp_path / "out.mp4")
-        assert 5 < summary.frames < 15
-        assert summary.frames + summary.missing == 20
-
-    def test_camera_that_is_not_there(self) -> None:
-        with pytest.raises(DataError, match="camera 97 gives no picture"):
-            VideoReader(97)
+def test_truncated_stream_gives_what_is_there_and_says_so(predictor: Predictor, tmp_path: Path) -> None:
+    path = write_video(tmp_path / "x.avi", 20, codec="mjpeg")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
+    summary = render_video(predictor, path, tmp_path / "out.mp4")
+    assert 5 < summary.frames < 15
+    assert summary.frames + summary.missing == 20
 
 
 @pytest.mark.slow
@@ -199,7 +120,7 @@ def test_memory_stays_flat_over_a_long_clip(predictor: Predictor, tmp_path: Path
     assert used[-1] - used[0] < 10, f"MB in use every 1000 frames: {used}"
 
 
-class FakeCamera(VideoReader):
+class FakeCamera(CameraReader):
     """Gives three frames; then the user has seen enough."""
 
     def __init__(self, source: int) -> None:
@@ -218,7 +139,7 @@ class TestUnfinished:
     def test_interrupting_a_camera_finishes_its_video(
         self, predictor: Predictor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("saunet.prediction.clips.VideoReader", FakeCamera)
+        monkeypatch.setattr("saunet.prediction.clips.CameraReader", FakeCamera)
         assert render_video(predictor, 0, tmp_path / "out.mp4").frames == 3
         with VideoReader(tmp_path / "out.mp4") as reader:
             assert reader.declared == 3
@@ -250,7 +171,7 @@ class TestUnfinished:
         code = (
             "import resource, signal, sys, numpy as np\n"
             "from saunet.errors import DataError\n"
-            "from saunet.prediction.clips import VideoWriter\n"
+            "from saunet.io.video import VideoWriter\n"
             "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
             "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
             "noise = np.random.default_rng(0)\n"
@@ -262,7 +183,8 @@ class TestUnfinished:
         )
         target = tmp_path / "x.mp4"
         result = subprocess.run([sys.executable, "-c", code, str(target)], capture_output=True, text=True, check=True)
-        assert f"{target} kept" in result.stdout
+        assert f"{target}" in result.stdout
+        assert "disk full" in result.stdout or "space" in result.stdout
         assert list(tmp_path.iterdir()) == []
 
 

@@ -24,8 +24,6 @@ from saunet.io.video import VIDEO_SUFFIXES, VideoReader
 
 QUALITY = 95
 """JPEG quality of cached frames."""
-_ESTIMATE = 2
-"""Frames by which a container's frame count may be off without anything being wrong."""
 
 
 class FramesCacheError(DataError):
@@ -61,6 +59,8 @@ class Recording:
     """Frames at the end that a video claims to hold and that cannot be decoded."""
     passed_over: int = 0
     """Frames between those taken, which the frame rate asked for does not need."""
+    times: tuple[float, ...] | None = None
+    """Seconds of each since the first frame of a video; None if unknown."""
 
 
 def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]:
@@ -136,17 +136,18 @@ def read_clip(
         return Recording(taken, numbers, clip.camera.fps, passed_over=len(paths) - len(taken))
     folder = cache / f"{clip.path.stem[:60]}-{_key(clip.path, fps, max_width)}"
     if not (folder / "clip.json").is_file():
-        _decode(clip.path, fps, folder, max_width, advance)
+        _decode(clip.path, clip.camera.fps, fps, folder, max_width, advance)
     try:
         facts = json.loads((folder / "clip.json").read_text(encoding="utf-8"))
-        numbers, rate, missing = tuple(facts["numbers"]), float(facts["fps"]), int(facts["missing"])
-        count = int(facts.get("count", numbers[-1] + 1))  # not written by older versions; then without the last few
+        numbers, rate, missing = tuple(facts["numbers"]), facts["fps"], int(facts["missing"])
+        times = None if facts["times"] is None else tuple(map(float, facts["times"]))
+        count = int(facts["count"])
     except (OSError, ValueError, LookupError, TypeError) as reason:
         raise DataError(f"{folder / 'clip.json'} is damaged ({reason}); delete the folder {folder}") from reason
     paths = frame_paths(folder)
     if len(paths) != len(numbers):
         raise DataError(f"{folder} holds {len(paths)} of {len(numbers)} frames; delete it, so that it is made again")
-    return Recording(tuple(paths), numbers, rate, missing, count - len(numbers))
+    return Recording(tuple(paths), numbers, rate, missing, count - len(numbers), times)
 
 
 def default_cache() -> Path:
@@ -156,32 +157,34 @@ def default_cache() -> Path:
 
 
 def _decode(
-    video: Path, fps: float | None, folder: Path, max_width: int, advance: Callable[[int, int | None], None]
+    video: Path,
+    rate: float | None,
+    fps: float | None,
+    folder: Path,
+    max_width: int,
+    advance: Callable[[int, int | None], None],
 ) -> None:
     """Write the frames of a video that are wanted, into a folder that gets its name only when it is complete."""
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-    numbers, count = [], 0
+    numbers: list[int] = []
+    times: list[float | None] = []
     try:
         partial.mkdir(parents=True, exist_ok=True)
-        with VideoReader(video) as reader:
-            wanted = every(reader.fps, fps)
-            next_number = next(wanted)
-            for count, frame in enumerate(reader, 1):
-                if count - 1 == next_number:
-                    width = min(max_width, frame.shape[1])
-                    small = resize(frame, round(frame.shape[0] * width / frame.shape[1]), width)
-                    (partial / f"{next_number:06d}.jpg").write_bytes(encode_jpeg(small, QUALITY))
-                    numbers.append(next_number)
-                    next_number = next(wanted)
-                advance(count, reader.declared)
-            missing = max(0, (reader.declared or 0) - count)
-            rate = reader.fps
+        reader = VideoReader(video, rate)
+        for frame in reader.frames(fps):
+            width = min(max_width, frame.image.shape[1])
+            small = resize(frame.image, round(frame.image.shape[0] * width / frame.image.shape[1]), width)
+            (partial / f"{frame.number:06d}.jpg").write_bytes(encode_jpeg(small, QUALITY))
+            numbers.append(frame.number)
+            times.append(frame.time)
+            advance(reader.count, reader.declared)
         facts = {
             "video": str(video.absolute()),
-            "fps": rate,
+            "fps": reader.fps,
             "numbers": numbers,
-            "count": count,
-            "missing": missing if missing > _ESTIMATE else 0,
+            "times": None if None in times else times,
+            "count": reader.count,
+            "missing": reader.missing,
         }
         write_json(partial / "clip.json", facts, indent=None)
         try:
@@ -200,7 +203,7 @@ def _decode(
 
 def _key(path: Path, fps: float | None, max_width: int) -> str:
     state = path.stat()
-    text = f"{path.resolve()}|{state.st_size}|{state.st_mtime_ns}|{fps}|{max_width}|{QUALITY}"
+    text = f"{path.resolve()}|{state.st_size}|{state.st_mtime_ns}|{fps}|{max_width}|{QUALITY}|times"
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
 
 

@@ -1,73 +1,166 @@
-"""The one reader of videos, for training data and prediction alike: frames in order, as RGB bytes."""
+"""Videos in and out: frames in the order in which a player shows them, with their times, colors and rotation."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
+import av
 import cv2
 import numpy as np
+from av.error import FFmpegError
 from jaxtyping import UInt8
 
-from saunet.errors import DataError
+from saunet.errors import ConfigError, DataError, UnreadableError, one_of, positive
+from saunet.io.atomic import replacing
 
-VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ts"})
+_CONTAINERS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ts", ".mts", ".m2ts", ".3gp")
+_OTHERS = (".3g2", ".flv", ".vob", ".lrv", ".ogv", ".h264", ".264", ".h265", ".265", ".hevc", ".mjpg", ".mjpeg")
+VIDEO_SUFFIXES = frozenset((*_CONTAINERS, *_OTHERS))
 """File name endings that are taken for videos."""
+
+CODECS: dict[str, tuple[str, dict[str, str]]] = {
+    "h264": ("libx264", {"preset": "veryfast", "crf": "18"}),
+    "mp4v": ("mpeg4", {"qmin": "3", "qmax": "6"}),
+    "vp09": ("libvpx-vp9", {"crf": "24", "b": "0", "deadline": "realtime", "cpu-used": "6"}),
+}
+"""What a video can be written as: ``h264`` plays everywhere; ``mp4v`` is quickest; ``vp09`` is free of patents."""
+
+Picture = UInt8[np.ndarray, "_ _ 3"]
+_RAW = frozenset({"h264", "hevc", "vvc", "obu", "m4v", "mpegvideo", "mjpeg", "h263", "vc1"})
+"""Formats of bare frames: what FFmpeg says of their rate and times is a guess."""
+_INDEXED = ("mov", "avi")
+"""Formats whose mean rate is counted, not rounded or guessed."""
+_TICKS = 90_000
+"""Ticks a second of the videos that are written: divides all usual rates."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VideoFrame:
+    """One frame of a video."""
+
+    number: int
+    """From 0, as recorded."""
+    time: float | None
+    """Seconds since the first frame; None if unknown."""
+    image: Picture
 
 
 class VideoReader:
-    """Frames of a video file or a camera, as RGB bytes, in order.
+    """Frames of a video file as RGB bytes, as a player shows them: in order, rotated, deinterlaced, in true colors.
+
+    Iterating reads from the start each time; one frame is in memory at a time.
 
     Args:
-        source: A video file, or the number of a camera.
+        source: The file.
+        rate: Frames per second of a bare stream (``.hevc``, ``.h264``) that does not contain its rate.
 
     Attributes:
-        fps: Frames a second; 25 where the file does not say.
-        declared: Number of frames that the file claims to hold; None for a camera or where it does not say.
+        fps: Mean frames per second; None if nobody knows.
+        declared: Number of frames as the file states it, or estimated from its duration; None if unknown.
+        height: Of the frames, after rotation.
+        width: Of the frames, after rotation.
+        missing: After reading to the end: frames that a truncated file lacks.
+        damaged: After reading to the end: frames that could be decoded in part or not at all.
+        plain: After reading to the end: frames of one single color.
+        count: Frames decoded since the start of the last reading.
 
     Raises:
-        DataError: if it does not exist, is no video that can be read, or holds no frame.
+        DataError: if it does not exist, is not a video that can be read, or contains no frame.
     """
 
-    def __init__(self, source: str | Path | int) -> None:
-        self.name = f"camera {source}" if isinstance(source, int) else str(source)
-        if not isinstance(source, int):
-            path = Path(source)
-            if not path.is_file():
-                raise DataError(f"no video at {path}; check the path")
-            if path.stat().st_size == 0:
-                raise DataError(f"{path} is empty (0 bytes); copy it again")
-        self._capture = cv2.VideoCapture(source if isinstance(source, int) else str(source))
-        opened = self._capture.isOpened()
-        done, frame = self._capture.read() if opened else (False, None)
-        if not done or frame is None:
-            self._capture.release()
-            raise DataError(self._why(isinstance(source, int), opened))
-        self._first: UInt8[np.ndarray, "h w 3"] | None = frame
-        self.height, self.width = frame.shape[:2]
-        fps = self._capture.get(cv2.CAP_PROP_FPS)
-        self.fps = float(fps) if 0 < fps < 1000 else 25.0
-        count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        self.declared = count if count > 0 and not isinstance(source, int) else None
+    def __init__(self, source: str | Path, rate: float | int | None = None) -> None:
+        self.path, self.name = Path(source), str(source)
+        if not self.path.is_file():
+            raise DataError(f"no video at {source}; check the path")
+        if self.path.stat().st_size == 0:
+            raise UnreadableError(f"{source} is empty (0 bytes); copy it again")
+        self.missing = self.damaged = self.plain = self.count = 0
+        self._broken = False
+        self._origin = 0.0  # time stamp of the first frame
+        container = self._open()
+        try:
+            stream = self._stream(container)
+            first = next(self._decoded(container, stream), None)
+            if first is None:
+                raise UnreadableError(
+                    f"{self.name} holds no frame that can be decoded; it may be truncated or have an unusual codec"
+                )
+            self.height, self.width = _rgb(first, self.name).shape[:2]
+            self._timed = container.format.name not in _RAW and first.time is not None
+            self._origin = float(first.time) if self._timed else 0.0
+            mean, usual = self._rates(container, stream)
+            self.fps, self._pace = mean or rate, usual or rate
+            self.declared = self._count(container, stream)
+        except FFmpegError as reason:
+            raise self._unreadable() from reason
+        finally:
+            container.close()
 
-    def _why(self, camera: bool, opened: bool) -> str:
-        if camera:
-            return f"{self.name} gives no picture; check that it is connected and that no other program uses it"
-        if opened:
-            return f"{self.name} holds no frame that can be decoded; it may be truncated or have an unusual codec"
-        return f"{self.name} is not a video that can be read, or is truncated; copy it again or convert it to mp4"
+    def __iter__(self) -> Iterator[Picture]:
+        return (frame.image for frame in self.frames())
 
-    def __iter__(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-        while self._first is not None:
-            yield cv2.cvtColor(self._first, cv2.COLOR_BGR2RGB)
-            done, frame = self._capture.read()
-            self._first = frame if done else None
+    def frames(self, fps: float | int | None = None) -> Iterator[VideoFrame]:
+        """Yield frames with their times.
+
+        Args:
+            fps: Take the frames nearest to equal steps of time, so many per second; None, or more than there are,
+                takes all.
+
+        Raises:
+            DataError: if the size of the picture changes on the way, or every frame has one single color.
+        """
+        stamped = self._stamped()
+        if fps is not None and self._pace is not None and fps < self._pace * (1 - 1e-3):
+            stamped = nearest_steps(stamped, positive("fps", fps))
+        for number, seconds, frame in stamped:
+            image = _rgb(frame, self.name)
+            if image.shape[:2] != (self.height, self.width):
+                raise DataError(
+                    f"{self.name} changes its size from {self.width}x{self.height} to {image.shape[1]}x"
+                    f"{image.shape[0]} (width x height) at frame {number}; frames share one size, so split the file "
+                    "there"
+                )
+            self.plain += _one_color(image)
+            yield VideoFrame(number, seconds, image)
+
+    def at(self, seconds: float | int) -> tuple[float, Picture]:
+        """Return the frame that is shown at a time (seconds since the first frame), and the time at which it began.
+
+        Raises:
+            DataError: if the video has no times, or shows nothing at that time.
+        """
+        if not self._timed:
+            raise DataError(f"{self.name} is a bare stream without times; convert it to mp4 to read it by time")
+        wanted = seconds + self._origin + 1e-6
+        for before in (0.0, 5.0, None) if seconds >= 0 else ():  # some formats seek past the time asked for
+            container = self._open()
+            try:
+                stream = self._stream(container)
+                if before is not None and not _seek(container, stream, max(self._origin, wanted - before)):
+                    continue
+                found = later = None
+                for frame in self._decoded(container, stream):
+                    if frame.time > wanted:
+                        later = frame
+                        break
+                    found = frame
+                if found is not None and (later or wanted < found.time + 1 / (self.fps or 1)):
+                    return float(found.time) - self._origin, _rgb(found, self.name)
+            except FFmpegError as reason:
+                raise self._unreadable() from reason
+            finally:
+                container.close()
+        raise DataError(f"{self.name} shows no frame at {seconds:g} s; it is shorter")
 
     def close(self) -> None:
-        """Release the file or camera."""
-        self._capture.release()
-        self._first = None
+        """Nothing is held open between two iterations."""
 
     def __enter__(self) -> VideoReader:
         return self
@@ -76,3 +169,369 @@ class VideoReader:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def _open(self) -> Any:
+        try:
+            # "file:" keeps names with colons from being taken for addresses; playlists must not open others either
+            return av.open(f"file:{self.path}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
+        except FFmpegError as reason:
+            if isinstance(reason, PermissionError):
+                raise UnreadableError(f"cannot read {self.name}: {reason.strerror}") from reason
+            raise self._unreadable() from reason
+
+    def _unreadable(self) -> UnreadableError:
+        return UnreadableError(
+            f"{self.name} is not a video that can be read, or is truncated; copy it again or convert it to mp4"
+        )
+
+    def _stream(self, container: Any) -> Any:
+        stream = container.streams.best("video")  # never a cover picture
+        if stream is None:
+            raise UnreadableError(f"{self.name} contains no video, only sound or text")
+        if stream.codec_context is None:
+            raise UnreadableError(f"{self.name} has a codec that cannot be decoded; convert it to H.264")
+        stream.thread_type = "AUTO"
+        return stream
+
+    def _decoded(self, container: Any, stream: Any) -> Iterator[Any]:
+        """Yield decoded frames, deinterlaced where they are interlaced."""
+        weave: _Deinterlacer | None = None
+        for packet in _packets(container, stream):
+            self._broken |= packet is None
+            try:
+                frames = stream.decode(packet)
+            except FFmpegError:
+                self.damaged += 1
+                continue
+            for frame in frames:
+                self.damaged += frame.is_corrupt
+                if weave is None and frame.interlaced_frame:
+                    weave = _Deinterlacer(stream)
+                yield from (frame,) if weave is None else weave.push(frame)
+        if weave is not None:
+            yield from weave.push(None)
+
+    def _stamped(self) -> Iterator[tuple[int, float | None, Any]]:
+        """Yield all frames with number and time; a clock that jumps back continues where it was."""
+        self.missing = self.damaged = self.plain = self.count = 0
+        self._broken = False
+        container = self._open()
+        step, shift, last = 1 / (self.fps or 25), -self._origin, -math.inf
+        try:
+            for number, frame in enumerate(self._decoded(container, self._stream(container))):
+                self.count = number + 1
+                if not self._timed:
+                    yield number, number / self.fps if self.fps else None, frame
+                    continue
+                seconds = last + step if frame.time is None else float(frame.time) + shift
+                if seconds <= last:
+                    shift, seconds = shift + last + step - seconds, last + step
+                last = seconds
+                yield number, seconds, frame
+        finally:
+            container.close()
+        if self.plain and self.plain == self.count:
+            raise DataError(
+                f"every one of the {self.plain} frames of {self.name} has one single color; it was not decoded, or the "
+                "camera was covered; convert it to H.264 and look at it"
+            )
+        if self._broken or _truncated(self.path):
+            self.missing = max(1, (self.declared or 0) - self.count)
+
+    def _rates(self, container: Any, stream: Any) -> tuple[float | None, float | None]:
+        """Return the mean rate, and the usual one: that of the median step between the first frames."""
+        if not self._timed:
+            rate = stream.codec_context.framerate
+            known = float(rate) if rate and 0 < rate < 1000 else None
+            return known, known
+        again = self._open()
+        try:
+            packets = _some(_packets(again, self._stream(again)), 300)
+            stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
+        finally:
+            again.close()
+        stamps = stamps[:-16] if len(stamps) > 200 else stamps  # the last ones may not be the next ones
+        steps = np.diff(stamps) * float(stream.time_base)
+        average = float(stream.average_rate or 0) or None
+        mean, usual = (float(1 / np.mean(steps)), float(1 / np.median(steps))) if len(steps) else (average, average)
+        return average if average and container.format.name.startswith(_INDEXED) else mean, usual
+
+    def _count(self, container: Any, stream: Any) -> int | None:
+        if stream.frames > 0:
+            return int(stream.frames)
+        lasts = float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) / 1e6
+        return round(lasts * self.fps) or None if self.fps and self._timed else None
+
+
+class CameraReader:
+    """Frames of a camera that is connected, until somebody stops it; times are those of arrival.
+
+    Args:
+        number: Of the camera, from 0.
+
+    Raises:
+        DataError: if it gives no picture.
+    """
+
+    declared = None
+    missing = damaged = plain = 0
+
+    def __init__(self, number: int) -> None:
+        self.name = f"camera {number}"
+        self._capture = cv2.VideoCapture(number)
+        done, frame = self._capture.read() if self._capture.isOpened() else (False, None)
+        if not done or frame is None:
+            self.close()
+            raise DataError(
+                f"{self.name} gives no picture; check that it is connected and that no other program uses it"
+            )
+        self.height, self.width = frame.shape[:2]
+        fps = self._capture.get(cv2.CAP_PROP_FPS)
+        self.fps = float(fps) if 0 < fps < 1000 else 25.0
+
+    def frames(self, fps: float | int | None = None) -> Iterator[VideoFrame]:
+        """Yield frames as they come, at most ``fps`` a second."""
+        start, number = time.monotonic(), 0
+        while True:
+            done, frame = self._capture.read()
+            if not done:
+                return
+            yield VideoFrame(number, time.monotonic() - start, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
+            number += 1
+
+    def close(self) -> None:
+        """Release the camera."""
+        self._capture.release()
+
+    def __iter__(self) -> Iterator[Picture]:
+        return (frame.image for frame in self.frames())
+
+
+def nearest_steps(
+    frames: Iterable[tuple[int, float | None, Any]], fps: float | int
+) -> Iterator[tuple[int, float | None, Any]]:
+    """Yield those of (number, seconds, frame) that are nearest to equal steps of time, each at most once."""
+    previous: tuple[int, float, Any] | None = None
+    start, step, half = 0.0, 0, 0.0
+    for number, seconds, frame in frames:
+        if seconds is None:
+            raise DataError("frames without times cannot be chosen by time; give the rate of the stream")
+        if previous is None:
+            start = seconds
+        else:
+            half = (seconds - previous[1]) / 2
+            reached = (previous[1] + half - start) * fps - 1e-6  # in steps; of two equally near, the later one
+            if step < reached:
+                yield previous
+                step = math.ceil(reached)
+        previous = (number, seconds, frame)
+    if previous is not None and (step == 0 or step < (previous[1] + half - start) * fps - 1e-6):
+        yield previous
+
+
+class VideoWriter:
+    """Writes RGB frames to an mp4 file that gets its name only when it is complete.
+
+    Use it as a context manager; leaving it by an error discards the file.
+
+    Args:
+        path: The file to write, ending in ``.mp4``.
+        fps: Frames per second, for frames without a time.
+        codec: One of `CODECS`.
+
+    Raises:
+        ConfigError: for another ending or codec, or a frame rate that is not positive.
+        DataError: if the system refuses to write, or the written file does not contain every frame (a full disk).
+    """
+
+    def __init__(self, path: str | Path, fps: float | int, codec: str = "h264") -> None:
+        self.path = Path(path)
+        one_of(f"the suffix of {self.path.name}", self.path.suffix.lower(), [".mp4"])
+        self.fps, self.codec = positive("fps", fps), one_of("codec", codec, CODECS)
+        self.count, self._last = 0, -1
+        self._container: Any = None
+        self._size = (0, 0)
+        self._replacing = replacing(self.path)
+
+    def __enter__(self) -> VideoWriter:
+        self._temporary = self._replacing.__enter__()
+        return self
+
+    def write(self, frame: Picture, seconds: float | int | None = None) -> None:
+        """Append a frame, shown from ``seconds`` on; all have the size of the first, made even as codecs need it.
+
+        Raises:
+            DataError: if a frame has another size.
+            ConfigError: if this PyAV lacks the codec.
+        """
+        if self._container is None:
+            self._size = (frame.shape[0], frame.shape[1])
+            self._start()
+        if frame.shape[:2] != self._size:
+            raise DataError(
+                f"frame {self.count} is {frame.shape[:2]} (height, width), the ones before it are {self._size}"
+            )
+        pad = ((0, self._size[0] % 2), (0, self._size[1] % 2), (0, 0))
+        picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(np.pad(frame, pad, mode="edge")), "rgb24")
+        # the tags alone convert nothing: the values have to be made for them
+        picture = picture.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
+        ticks = round((self.count / self.fps if seconds is None else seconds) * _TICKS)
+        self._last = picture.pts = max(ticks, self._last + 1)
+        picture.time_base = Fraction(1, _TICKS)
+        self._container.mux(self._stream.encode(picture))
+        self.count += 1
+
+    def _start(self) -> None:
+        name, options = CODECS[self.codec]
+        try:
+            av.Codec(name, "w")
+        except ValueError as reason:
+            raise ConfigError(
+                f"codec is {self.codec}, with which this PyAV cannot write {self.path}; set codec=mp4v"
+            ) from reason
+        self._container = av.open(f"file:{self._temporary}", "w", format="mp4", options={"movflags": "+faststart"})
+        rate = Fraction(self.fps).limit_denominator(1001)
+        self._stream: Any = self._container.add_stream(name, rate=max(rate, Fraction(1, 1001)), options=options)
+        self._stream.height, self._stream.width = (side + side % 2 for side in self._size)
+        self._stream.pix_fmt = "yuv420p"
+        context = self._stream.codec_context
+        context.time_base = Fraction(1, 30_000 if self.codec == "mp4v" else _TICKS)
+        context.colorspace = context.color_primaries = context.color_trc = 1  # BT.709
+        context.color_range = 1  # of television: 16 to 235
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        problem: BaseException | None = error
+        try:
+            if self._container is not None:
+                try:
+                    if kind is None:
+                        self._container.mux(self._stream.encode(None))
+                finally:
+                    self._container.close()
+            if kind is None:
+                self._check()
+        except Exception as reason:
+            problem = problem or reason
+        self._replacing.__exit__(type(problem) if problem else None, problem, problem and problem.__traceback__)
+        if problem is not None and problem is not error:
+            raise problem
+
+    def _check(self) -> None:
+        if self.count == 0:
+            raise DataError(f"no frame was given, so {self.path} was not written")
+        try:
+            with av.open(f"file:{self._temporary}") as container:
+                kept = sum(1 for _ in _packets(container, container.streams.video[0])) - 1
+        except FFmpegError:
+            kept = 0
+        if kept != self.count:
+            raise DataError(f"{self.path} kept {kept} of {self.count} frames, so it was discarded; is the disk full?")
+
+
+class _Deinterlacer:
+    """FFmpeg's yadif: one frame out for each one in; frames that are not interlaced pass unchanged."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream, self._graph, self._key = stream, None, None
+
+    def push(self, frame: Any) -> Iterator[Any]:
+        """Take a frame, None at the end, and yield those that are ready."""
+        key = frame and (frame.format.name, frame.width, frame.height)
+        if self._graph is not None and key != self._key:
+            self._graph.push(None)
+            yield from self._ready()
+            self._graph = None
+        if frame is None:
+            return
+        if self._graph is None:
+            self._graph, self._key = av.filter.Graph(), key
+            source = self._graph.add_buffer(
+                width=frame.width, height=frame.height, format=frame.format, time_base=self._stream.time_base
+            )
+            yadif = self._graph.add("yadif", "mode=send_frame:deint=interlaced")
+            source.link_to(yadif)
+            yadif.link_to(self._graph.add("buffersink"))
+            self._graph.configure()
+        self._graph.push(frame)
+        yield from self._ready()
+
+    def _ready(self) -> Iterator[Any]:
+        while True:
+            try:
+                yield self._graph.pull()
+            except (av.error.BlockingIOError, av.error.EOFError):
+                return
+
+
+def _packets(container: Any, stream: Any) -> Iterator[Any]:
+    """Yield a stream's packets, last an empty one, which flushes; None instead where the file cannot be read on."""
+    try:
+        yield from container.demux(stream)
+    except FFmpegError:
+        yield None
+
+
+def _seek(container: Any, stream: Any, seconds: float) -> bool:
+    """Go to the key frame before a time stamp; False where a format cannot."""
+    if container.format.name == "mpeg":  # its time stamps are off by half a frame afterwards
+        return False
+    try:
+        container.seek(math.floor(seconds / stream.time_base), stream=stream)
+    except FFmpegError:
+        return False
+    return True
+
+
+def _some(items: Iterable[Any], count: int) -> Iterator[Any]:
+    return (item for item, _ in zip((each for each in items if each is not None), range(count), strict=False))
+
+
+def _rgb(frame: Any, name: str) -> Picture:
+    """Convert by the frame's own tags of matrix and range, and turn it as its display matrix says."""
+    try:
+        image = frame.to_ndarray(format="rgb24")
+    except (FFmpegError, ValueError) as reason:
+        raise UnreadableError(
+            f"{name} has pixels of format {frame.format.name}, which cannot be converted to RGB; convert it to H.264"
+        ) from reason
+    turns = round(frame.rotation / 90) % 4  # counter-clockwise, as NumPy's
+    return np.ascontiguousarray(np.rot90(image, turns)) if turns else image
+
+
+def _one_color(image: Picture) -> bool:
+    few = image[::16, ::16]
+    return bool((few == few[0, 0]).all() and (image == image[0, 0]).all())
+
+
+def _truncated(path: Path) -> bool:
+    """Return whether a file is shorter than its outermost chunks say (MP4, AVI, Matroska); other formats do not say."""
+    at, size = 0, path.stat().st_size
+    with path.open("rb") as file:
+        while at < size:
+            file.seek(at)
+            length = _chunk_length(file.read(16))
+            if length is None:
+                return False
+            at += length
+    return at > size
+
+
+_BOXES = (b"ftyp", b"moov", b"mdat", b"moof", b"free", b"skip", b"wide", b"mfra", b"sidx", b"styp", b"uuid", b"meta")
+
+
+def _chunk_length(head: bytes) -> int | None:
+    """Return the bytes of the chunk that starts so; None if it does not say, or is of no known kind."""
+    if len(head) < 16:
+        return None
+    if head[:4] == b"RIFF":
+        return 8 + int.from_bytes(head[4:8], "little") if any(head[4:8]) else None
+    if head[:4] in (b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"):  # EBML header, Matroska segment
+        count = 9 - head[4].bit_length()  # leading zeros tell how many bytes the length has
+        value = int.from_bytes(head[4 : 4 + count], "big") - (1 << 7 * count)
+        return None if count > 8 or value == (1 << 7 * count) - 1 else 4 + count + value
+    if head[4:8] in _BOXES:
+        length = int.from_bytes(head[:4], "big")
+        return int.from_bytes(head[8:], "big") if length == 1 else length or None
+    return None

@@ -58,7 +58,7 @@ def predict_recording(
     layout: str = "auto",
     colormap: str = "magma",
     memory: float = 0.95,
-    codec: str = "mp4v",
+    codec: str = "h264",
     camera: Camera | Sequence[float | int] | None = None,
     max_depth: float | int | None = None,
     odometer: Odometer | None = None,
@@ -81,7 +81,7 @@ def predict_recording(
         layout: Of the video: ``"stacked"``, ``"beside"``, or ``"auto"``.
         colormap: Color map.
         memory: Weight of the past in the clip's running color range; see `RunningRange`.
-        codec: How the video is encoded, one of `saunet.prediction.clips.CODECS`.
+        codec: How the video is encoded, one of `saunet.io.video.CODECS`.
         camera: True intrinsics, which ``"ply"`` and ``"html"`` need; see `predict_clip`.
         max_depth: Leave points out that are farther, in the unit of depth.
         odometer: What ``"trajectory"`` needs.

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 
 from saunet.errors import one_of
 from saunet.io.colormaps import COLORMAPS, colorize
-from saunet.prediction.clips import VideoWriter
+from saunet.io.video import VideoWriter
 from saunet.prediction.files import ENDINGS, Style, write_output
 from saunet.prediction.panel import fit, label
 from saunet.prediction.pointcloud import Camera
@@ -57,7 +57,7 @@ class VideoSink(Sink):
         layout: How image and disparity are arranged, one of ``LAYOUTS``.
         colormap: Colors of the disparity, one of ``COLORMAPS``.
         labels: Write what is shown into the picture.
-        codec: One of `saunet.prediction.clips.CODECS`.
+        codec: One of `saunet.io.video.CODECS`.
 
     Raises:
         ConfigError: for a layout, colormap or codec that does not exist.
@@ -70,7 +70,7 @@ class VideoSink(Sink):
         layout: str = "auto",
         colormap: str = "magma",
         labels: bool = True,
-        codec: str = "mp4v",
+        codec: str = "h264",
     ) -> None:
         self._layout = one_of("layout", layout, LAYOUTS)
         self._colormap = one_of("colormap", colormap, COLORMAPS)

@@ -58,7 +58,7 @@ def render_video(
     layout: str = "auto",
     colormap: str = "magma",
     memory: float = 0.95,
-    codec: str = "mp4v",
+    codec: str = "h264",
     max_frames: int | None = None,
     labels: bool = True,
     progress: bool = True,
@@ -76,7 +76,7 @@ def render_video(
         layout: ``"stacked"`` (disparity below), ``"beside"``, or ``"auto"``.
         colormap: Color map.
         memory: Weight of the past in the running color range; see `RunningRange`.
-        codec: How the video is encoded, one of `saunet.prediction.clips.CODECS`; ``"vp09"`` plays in browsers.
+        codec: How the video is encoded, one of `saunet.io.video.CODECS`; ``"vp09"`` plays in browsers.
         max_frames: Stop after so many frames.
         labels: Name the two pictures.
         progress: Show a progress bar on a terminal.
@@ -111,7 +111,7 @@ def predict_clip(
     layout: str = "auto",
     colormap: str = "magma",
     memory: float = 0.95,
-    codec: str = "mp4v",
+    codec: str = "h264",
     camera: Camera | Sequence[float | int] | None = None,
     max_depth: float | int | None = None,
     odometer: Odometer | None = None,
@@ -136,7 +136,7 @@ def predict_clip(
         layout: Of the video: ``"stacked"``, ``"beside"``, or ``"auto"``.
         colormap: Color map.
         memory: Weight of the past in the running color range; see `RunningRange`.
-        codec: How the video is encoded, one of `saunet.prediction.clips.CODECS`; ``"vp09"`` plays in browsers.
+        codec: How the video is encoded, one of `saunet.io.video.CODECS`; ``"vp09"`` plays in browsers.
         camera: True intrinsics, which ``"ply"`` and ``"html"`` need: a `Camera`, or numbers as `Camera.from_numbers`
             takes them, in pixels of the first frame.
         max_depth: Leave points out that are farther, in the unit of depth.
