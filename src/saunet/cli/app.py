@@ -9,10 +9,10 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
 
 from saunet import __version__, plugins
 from saunet.errors import ConfigError, SaunetError, suggest
@@ -173,11 +173,24 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(overview())
     elif tool in ("-V", "--version", "version"):
         print(f"saunet {__version__}")
+    elif tool == "--completion" or tool == "--complete":
+        _completion(tool, rest[0] if rest else "")
+    elif tool == "resume":
+        run("train", rest, read=resumed)
     elif tool in TOOLS:
         run(tool, rest)
     else:
         hint = suggest(tool, TOOLS) or f"; the tools are {', '.join(TOOLS)}"
         sys.exit(f"saunet: the first word is a tool, not '{tool}'{hint}")
+
+
+def _completion(asked: str, word: str) -> None:
+    from saunet.cli.completion import complete, script
+
+    try:
+        print(script(word) if asked == "--completion" else "\n".join(complete(word, [*TOOLS, "resume"], table())))
+    except ConfigError as error:
+        sys.exit(f"saunet: {error}")
 
 
 def overview() -> str:
@@ -196,14 +209,40 @@ def table() -> Table:
     return read({name: tool.options for name, tool in TOOLS.items() if tool.options})
 
 
-def run(name: str, argv: Sequence[str]) -> None:
+def resumed(words: Sequence[str]) -> list[str]:
+    """Return the command line that continues a run: the run's own, from its last checkpoint, in its folder.
+
+    Args:
+        words: The run's folder, and what shall differ.
+
+    Raises:
+        ConfigError: if that is no run's folder.
+    """
+    from saunet.runs.folder import read
+
+    folder = Path(words[0]).absolute() if words else Path()
+    content = read(folder) if words else None
+    if content is None:
+        raise ConfigError(
+            f"saunet resume takes the folder of a run, with its run.json; got {' '.join(words) or 'none'}"
+        )
+    again = [word for word in content.get("overrides", []) if not word.startswith(("resume=", "init_from="))]
+    return [*again, f"resume={folder / 'checkpoints' / 'last.ckpt'}", f"hydra.run.dir='{folder}'", *words[1:]]
+
+
+def run(name: str, argv: Sequence[str], read: Callable[[Sequence[str]], Sequence[str]] = list) -> None:
     """Run a tool with the words of a command line.
+
+    Args:
+        name: The tool.
+        argv: The words.
+        read: What makes them the tool's own.
 
     Raises:
         SystemExit: with the exit code, unless all went well.
     """
     try:
-        code = _run(name, argv)
+        code = _run(name, read(argv))
     except KeyboardInterrupt:
         code = _say(name, "interrupted", 130)
     except Exception as error:
@@ -264,12 +303,15 @@ def call(name: str, composed: Composed, keys: Table) -> tuple[int, object]:
     """
     from saunet.cli import compose
     from saunet.cli.errors import sentence
+    from saunet.cli.log import quiet
     from saunet.cli.table import imported
 
     tool = TOOLS[name]
     options = compose.options(imported(tool.options), composed, keys)
     record = {"choices": composed.choices, "overrides": composed.overrides, "describe": sentence}
-    result = imported(tool.function)(options, **(record if tool.recorded else {}))
+    function = imported(tool.function)
+    quiet()
+    result = function(options, **(record if tool.recorded else {}))
     if isinstance(result, Shown):
         result.show()
     elif result is not None:
@@ -280,7 +322,7 @@ def call(name: str, composed: Composed, keys: Table) -> tuple[int, object]:
     return (result.exit_code if isinstance(result, Graded) else 0), result
 
 
-def job(name: str, cfg: DictConfig) -> object:
+def job(name: str, raising: bool, cfg: DictConfig) -> object:
     """Do one job of a sweep, perhaps in another process; what goes wrong is said at once and ends this job only.
 
     Returns:
@@ -290,13 +332,13 @@ def job(name: str, cfg: DictConfig) -> object:
 
     from saunet.cli import compose
     from saunet.cli.errors import sentence
-    from saunet.cli.sweeps import check_folder
+    from saunet.cli.sweeps import Failed, check_folder
 
     hydra = HydraConfig.get()
     try:
         plugins.load(cfg.plugins)
         keys = table()
-        composed = compose.of_job(cfg, hydra)
+        composed = compose.of_job(cfg, cast("DictConfig", hydra))
         if "output_dir" in composed.config:
             check_folder(composed.config["output_dir"], composed.folder)
         code, result = call(name, composed, keys)
@@ -305,7 +347,9 @@ def job(name: str, cfg: DictConfig) -> object:
     except Exception as error:
         reason = sentence(error) or f"{type(error).__name__}: {error}"
         print(f"saunet {name}: job {hydra.job.num} ({hydra.job.override_dirname}) failed: {reason}", file=sys.stderr)
-        raise
+        if raising:
+            raise
+        return Failed()
     return result.cost if isinstance(result, Costed) else None
 
 

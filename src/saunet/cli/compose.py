@@ -11,11 +11,10 @@ import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Optional, TypeVar, Union, cast
+from typing import Optional, TypeVar, Union
 
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
-from hydra.conf import HydraConf
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -151,7 +150,7 @@ def single(hydra: Hydra, name: str, overrides: list[str]) -> Composed | None:
         HydraConfig.instance().cfg = None
 
 
-def of_job(cfg: DictConfig, hydra_cfg: HydraConf) -> Composed:
+def of_job(cfg: DictConfig, hydra_cfg: DictConfig) -> Composed:
     """Return what a job of a sweep, or a single run, is to do.
 
     Raises:
@@ -163,7 +162,7 @@ def of_job(cfg: DictConfig, hydra_cfg: HydraConf) -> Composed:
         raise ConfigError(f"{missing[0]} is not set; add {needed} to the command line")
     plain = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
-    choices = OmegaConf.to_container(cast(DictConfig, hydra_cfg.runtime.choices), resolve=True)
+    choices = OmegaConf.to_container(hydra_cfg.runtime.choices, resolve=True)
     assert isinstance(choices, dict)
     return Composed(
         {str(key): value for key, value in plain.items()},

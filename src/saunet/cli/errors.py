@@ -40,6 +40,10 @@ def sentence(error: BaseException, table: Table | None = None) -> str | None:
         if isinstance(error, OSError):
             return f"cannot use {error.filename or 'a file'}: {error.strerror or error}; check the path and its rights"
         return None
+    if type(error).__name__ == "OverrideParseException":
+        given = str(getattr(error, "override", ""))
+        key, _, value = given.partition("=")
+        return f"{given} cannot be read; put the value in quotes: \"{key}='{value}'\""
     return _of_hydra(text, table)
 
 
@@ -67,11 +71,6 @@ def _of_hydra(text: str, table: Table | None) -> str:
     there = re.search(r"Could not append to config\. An item is already at '([^']+)'", text)
     if there:
         return f"+{there[1]}=... adds a key and there is one already; leave out the plus sign: {there[1]}=..."
-    typed = re.search(r"[Ee]rror parsing override '(.+?)'$", text, re.MULTILINE)
-    if typed:
-        given = typed[1]
-        key, _, value = given.partition("=")
-        return f"{given} cannot be read; put the value in quotes: '{key}=\"{value}\"'"
     wrong = re.search(r"Value '.*' of type .*|Cannot (?:assign|convert) .*|Invalid value .*", text)
     if wrong and full_key:
         return f"{full_key[1]}: {wrong[0][0].lower()}{wrong[0][1:]}"

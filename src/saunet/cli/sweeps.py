@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -18,14 +19,18 @@ from saunet.runs.folder import FILE
 from saunet.runs.sweep import PLAN, summary, write_plan
 
 
-def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[DictConfig], object]) -> int:
+class Failed:
+    """What a job returns that failed and said so."""
+
+
+def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[bool, DictConfig], object]) -> int:
     """Run a job for each combination of the values given.
 
     Args:
         hydra: Hydra.
         name: Of the root config.
         overrides: What the command line says.
-        task: What a job does with its configuration.
+        task: What a job does, given whether it raises what goes wrong, as a search wants it, and its configuration.
 
     Returns:
         The exit code.
@@ -38,13 +43,15 @@ def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[DictCon
     if planned:
         write_plan(folder, planned)
     failed: Exception | None = None
-    code = 1
+    code = 0
     try:
-        hydra.multirun(name, task, overrides)
+        returned = hydra.multirun(name, functools.partial(task, not planned), overrides)
+        jobs = [job for batch in returned for job in batch] if planned else []
+        code = 1 if any(isinstance(job.return_value, Failed) for job in jobs) else 0
     except KeyboardInterrupt:
         code = 130
     except Exception as error:
-        failed = error
+        failed, code = error, 1
     if not any(folder.glob("**/.hydra")) and failed:
         for file in (PLAN, "multirun.yaml"):
             (folder / file).unlink(missing_ok=True)
@@ -54,10 +61,10 @@ def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[DictCon
     if any(folder.glob(f"**/{FILE}")):
         text, finished = summary(folder, planned)
     else:  # of a tool that keeps no record of a run
-        finished = failed is None and code == 1
+        finished = code == 0
         text = f"sweep: {f'{len(planned)} jobs finished' if finished else 'not all jobs finished'}; results: {folder}"
     print(text, file=sys.stdout if finished else sys.stderr)
-    return 0 if finished else code
+    return 0 if finished else code or 1
 
 
 def _planned(cfg: DictConfig) -> list[list[str]]:

@@ -18,7 +18,7 @@ from saunet import schema
 from saunet.cli.table import Table
 from saunet.errors import ConfigError, suggest
 
-_OVERRIDE = re.compile(r"(?P<sign>\+{0,2}|~)(?P<key>[\w@/.:-]*[\w@/:-])=(?P<value>.*)", re.DOTALL)
+_OVERRIDE = re.compile(r"(?P<sign>\+{0,2}|~)(?P<key>[\w@/.:][\w@/.:-]*)=(?P<value>.*)", re.DOTALL)
 _GLOB = re.compile(r"""['"]?glob\(['"]?(?P<pattern>[^,()'"]*/[^,()'"]*)['"]?\)['"]?""")
 _FUNCTIONS = "choice|range|interval|glob|sort|shuffle|tag|extend_list|int|float|str|bool|json_str"
 _FUNCTION = re.compile(rf"({_FUNCTIONS})\(.*\)", re.DOTALL)
@@ -109,7 +109,7 @@ def overrides(
         found = _OVERRIDE.fullmatch(word)
         if found is None and word.startswith("~"):
             made.append(word)
-        elif found is None or (positional and not _known(found["key"], tool, table) and Path(word).exists()):
+        elif found is None or (positional and not _is_key(found["key"], tool, table) and Path(word).exists()):
             plain.append(word)
         else:
             key = (aliases or {}).get(found["key"], found["key"])
@@ -158,15 +158,16 @@ def _override(sign: str, key: str, value: str, tool: str, table: Table, sweeping
 
 def type_of(key: str, tool: str, table: Table) -> str:
     """Return the type of a key as `saunet.schema.Key.type`; ``any`` for one that is not known."""
-    found = {each.type for each in _candidates(key, tool, table)}
+    found = {each.type for each in known(key, tool, table)}
     return found.pop() if len(found) == 1 else "any"
 
 
-def _known(key: str, tool: str, table: Table) -> bool:
-    return key in table.groups() or bool(_candidates(key.split(".")[0], tool, table)) or key.startswith("hydra")
+def _is_key(key: str, tool: str, table: Table) -> bool:
+    return key in table.groups() or bool(known(key.split(".")[0], tool, table)) or key.startswith("hydra")
 
 
-def _candidates(key: str, tool: str, table: Table) -> list[schema.Key]:
+def known(key: str, tool: str, table: Table) -> list[schema.Key]:
+    """Return what a key can be: of the tool's options, or of any component that has it."""
     own = table.tools[tool].key(key)
     if own is not None:
         return [own]

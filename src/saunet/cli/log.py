@@ -1,0 +1,50 @@
+"""What is said besides results: to the terminal, and with the time into a file of the run's folder."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import warnings
+from pathlib import Path
+
+
+class RunLog(logging.FileHandler):
+    """A log in a run's folder. It makes no folder: what is said before there is one is kept and written later.
+
+    Args:
+        filename: The file; each further process of a run has its own.
+    """
+
+    def __init__(self, filename: str) -> None:
+        path, rank = Path(filename), os.environ.get("LOCAL_RANK", "0")
+        super().__init__(path if rank == "0" else path.with_stem(f"{path.stem}_rank{rank}"), delay=True)
+        self._early: list[logging.LogRecord] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record, once the folder exists."""
+        self._early.append(record)
+        if Path(self.baseFilename).parent.is_dir():
+            early, self._early = self._early, []
+            for each in early:
+                super().emit(each)
+
+
+class _NoAdvertisement(logging.Filter):
+    def filter(self, record: logging.LogRecord) -> bool:
+        return not record.getMessage().startswith(("💡", "TPU available", "Loading `train_dataloader` to estimate"))
+
+
+_NO_ADVERTISEMENT = _NoAdvertisement()
+
+
+def quiet() -> None:
+    """Let Lightning, once imported, speak through our loggers and of what concerns the user alone."""
+    if "lightning.pytorch.utilities.rank_zero" in sys.modules:
+        for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
+            logging.getLogger(name).handlers.clear()
+            logging.getLogger(name).propagate = True
+        for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
+            logging.getLogger(name).addFilter(_NO_ADVERTISEMENT)
+    warnings.filterwarnings("ignore", message=r".*LeafSpec.*")
+    warnings.filterwarnings("ignore", message=r".*does not have many workers.*")

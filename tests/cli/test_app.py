@@ -1,0 +1,217 @@
+"""From a command line to a tool's options: types, text, lists, paths, and what is said of mistakes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from unittest import mock
+
+import pytest
+from echo_tool import ECHOED, EchoOptions
+
+from saunet.cli import app
+
+ECHO = app.Tool(
+    "return what was given", "echo_tool:EchoOptions", "echo_tool:echo", ("echo road.png",), positional="input"
+)
+Said = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def echo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Said]:
+    """Run ``saunet echo``: ``code, out, err = echo("count=4")``; its options are the last of `ECHOED`."""
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf" / "echo.yaml").write_text(
+        "defaults:\n  - echo_schema\n  - data: null\n  - override hydra/job_logging: terminal\n  - _self_\n"
+        "output_dir: ${hydra:runtime.output_dir}\n"
+    )
+    work = tmp_path / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    monkeypatch.setattr(sys, "argv", ["saunet"])
+    monkeypatch.setenv("XDG_CACHE_HOME", str(CACHE))
+    ECHOED.clear()
+
+    def run(*words: str) -> tuple[int, str, str]:
+        code = 0
+        try:
+            app.main(["echo", f"--config-dir={tmp_path / 'conf'}", *words])
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    with mock.patch.dict(app.TOOLS, {"echo": ECHO}):
+        yield run
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    global CACHE
+    CACHE = tmp_path_factory.mktemp("cache")
+
+
+CACHE = Path()
+
+
+def _given(echo: Said, *words: str) -> EchoOptions:
+    code, _, err = echo(*words)
+    assert code == 0, err
+    return ECHOED[-1]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2024_05_01",
+        "0001",
+        "1e5",
+        "true",
+        "road.png",
+        "/data/a b/c.png",
+        "a=b.png",
+        "x,y.png",
+        "[1].png",
+        "a(1).png",
+        "#1.png",
+        "{a}.png",
+        "it's.png",
+        'say "x".png',
+        "C:\\data\\x.png",
+        "tail\\",
+        "12:30",
+        "ünï.png",
+    ],
+)
+def test_text_stays_what_was_typed(echo: Said, text: str) -> None:
+    assert _given(echo, f"input={text}").input == text
+    assert _given(echo, f"output_dir={text}").output_dir == text
+
+
+@pytest.mark.parametrize(
+    ("word", "names"),
+    [
+        ("names=one", ("one",)),
+        ("names=[one]", ("one",)),
+        ("names=one,two", ("one", "two")),
+        ("names=[2024_05_01,0001]", ("2024_05_01", "0001")),
+        ("names=['a,b', c d]", ("a,b", "c d")),
+        ("names=[]", ()),
+    ],
+)
+def test_one_value_is_a_list_of_one_and_names_stay(echo: Said, word: str, names: tuple[str, ...]) -> None:
+    assert _given(echo, word).names == names
+
+
+def test_types_nesting_and_components(echo: Said) -> None:
+    options = _given(echo, "numbers=3", "flag=true", "inner.factor=2", "data=synthetic_tiny", "data.workers=0")
+    assert options.numbers == (3.0,)
+    assert options.flag is True
+    assert options.inner.factor == 2.0
+    assert options.data is not None
+    assert options.data.name == "synthetic_tiny"
+    assert options.data.get("workers") == 0
+    assert _given(echo, "input=null").input is None
+
+
+def test_plain_words_are_the_input(echo: Said, tmp_path: Path) -> None:
+    assert _given(echo, "road.png").input == "road.png"
+    Path("a=b.png").touch()
+    assert _given(echo, "a=b.png").input == "a=b.png"
+    assert "given twice" in echo("road.png", "input=x")[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("coutn=3", ("unknown key 'coutn'", "did you mean 'count'?", "allowed:")),
+        ("inner.facotr=3", ("inner.facotr", "did you mean 'factor'?")),
+        ("+typo.key=3", ("unknown key 'typo'", "allowed:")),
+        ("+dta.root=x", ("unknown key 'dta'", "did you mean 'data'?")),
+        ("data=synthetic +data.wrokers=3", ("unknown key 'data.wrokers'", "did you mean 'data.workers'?")),
+        ("data=synthetic data.wrokers=3", ("unknown key 'data.wrokers'", "did you mean 'workers'?")),
+        ("data=sinthetic", ("unknown data 'sinthetic'", "did you mean 'synthetic'?")),
+        ("count=many", ("count", "'many'", "nteger")),
+        ("count=1,2", ("count=1,2 has several values", "-m", "count=[1,2]")),
+        ("count=-1", ("count is -1; it must be at least 0",)),
+        ("--count 3", ("no option --count", "count=3")),
+        ("--count=3", ("no option --count=3", "written without dashes: count=3")),
+        ("a b", ("'b' is not KEY=VALUE",)),
+        ("count=[", ("count=[", "quotes")),
+        ("+count=4", ("leave out the plus sign: count=...",)),
+        ("plugins=[nowhere]", ("no module 'nowhere'",)),
+    ],
+)
+def test_a_mistake_is_one_sentence(echo: Said, words: str, expected: tuple[str, ...]) -> None:
+    code, out, err = echo(*words.split(" "))
+    assert code == 1
+    assert out == ""
+    assert err.startswith("saunet echo: ")
+    assert err.count("\n") == 1
+    for each in expected:
+        assert each in err
+    assert list(Path().iterdir()) == []
+
+
+def test_a_sweep_keeps_text_and_writes_its_plan(echo: Said) -> None:
+    code, out, err = echo("-m", "input=0001,2024_05_01", "names=a,b", "hydra.sweep.dir=sweep")
+    assert code == 0, err
+    assert [(each.input, each.names) for each in ECHOED] == [
+        ("0001", ("a",)),
+        ("0001", ("b",)),
+        ("2024_05_01", ("a",)),
+        ("2024_05_01", ("b",)),
+    ]
+    assert "4 jobs finished" in out
+    assert "\"input='0001'\"" in Path("sweep/sweep.json").read_text()
+
+
+def test_a_failed_job_is_named_and_costs_no_other(echo: Said) -> None:
+    code, _, err = echo("-m", "count=-1,2", "hydra.sweep.dir=sweep")
+    assert code == 1
+    assert [each.count for each in ECHOED] == [2]
+    assert "job 0 (count=-1) failed: count is -1" in err
+
+
+def test_nothing_is_written_by_the_command_line_itself(echo: Said) -> None:
+    assert _given(echo).count == 3
+    assert list(Path().iterdir()) == []
+
+
+def test_help_says_what_each_key_is(echo: Said) -> None:
+    _, out, _ = echo("--help")
+    for each in ("input: str = null  A file.", "inner.factor: float = 1.0  How much.", "mode: a|b = a", "data=NAME"):
+        assert each in out
+    _, out, _ = echo("data=synthetic_tiny", "--help")
+    assert "data.workers: int" in out
+
+
+def test_the_first_word_is_a_tool(capsys: pytest.CaptureFixture[str]) -> None:
+    app.main(["--help"])
+    out = capsys.readouterr().out
+    assert all(name in out for name in app.TOOLS)
+    with pytest.raises(SystemExit, match="did you mean 'train'"):
+        app.main(["trian"])
+
+
+def test_completion(echo: Said, capsys: pytest.CaptureFixture[str]) -> None:
+    def completed(line: str) -> list[str]:
+        app.main(["--complete", line])
+        return capsys.readouterr().out.split()
+
+    assert "echo" in completed("saunet ec")
+    assert completed("saunet echo cou") == ["count="]
+    assert completed("saunet echo mode=") == ["mode=a", "mode=b"]
+    assert completed("saunet echo inner.fa") == ["inner.factor="]
+    assert "data=synthetic_tiny" in completed("saunet echo data=syn")
+    assert "data.workers=" in completed("saunet echo data=synthetic data.wo")
+    Path("road.png").touch()
+    assert completed("saunet echo input=ro") == ["input=road.png"]
+    assert (
+        "complete"
+        in subprocess.run(
+            [sys.executable, "-m", "saunet", "--completion", "bash"], capture_output=True, text=True, check=True
+        ).stdout
+    )
