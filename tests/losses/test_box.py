@@ -6,7 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from saunet.losses.box import box_mean
+from saunet.losses.functional import box_mean
 
 
 @pytest.mark.parametrize("size", [(2, 2), (2, 5), (3, 4), (7, 9)])

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from saunet.errors import ConfigError
 from saunet.models.encoders.efficientnet_lite import EfficientNetLite, SameConv2d
-from saunet.models.pretrained import load_pretrained
-from saunet.models.pretrained_keys import to_our_names
+from saunet.models.pretrained import load_pretrained, to_our_names
 from saunet.registry import encoders, poses
 
 VARIANTS = ("efficientnet_lite0", "efficientnet_lite1", "efficientnet_lite2")

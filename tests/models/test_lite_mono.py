@@ -114,3 +114,27 @@ def test_wrong_drop_path():
 def test_decoder_needs_a_level():
     with pytest.raises(ConfigError, match="deepest stride is 2; decoder 'lite_mono' needs at least 4"):
         decoders.build("lite_mono", features=(FeatureSpec(8, 2),))
+
+
+def test_weights_start_as_published():
+    """Encoder: He's normal distribution, fan out, for convolutions and linear layers; decoder: 0.02 and zero biases."""
+    encoder = encoders.build("lite_mono")
+    for layer in (encoder.reductions[1], encoder.stages[2][0].expand, encoder.stages[2][0].reduce, encoder.stem[3]):
+        fan_out = layer.weight[:, 0].numel()
+        assert layer.weight.std().item() == pytest.approx((2 / fan_out) ** 0.5, rel=0.05)
+    decoder = decoders.build("lite_mono", features=encoder.features)
+    for block in (*decoder.before, *decoder.after):
+        assert block[0].weight.std().item() == pytest.approx(0.02, rel=0.05)
+        assert not block[0].bias.any()
+
+
+def test_the_input_is_normalized_as_published():
+    """(x - 0.45) / 0.225: a picture of that gray gives what zeros give to the bare stem."""
+    encoder = encoders.build("lite_mono_tiny").eval()
+    seen = []
+    encoder.stem[0].register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
+    with torch.no_grad():
+        encoder(torch.full((1, 3, 32, 32), 0.45))
+        encoder(torch.full((1, 3, 32, 32), 0.675))
+    torch.testing.assert_close(seen[0], torch.zeros(1, 3, 32, 32), atol=1e-6, rtol=0)
+    torch.testing.assert_close(seen[1], torch.ones(1, 3, 32, 32), atol=1e-5, rtol=0)

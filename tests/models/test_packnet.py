@@ -58,6 +58,35 @@ def test_coarser_disparity_is_used():
     assert (fine - moved).abs().max() > 1e-4
 
 
+def test_the_decoder_computes_what_the_published_code_does():
+    """Its forward pass once more, from the published definition: zero padding, sigmoid / 0.5 handed on."""
+    torch.manual_seed(1)
+    features = tuple(FeatureSpec(32, 2**i) for i in range(3))
+    decoder = decoders.build("packnet", features=features, channels=(32, 32), scales=(0, 1))
+    fine, middle, deep = (torch.randn(1, 32, 16 // f.stride, 24 // f.stride) for f in features)
+
+    def block(conv, norm, x):
+        padded = F.conv2d(F.pad(x, [1, 1, 1, 1]), conv.weight, conv.bias)
+        return F.elu(F.group_norm(padded, 16, norm.weight, norm.bias))
+
+    def unpack(layer, x):
+        x = block(layer.reduce.conv, layer.reduce.norm, x)
+        return F.pixel_shuffle(F.conv3d(x[:, None], layer.expand.weight, layer.expand.bias, padding=1).flatten(1, 2), 2)
+
+    def inverse_depth(head, x):
+        return torch.sigmoid(F.conv2d(F.pad(x, [1, 1, 1, 1]), head.conv.weight, head.conv.bias)) / 0.5
+
+    with torch.no_grad():
+        x = torch.cat([unpack(decoder.unpackings[0], deep), middle], 1)
+        x = block(decoder.joins[0].conv, decoder.joins[0].norm, x)
+        coarse = inverse_depth(decoder.heads[1], x)
+        x = torch.cat([unpack(decoder.unpackings[1], x), fine, F.interpolate(coarse, scale_factor=2)], 1)
+        expected = inverse_depth(decoder.heads[0], block(decoder.joins[1].conv, decoder.joins[1].norm, x))
+        got = decoder([fine, middle, deep])
+    torch.testing.assert_close(got[0], expected * 0.5, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(got[1], coarse * 0.5, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [

@@ -14,14 +14,12 @@ import torch
 from torch import Tensor
 
 from saunet.errors import CheckpointError
-from saunet.models import pretrained_files
+from saunet.models import pretrained
 from saunet.models.depth import DepthNet
 from saunet.models.encoders.resnet import ResNet
 from saunet.models.encoders.stratified import StratifiedTransformer
 from saunet.models.encoders.swin import SwinTransformer
-from saunet.models.pretrained import load_pretrained
-from saunet.models.pretrained_files import PUBLIC_WEIGHTS, locate
-from saunet.models.pretrained_keys import resample_bias_table, to_our_names
+from saunet.models.pretrained import PUBLIC_WEIGHTS, load_pretrained, locate, resample_bias_table, to_our_names
 from saunet.registry import decoders, encoders, poses
 
 State = dict[str, Tensor]
@@ -268,7 +266,7 @@ class TestFiles:
             SwinTransformer(weights="imagenet")
         message = str(caught.value)
         assert "https://download.pytorch.org/models/swin_t-704ceda3.pth" in message
-        assert str(pretrained_files.cache_folder() / "swin_t-704ceda3.pth") in message
+        assert str(pretrained.cache_folder() / "swin_t-704ceda3.pth") in message
         assert "weights=/path/to/swin_t-704ceda3.pth" in message
 
     def test_url_is_fetched_once(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -285,7 +283,7 @@ class TestFiles:
         assert (tmp_path / "hub" / "checkpoints" / "w.pth").is_file()
 
     def test_wrong_hash_is_refused(self, tmp_path: Path) -> None:
-        path = pretrained_files.cache_folder() / PUBLIC_WEIGHTS["resnet18"].filename
+        path = pretrained.cache_folder() / PUBLIC_WEIGHTS["resnet18"].filename
         path.parent.mkdir(parents=True)
         path.write_bytes(b"half a download")
         with pytest.raises(CheckpointError, match=r"has sha256 .* but f37072fd\.\.\. is published; delete it"):

@@ -7,7 +7,7 @@ import torch
 
 from saunet.errors import ConfigError
 from saunet.models.encoders.resnet import ResNet
-from saunet.models.pretrained_keys import tile_frames
+from saunet.models.pretrained import tile_frames
 from saunet.registry import encoders
 
 
@@ -38,6 +38,14 @@ def test_parameter_count(name, published, width):
         model = encoders.build(name)
     assert sum(p.numel() for p in model.parameters()) == published - width * 1000 - 1000
     assert model.variant == name
+
+
+def test_convolutions_start_from_he_s_normal_distribution_with_fan_out():
+    model = ResNet((1, 1, 1, 1), bottleneck=True)
+    for conv in (model.conv1, model.layer3[0].conv2, model.layer4[0].conv3, model.layer2[0].downsample[0]):
+        fan_out = conv.weight[:, 0].numel()
+        assert conv.weight.std().item() == pytest.approx((2 / fan_out) ** 0.5, rel=0.03)
+        assert conv.weight.mean().abs().item() < 0.03 * (2 / fan_out) ** 0.5 + 1e-4
 
 
 def test_torchvision_names():

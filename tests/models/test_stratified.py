@@ -14,7 +14,7 @@ import torch.nn.functional as F
 
 from saunet.errors import ConfigError
 from saunet.models.encoders.stratified import StratifiedTransformer
-from saunet.models.layers import window_plan
+from saunet.models.layers import window
 from saunet.registry import encoders
 
 
@@ -123,7 +123,7 @@ def test_compiles_as_one_graph_for_any_batch_and_size_and_traces() -> None:
 
 @pytest.mark.parametrize("warm", [False, True])
 def test_exports_with_constant_plans_and_leaves_no_traces(warm: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(window_plan, "_KEPT", {})
+    monkeypatch.setattr(window, "_KEPT", {})
     encoder = little(depths=(2, 1, 1, 1)).eval()
     image = torch.rand(1, 3, 32, 64)
     with torch.no_grad():

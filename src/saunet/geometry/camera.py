@@ -25,6 +25,12 @@ def scale_intrinsics(K: Float[Tensor, "*b 3 3"], scale_x: Number, scale_y: Numbe
 
     Returns:
         Intrinsics in pixels of the resized image.
+
+    Example:
+        >>> K = torch.tensor([[100.0, 0.0, 49.5], [0.0, 100.0, 29.5], [0.0, 0.0, 1.0]])
+        >>> saunet.scale_intrinsics(K, 0.5, 0.5)[:2]
+        tensor([[50.0000,  0.0000, 24.5000],
+                [ 0.0000, 50.0000, 14.5000]])
     """
     x, y = _per_item(scale_x, K), _per_item(scale_y, K)
     return torch.stack(
@@ -48,6 +54,11 @@ def crop_intrinsics(K: Float[Tensor, "*b 3 3"], left: Number, top: Number) -> Fl
 
     Returns:
         Intrinsics in pixels of the crop.
+
+    Example:
+        >>> K = torch.tensor([[100.0, 0.0, 49.5], [0.0, 100.0, 29.5], [0.0, 0.0, 1.0]])
+        >>> saunet.crop_intrinsics(K, left=10, top=4)[:2, 2]
+        tensor([39.5000, 25.5000])
     """
     x, y = _per_item(left, K), _per_item(top, K)
     return torch.stack((K[..., 0, :] - x * K[..., 2, :], K[..., 1, :] - y * K[..., 2, :], K[..., 2, :]), dim=-2)
@@ -65,26 +76,15 @@ def flip_intrinsics(K: Float[Tensor, "*b 3 3"], width: Number) -> Float[Tensor, 
 
     Returns:
         Intrinsics in pixels of the mirrored image.
+
+    Example:
+        >>> K = torch.tensor([[100.0, 0.0, 40.0], [0.0, 100.0, 29.5], [0.0, 0.0, 1.0]])
+        >>> saunet.flip_intrinsics(K, width=100)[0, 2]
+        tensor(59.)
     """
     shift = (_per_item(width, K) - 1) * K[..., 2, :]
     mirrored = torch.cat((K[..., 0, :1], -K[..., 0, 1:]), dim=-1)
     return torch.stack((mirrored + shift, K[..., 1, :], K[..., 2, :]), dim=-2)
-
-
-@full_precision
-def invert_intrinsics(K: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Inverse of an upper triangular K in closed form: exact, and without the device synchronization of a solver.
-
-    Args:
-        K: Intrinsics in pixels.
-
-    Returns:
-        K^-1, which maps homogeneous pixels to rays at depth 1.
-    """
-    fx, skew, cx, fy, cy = K[..., 0, 0], K[..., 0, 1], K[..., 0, 2], K[..., 1, 1], K[..., 1, 2]
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    entries = (1 / fx, -skew / (fx * fy), (skew * cy / fy - cx) / fx, zero, 1 / fy, -cy / fy, zero, zero, one)
-    return torch.stack(entries, dim=-1).reshape(K.shape)
 
 
 def _per_item(value: Number, K: Tensor) -> Tensor | float:

@@ -20,6 +20,10 @@ def sigmoid_to_disparity(sigmoid: Float[Tensor, "*b"], min_depth: float, max_dep
 
     Returns:
         Disparity (inverse depth), 1/meter.
+
+    Example:
+        >>> saunet.sigmoid_to_disparity(torch.tensor([0.0, 1.0]), min_depth=0.1, max_depth=10.0)
+        tensor([ 0.1000, 10.0000])
     """
     low, high = 1 / max_depth, 1 / min_depth
     return low + (high - low) * sigmoid
@@ -34,6 +38,10 @@ def disparity_to_depth(disparity: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 
     Returns:
         Depth.
+
+    Example:
+        >>> saunet.disparity_to_depth(torch.tensor([0.5, 0.1]))
+        tensor([ 2., 10.])
     """
     return disparity.reciprocal()
 
@@ -46,14 +54,6 @@ def median_ratio(
 
     The median of an even count is the mean of the two middle values (as in NumPy, unlike ``torch.median``). Works
     without leaving the device.
-
-    Args:
-        prediction: Depth up to scale, greater than 0.
-        target: Depth in meters.
-        mask: Pixels that count.
-
-    Returns:
-        One ratio an image; 1 where the mask is empty.
     """
     ratio = _median(target, mask) / _median(prediction, mask)
     return torch.where(mask.flatten(1).any(1), ratio, torch.ones_like(ratio))

@@ -36,13 +36,7 @@ class GroundPlane(NamedTuple):
 
 
 def road_region(height: int, width: int, device: torch.device | None = None) -> Bool[Tensor, "{height} {width}"]:
-    """Return where a camera that looks ahead expects road: a trapezium in the lower two fifths of the image.
-
-    Args:
-        height: Of the image, in pixels.
-        width: Of the image, in pixels.
-        device: Where the mask is wanted; the CPU by default.
-    """
+    """Return where a camera that looks ahead expects road: a trapezium in the lower two fifths of the image."""
     v = (torch.arange(height, device=device)[:, None] + 0.5) / height
     u = (torch.arange(width, device=device) + 0.5) / width
     depth_in_image = (v - 0.6) / 0.4

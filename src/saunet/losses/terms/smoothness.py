@@ -43,10 +43,6 @@ def multiscale_smoothness(
     """Mean over scales of the edge-aware smoothness times 1/2**scale.
 
     A step between two pixels of scale s spans 2**s pixels of the image: the factor makes it a step per image pixel.
-
-    Args:
-        disparities: One map a scale.
-        image: The image at full resolution.
     """
     values = []
     for disparity in disparities:

@@ -37,11 +37,7 @@ class Velocity(Term):
         poses: Float[Tensor, "b s 4 4"],
         views: Sequence[View],
     ) -> TermResult:
-        """Return the mean over samples and sources whose distance is known.
-
-        Raises:
-            ConfigError: if no motion is predicted, or the batch does not say how far the camera traveled.
-        """
+        """Return the mean over samples and sources whose distance is known."""
         predictions = poses.shape[1] - ("T_stereo_tgt" in batch)
         if predictions == 0:
             raise ConfigError(

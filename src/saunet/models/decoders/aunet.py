@@ -68,11 +68,7 @@ class AUNetDecoder(nn.Module):
         self.heads = nn.ModuleList([DisparityHead(widths[scale]) for scale in self.scales])
 
     def forward(self, features: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Return sigmoid disparity, b 1 h/2**s w/2**s, for each scale s.
-
-        Args:
-            features: The encoder's feature maps, finest first.
-        """
+        """Return sigmoid disparity, b 1 h/2**s w/2**s, for each scale s."""
         projected = {
             level: project(feature)
             for level, project, feature in zip(self.skip_levels, self.projections, features, strict=True)
@@ -92,12 +88,7 @@ class AUNetDecoder(nn.Module):
 
 
 class AttentionBottleneck(nn.Module):
-    """Halve the map, attend, restore the size, join with the input (SAU-Net section III-C, the decoder's first layer).
-
-    Args:
-        channels: Channels in and out, the compressed channels that the attention weighs.
-        attention: Name of a registered attention.
-    """
+    """Halve the map, attend, restore the size, join with the input (SAU-Net section III-C, its first layer)."""
 
     def __init__(self, channels: int, attention: str) -> None:
         super().__init__()
@@ -115,9 +106,6 @@ class Mapping(nn.Module):
 
     Padded with zeros, not by reflection: a window encoder has no notion of where in the image it looks, and the border
     is what tells the decoder; on a road the height in the image says much about depth.
-
-    Args:
-        channels: Channels in and out.
     """
 
     def __init__(self, channels: int) -> None:

@@ -9,11 +9,7 @@ from saunet.types import FeatureSpec
 
 
 def by_level(features: Sequence[FeatureSpec]) -> dict[int, int]:
-    """Return ``{level: channels}`` of an encoder's features, finest first; level l has stride 2**l.
-
-    Raises:
-        ConfigError: if there is no feature, or the strides are not ascending powers of two.
-    """
+    """Return ``{level: channels}`` of an encoder's features, finest first; level l has stride 2**l."""
     strides = [feature.stride for feature in features]
     if not features or sorted(set(strides)) != strides or any(s < 1 or s & (s - 1) for s in strides) or strides[-1] < 2:
         raise ConfigError(
@@ -23,15 +19,7 @@ def by_level(features: Sequence[FeatureSpec]) -> dict[int, int]:
 
 
 def check_scales(scales: Sequence[int], levels: int) -> tuple[int, ...]:
-    """Return ``scales`` as a tuple.
-
-    Args:
-        scales: Scales to predict disparity at; scale s has the size of the image divided by 2**s.
-        levels: How many scales the decoder can predict.
-
-    Raises:
-        ConfigError: if they are not 0, 1, ... in order (a pyramid is indexed by scale), or more than there are levels.
-    """
+    """Return ``scales`` as a tuple."""
     scales = tuple(scales)
     if not scales or scales != tuple(range(len(scales))) or len(scales) > levels:
         raise ConfigError(

@@ -19,7 +19,8 @@ class LiteMonoDecoder(nn.Module):
     """Convolve, upsample, join with the skip, convolve, at half of the encoder's channels (Lite-Mono section 3.3).
 
     The finest features are at half size; a head's logits are enlarged by two before the sigmoid. So there is one scale
-    less than in other decoders: three for Lite-Mono's own encoder, as published.
+    less than in other decoders: three for Lite-Mono's own encoder, as published. Weights start as in the published code
+    (truncated normal, 0.02; zero biases), but for the heads' biases: see `DisparityHead`.
 
     Args:
         features: The encoder's features, finest first.
@@ -49,13 +50,14 @@ class LiteMonoDecoder(nn.Module):
         self.before = nn.ModuleList(before)
         self.after = nn.ModuleList(after)
         self.heads = nn.ModuleList(reversed(heads))
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.trunc_normal_(module.weight, std=0.02)
+        for block in (*before, *after):
+            nn.init.zeros_(block[0].bias)  # type: ignore[arg-type]
 
     def forward(self, features: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Return sigmoid disparity, b 1 h/2**s w/2**s, for each scale s.
-
-        Args:
-            features: The encoder's feature maps, finest first.
-        """
+        """Return sigmoid disparity, b 1 h/2**s w/2**s, for each scale s."""
         skips = dict(zip(self.skip_levels, features, strict=True))
         level = self.skip_levels[-1]
         x = skips[level]

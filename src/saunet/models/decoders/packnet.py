@@ -15,10 +15,18 @@ from saunet.models.layers.packing import GROUPS, ConvNormELU, Unpacking, initial
 from saunet.registry import decoders
 from saunet.types import FeatureSpec
 
+_MIN_DEPTH = 0.5
+"""Of PackNet's inverse depth, sigmoid / 0.5; what a level tells the next finer one."""
+
 
 @decoders.register("packnet")
 class PackNetDecoder(nn.Module):
     """Unpack, join with the skip and the coarser disparity, convolve (PackNet Table 1, version with concatenation).
+
+    As in the published code, a level hands sigmoid / 0.5 to the next finer one, the heads pad with zeros, and weights
+    start from Glorot and Bengio's uniform distribution. Two things are this library's for all decoders: the heads'
+    biases start as in `DisparityHead` instead of at 0, and `DepthNet` maps the sigmoid to depth by its own limits,
+    where PackNet takes sigmoid / 0.5 for inverse depth.
 
     Args:
         features: The encoder's features, finest first.
@@ -52,15 +60,13 @@ class PackNetDecoder(nn.Module):
             inputs = channels[level]
         self.unpackings = nn.ModuleList(unpackings)
         self.joins = nn.ModuleList(joins)
+        self.heads = nn.ModuleList([DisparityHead(channels[scale], padding="zeros") for scale in self.scales])
         initialize(self)
-        self.heads = nn.ModuleList([DisparityHead(channels[scale]) for scale in self.scales])
+        for head in self.heads:
+            head.start_bias()  # type: ignore[operator]
 
     def forward(self, features: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Return sigmoid disparity, b 1 h/2**s w/2**s, for each scale s.
-
-        Args:
-            features: The encoder's feature maps, finest first.
-        """
+        """Return sigmoid disparity, b 1 h/2**s w/2**s, for each scale s."""
         skips = dict(zip(self.skip_levels, features, strict=True))
         level = self.skip_levels[-1]
         x = skips[level]
@@ -71,7 +77,8 @@ class PackNetDecoder(nn.Module):
             if level in skips:
                 parts.append(skips[level])
             if maps:
-                parts.append(F.interpolate(maps[-1], scale_factor=2, mode="nearest").to(parts[0].dtype))
+                coarser = F.interpolate(maps[-1] / _MIN_DEPTH, scale_factor=2, mode="nearest")
+                parts.append(coarser.to(parts[0].dtype))
             x = join(torch.cat(parts, 1))
             if level < len(self.heads):
                 maps.append(self.heads[level](x))

@@ -58,11 +58,7 @@ class UNetDecoder(nn.Module):
         self.heads = nn.ModuleList([DisparityHead(channels[scale]) for scale in self.scales])
 
     def forward(self, features: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Return sigmoid disparity, b 1 h/2**s w/2**s, for each scale s.
-
-        Args:
-            features: The encoder's feature maps, finest first.
-        """
+        """Return sigmoid disparity, b 1 h/2**s w/2**s, for each scale s."""
         skips = dict(zip(self.skip_levels, features, strict=True))
         level = self.skip_levels[-1]
         x = skips[level]

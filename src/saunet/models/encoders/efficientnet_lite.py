@@ -44,13 +44,6 @@ class SameConv2d(nn.Conv2d):
 
     The padding depends on the size of the input: a stride of 2 pads an even side by one pixel less at the start than
     at the end, and an odd side equally.
-
-    Args:
-        inputs: Channels in.
-        outputs: Channels out.
-        kernel: Odd side of the kernel.
-        stride: 1 or 2.
-        groups: Groups of channels, as many as there are inputs for a depthwise convolution.
     """
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
@@ -70,15 +63,7 @@ class SameConv2d(nn.Conv2d):
 
 
 class InvertedResidual(nn.Module):
-    """MobileNetV2's block without squeeze-and-excitation: 1×1 up, depthwise, 1×1 down, ReLU6 after the first two.
-
-    Args:
-        inputs: Channels in.
-        outputs: Channels out.
-        kernel: Side of the depthwise kernel.
-        stride: 1, or 2 to halve the map.
-        expansion: Factor from the inputs to the channels of the depthwise convolution; 1 leaves the first 1×1 out.
-    """
+    """MobileNetV2's block without squeeze-and-excitation: 1×1 up, depthwise, 1×1 down, ReLU6 after the first two."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
         super().__init__()
@@ -160,11 +145,7 @@ class EfficientNetLite(nn.Module):
             load_pretrained(self, weights)
 
     def forward(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, ...]:
-        """Return the five feature maps, b c ceil(h/s) ceil(w/s), finest first.
-
-        Args:
-            image: RGB in [0, 1], 3 channels per frame; the network takes any h and w, decoders multiples of 32.
-        """
+        """Return the five feature maps of RGB in [0, 1], b c ceil(h/s) ceil(w/s), finest first; any h and w will do."""
         x = F.relu6(self.bn_stem(self.conv_stem((image * 255 - 127) / 128)), inplace=True)
         features = []
         for index, block in enumerate(self.blocks):

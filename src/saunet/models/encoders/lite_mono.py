@@ -28,7 +28,8 @@ class LiteMonoEncoder(nn.Module):
 
     A stem of three 3×3 convolutions; before each stage a strided convolution over the concatenation of the previous
     stage's input and output and the average-pooled image; each stage is dilated convolutions (`DilatedBlock`) and one
-    `GlobalBlock` at its end. With ``decoder=lite_mono`` the network has 3.1 M parameters, as published.
+    `GlobalBlock` at its end. Weights start as in the published code, from He et al.'s normal distribution (fan out).
+    With ``decoder=lite_mono`` the network has 3.1 M parameters, as published.
 
     Args:
         dims: Channels of the three stages.
@@ -91,16 +92,10 @@ class LiteMonoEncoder(nn.Module):
         self.size_divisor = 16
         for module in self.modules():
             if isinstance(module, nn.Conv2d | nn.Linear):
-                nn.init.trunc_normal_(module.weight, std=0.02)
-                if module.bias is not None:
-                    nn.init.zeros_(module.bias)
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
-        """Return the three feature maps, b c h/s w/s, finest first.
-
-        Args:
-            image: RGB in [0, 1]; h and w multiples of 16.
-        """
+        """Return the three feature maps of RGB in [0, 1], b c h/s w/s, finest first."""
         pooled = (image - self.mean) / self.std
         parts = [self.stem(pooled)]
         features = []
@@ -114,14 +109,7 @@ class LiteMonoEncoder(nn.Module):
 
 
 class DilatedBlock(nn.Module):
-    """Dilated depthwise 3×3, then two pointwise layers, added to the input (consecutive dilated convolutions, eq. (2)).
-
-    Args:
-        dim: Channels.
-        rate: Dilation.
-        expansion: How much wider the pointwise layers are.
-        drop_path: Probability of stochastic depth.
-    """
+    """Dilated depthwise 3×3, then two pointwise layers, added to the input (consecutive dilated convolutions, (2))."""
 
     def __init__(self, dim: int, rate: int, expansion: int, drop_path: float) -> None:
         super().__init__()
@@ -141,15 +129,7 @@ class DilatedBlock(nn.Module):
 
 
 class GlobalBlock(nn.Module):
-    """Cross-covariance attention, then two pointwise layers, added to the input (local-global features, eqs. (3)–(5)).
-
-    Args:
-        dim: Channels.
-        heads: Heads of the attention.
-        expansion: How much wider the pointwise layers are.
-        drop_path: Probability of stochastic depth.
-        position: Add a code of the position first, as in the first stage.
-    """
+    """Cross-covariance attention, then two pointwise layers, added to the input (local-global features, (3)–(5))."""
 
     def __init__(self, dim: int, heads: int, expansion: int, drop_path: float, position: bool) -> None:
         super().__init__()

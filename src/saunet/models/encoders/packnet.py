@@ -54,11 +54,7 @@ class PackNetEncoder(nn.Module):
         initialize(self)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
-        """Return the six feature maps, b c h/s w/s, finest first.
-
-        Args:
-            image: RGB in [0, 1], which PackNet takes as it is; h and w multiples of 32.
-        """
+        """Return the six feature maps of RGB in [0, 1], taken as it is, b c h/s w/s, finest first."""
         x = self.stem(image)
         features = [x]
         for stage, packing in zip(self.stages, self.packings, strict=True):
@@ -68,11 +64,7 @@ class PackNetEncoder(nn.Module):
 
 
 def check_channels(channels: Sequence[int]) -> None:
-    """Check that every number of channels divides into PackNet's normalization groups.
-
-    Raises:
-        ConfigError: if one does not.
-    """
+    """Check that every number of channels divides into PackNet's normalization groups."""
     if any(c < 1 or c % GROUPS for c in channels):
         raise ConfigError(
             f"channels is {tuple(channels)}; PackNet normalizes over {GROUPS} groups, give multiples of {GROUPS}"

@@ -18,13 +18,7 @@ _WIDTHS = (64, 128, 256, 512)
 
 
 class BasicBlock(nn.Module):
-    """Two 3×3 convolutions with a shortcut, the block of ResNet-18 and 34 (He et al. 2016, fig. 5 left).
-
-    Args:
-        inputs: Channels in.
-        width: Channels of the 3×3 convolutions.
-        stride: 1, or 2 to halve the map.
-    """
+    """Two 3×3 convolutions with a shortcut, the block of ResNet-18 and 34 (He et al. 2016, fig. 5 left)."""
 
     expansion = 1
 
@@ -45,13 +39,7 @@ class BasicBlock(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """1×1, 3×3, 1×1 convolutions with a shortcut, the block of ResNet-50 and up; it strides in the 3×3.
-
-    Args:
-        inputs: Channels in.
-        width: Channels of the 3×3 convolutions.
-        stride: 1, or 2 to halve the map.
-    """
+    """1×1, 3×3, 1×1 convolutions with a shortcut, the block of ResNet-50 and up; it strides in the 3×3."""
 
     expansion = 4
 
@@ -144,11 +132,7 @@ class ResNet(nn.Module):
             load_pretrained(self, weights)
 
     def forward(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, ...]:
-        """Return the five feature maps, b c h/s w/s, finest first.
-
-        Args:
-            image: RGB in [0, 1], 3 channels a frame; h and w multiples of 32.
-        """
+        """Return the five feature maps of RGB in [0, 1], b c h/s w/s, finest first."""
         x = F.relu(self.bn1(self.conv1((image - self.mean) / self.std)), inplace=True)
         features = [x]
         x = self.maxpool(x)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -14,12 +15,7 @@ START = 0.3
 
 
 class Conv3x3(nn.Conv2d):
-    """3×3 convolution with one pixel of reflection padding, as in Monodepth2's decoder: no frame along the border.
-
-    Args:
-        inputs: Channels in.
-        outputs: Channels out.
-    """
+    """3×3 convolution with one pixel of reflection padding, as in Monodepth2's decoder: no frame along the border."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(inputs, outputs, 3)
@@ -31,12 +27,7 @@ class Conv3x3(nn.Conv2d):
 
 
 class ConvELU(nn.Sequential):
-    """Reflection-padded 3×3 convolution and ELU, Monodepth2's decoder block.
-
-    Args:
-        inputs: Channels in.
-        outputs: Channels out.
-    """
+    """Reflection-padded 3×3 convolution and ELU, Monodepth2's decoder block."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(Conv3x3(inputs, outputs), nn.ELU(inplace=True))
@@ -49,15 +40,17 @@ class DisparityHead(nn.Module):
     a depth of a third of a unit, three times the nearest one: room on both sides, and about where networks trained from
     video settle. Logit 0 is only twice the nearest depth, and most of a road scene lies further away than that.
 
-    Args:
-        inputs: Channels of the feature map.
-        enlarge: How much larger the disparity is than the feature map; its logits are upsampled.
+    With ``enlarge`` the disparity is that much larger than the feature map: the logits are upsampled.
     """
 
-    def __init__(self, inputs: int, enlarge: int = 1) -> None:
+    def __init__(self, inputs: int, enlarge: int = 1, padding: Literal["reflect", "zeros"] = "reflect") -> None:
         super().__init__()
         self.enlarge = enlarge
-        self.conv = Conv3x3(inputs, 1)
+        self.conv = Conv3x3(inputs, 1) if padding == "reflect" else nn.Conv2d(inputs, 1, 3, padding=1)
+        self.start_bias()
+
+    def start_bias(self) -> None:
+        """Set the bias to its start."""
         nn.init.constant_(self.conv.bias, math.log(START / (1 - START)))  # type: ignore[arg-type]
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 _ _"]:

@@ -10,14 +10,7 @@ from saunet.errors import ConfigError
 
 
 class DropPath(nn.Module):
-    """Stochastic depth: drop a residual branch for a whole sample in training, scaled so that the mean is kept.
-
-    Args:
-        rate: Probability of dropping, in [0, 1).
-
-    Raises:
-        ConfigError: if ``rate`` is outside that range.
-    """
+    """Stochastic depth: drop a residual branch for a whole sample in training, scaled so that the mean is kept."""
 
     def __init__(self, rate: float = 0.0) -> None:
         super().__init__()

@@ -13,13 +13,7 @@ FOLDS = 8
 
 
 class ConvNormELU(nn.Module):
-    """2-D convolution, group normalization over 16 groups, ELU.
-
-    Args:
-        inputs: Channels in.
-        outputs: Channels out.
-        kernel: Side of the kernel, odd.
-    """
+    """2-D convolution, group normalization over 16 groups, ELU."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3) -> None:
         super().__init__()
@@ -32,12 +26,7 @@ class ConvNormELU(nn.Module):
 
 
 class ResidualConv(nn.Module):
-    """Two 3×3 convolutions beside a 1×1, summed, normalized and activated: PackNet's residual block.
-
-    Args:
-        inputs: Channels in.
-        outputs: Channels out.
-    """
+    """Two 3×3 convolutions beside a 1×1, summed, normalized and activated: PackNet's residual block."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -52,12 +41,7 @@ class ResidualConv(nn.Module):
 
 
 class Packing(nn.Module):
-    """Halve a map, losing no pixel (PackNet section 3.1, fig. 3a): fold 2×2 into channels, 3-D, 2-D convolution.
-
-    Args:
-        channels: Channels in and out.
-        kernel: Side of the 2-D convolution.
-    """
+    """Halve a map, losing no pixel (PackNet section 3.1, fig. 3a): fold 2×2 into channels, 3-D, 2-D convolution."""
 
     def __init__(self, channels: int, kernel: int = 3) -> None:
         super().__init__()
@@ -72,12 +56,7 @@ class Packing(nn.Module):
 
 
 class Unpacking(nn.Module):
-    """Double a map (PackNet section 3.1, fig. 3b): 2-D then 3-D convolution, unfold channels into 2×2 pixels.
-
-    Args:
-        inputs: Channels in.
-        outputs: Channels out.
-    """
+    """Double a map (PackNet section 3.1, fig. 3b): 2-D then 3-D convolution, unfold channels into 2×2 pixels."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()

@@ -16,13 +16,6 @@ class CrossCovarianceAttention(nn.Module):
     """softmax(K̂ᵀQ̂/τ) over channels (El-Nouby et al., XCiT, NeurIPS 2021, eq. (5)), with a learnt τ per head.
 
     Queries and keys are normalized along the pixels, in float32.
-
-    Args:
-        channels: Channels, a multiple of ``heads``.
-        heads: Groups of channels that attend among themselves.
-
-    Raises:
-        ConfigError: if the heads do not divide the channels.
     """
 
     def __init__(self, channels: int, heads: int) -> None:
@@ -46,12 +39,7 @@ class CrossCovarianceAttention(nn.Module):
 
 
 class FourierPosition(nn.Module):
-    """Sines and cosines of the normalized row and column, projected to the channels (XCiT section 3.4, after DETR).
-
-    Args:
-        channels: Channels out.
-        waves: Numbers per direction: half of them sines, half cosines.
-    """
+    """Sines and cosines of the normalized row and column, projected to the channels (XCiT section 3.4, after DETR)."""
 
     def __init__(self, channels: int, waves: int = 32) -> None:
         super().__init__()

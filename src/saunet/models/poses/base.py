@@ -16,11 +16,7 @@ MOTION_SCALE = 0.01
 
 
 def check_offsets(offsets: Sequence[int]) -> tuple[int, ...]:
-    """Return the time offsets of the sources as a tuple.
-
-    Raises:
-        ConfigError: if there is none, one is 0 (the target itself), or two are equal.
-    """
+    """Return the time offsets of the sources as a tuple."""
     offsets = tuple(offsets)
     if not offsets or 0 in offsets or len(set(offsets)) < len(offsets):
         raise ConfigError(
@@ -32,11 +28,7 @@ def check_offsets(offsets: Sequence[int]) -> tuple[int, ...]:
 def ordered_pairs(
     target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b s 3 h w"], offsets: Sequence[int]
 ) -> Float[Tensor, "sb 6 h w"]:
-    """Stack each source with the target, the earlier frame in the first three channels.
-
-    Returns:
-        All pairs in one batch, source by source: index ``s * b + b``.
-    """
+    """Stack each source with the target, the earlier frame in the first three channels; source by source."""
     pairs = []
     for index, offset in enumerate(offsets):
         source = sources[:, index]
@@ -49,10 +41,6 @@ def motions_to_sources(motion: Float[Tensor, "s b 6"], offsets: Sequence[int]) -
 
     A network sees every pair in the order of time and so always predicts T_later_earlier, which for steady driving is
     the same for all pairs. That is T_src_tgt where the source is the later frame; else it is inverted.
-
-    Args:
-        motion: Axis-angle (radians) and translation of each pair, before `MOTION_SCALE`.
-        offsets: Time offset of each source.
     """
     motion = MOTION_SCALE * motion.float()
     poses = [
@@ -63,11 +51,7 @@ def motions_to_sources(motion: Float[Tensor, "s b 6"], offsets: Sequence[int]) -
 
 
 def check_sources(sources: Tensor, offsets: Sequence[int]) -> None:
-    """Check that there is one source image, of b s 3 h w, per offset.
-
-    Raises:
-        ConfigError: if there is not.
-    """
+    """Check that there is one source image, of b s 3 h w, per offset."""
     if sources.shape[1] != len(offsets):
         raise ConfigError(
             f"the batch has {sources.shape[1]} source frames, the pose network was built for offsets {list(offsets)}; "

@@ -51,15 +51,7 @@ class PoseCNN(nn.Module):
     def forward(
         self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b s 3 h w"]
     ) -> Float[Tensor, "b s 4 4"]:
-        """Return T_src_tgt for each source: a target point times it is a source point.
-
-        Args:
-            target: The target image, RGB in [0, 1].
-            sources: The source images, in the order of ``offsets``.
-
-        Raises:
-            ConfigError: if the number of sources does not fit.
-        """
+        """Return T_src_tgt for each source: a target point times it is a source point."""
         check_sources(sources, self.offsets)
         frames = ordered_pairs(target, sources, self.offsets).contiguous(memory_format=torch.channels_last)
         motion = self.project(self.layers((frames - 0.45) / 0.225)).mean((2, 3))

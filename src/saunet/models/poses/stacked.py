@@ -21,14 +21,6 @@ class StackedPose(nn.Module):
     - ``triplet``: "this moment and the two adjacent frames" at once, in the order of time, and two motions.
 
     Both predict motions forward in time, which are inverted for sources before the target.
-
-    Args:
-        encoder: Called with the number of stacked frames; returns a network with ``features`` and ``size_divisor``.
-        input: What the encoder sees at once: ``pairs`` or ``triplet``.
-        offsets: Time offset of each source, in frames.
-
-    Raises:
-        ConfigError: for a wrong word or offsets, or ``triplet`` without exactly two sources.
     """
 
     def __init__(self, encoder: Callable[[int], Any], input: str, offsets: Sequence[int]) -> None:
@@ -48,15 +40,7 @@ class StackedPose(nn.Module):
     def forward(
         self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b s 3 h w"]
     ) -> Float[Tensor, "b s 4 4"]:
-        """Return T_src_tgt for each source: a target point times it is a source point.
-
-        Args:
-            target: The target image, RGB in [0, 1].
-            sources: The source images, in the order of ``offsets``.
-
-        Raises:
-            ConfigError: if the number of sources or the image size does not fit.
-        """
+        """Return T_src_tgt for each source: a target point times it is a source point."""
         check_sources(sources, self.offsets)
         divisible(target.shape[-2], target.shape[-1], self.encoder.size_divisor)
         if self.input == "pairs":
@@ -78,13 +62,7 @@ class StackedPose(nn.Module):
 
 
 class PoseHead(nn.Module):
-    """Monodepth2's pose decoder: 1×1 squeeze to 256, two 3×3, 1×1 to 6 per motion, mean over the map.
-
-    Args:
-        inputs: Channels of the encoder's deepest feature.
-        motions: How many motions to predict.
-        width: Channels in between.
-    """
+    """Monodepth2's pose decoder: 1×1 squeeze to 256, two 3×3, 1×1 to 6 per motion, mean over the map."""
 
     def __init__(self, inputs: int, motions: int, width: int = 256) -> None:
         super().__init__()
