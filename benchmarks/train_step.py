@@ -25,8 +25,8 @@ from omegaconf import OmegaConf
 from saunet import config
 from saunet.data.windows import DRAWS
 from saunet.registry import instantiate
-from saunet.training.assemble import assemble
 from saunet.training.speed import Speed
+from saunet.training.tool import TrainOptions, assemble
 
 SIZE = (192, 640)
 
@@ -42,7 +42,7 @@ def build(overrides: list[str], batch: int) -> tuple[Any, Any]:
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     data = instantiate(plain["data"])
     torch.manual_seed(0)
-    return assemble(plain, data), data
+    return assemble(TrainOptions.from_plain(plain), data), data
 
 
 def random_frames(batch: int, offsets: int, device: str) -> dict[str, Any]:

@@ -9,11 +9,10 @@ from __future__ import annotations
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from saunet import config
 from saunet.registry import instantiate
-from saunet.training.assemble import assemble
+from saunet.training.tool import TrainOptions, assemble
 
 GOLDEN: dict[str, list[float]] = {
     "saunet": [1.41653, 1.39354, 1.28218, 1.2556],
@@ -29,7 +28,7 @@ def test_the_first_losses_of_a_seeded_training(objective: str) -> None:
         cfg = compose("train", ["experiment=smoke", f"objective={objective}", "output_dir=unused", "data.color=0"])
     torch.manual_seed(cfg.seed)
     data = instantiate(config.plain(cfg.data))
-    model = assemble(dict(OmegaConf.to_container(cfg, resolve=True)), data)  # type: ignore[call-overload, arg-type]
+    model = assemble(TrainOptions.from_plain(config.plain(cfg)), data)
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
     data.setup("fit")
     losses = []

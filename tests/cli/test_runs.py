@@ -153,7 +153,7 @@ def test_a_finished_run_is_not_replaced_by_mistake(tool: Tool, smoke_run: Path, 
     shutil.copytree(smoke_run, run)
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     for mistake, words in (
-        ((), "holds best.ckpt of an earlier run; go on with it by resume=auto"),
+        ((), "holds best.ckpt of an earlier run; continue it by resume=auto"),
         (("seed=-1", "resume=auto"), "seed is -1"),
     ):
         outcome = tool("train", *QUICK, "hydra.run.dir=run", *mistake)
@@ -194,6 +194,6 @@ def test_sigterm_ends_a_run_with_a_message_and_a_record(tmp_path: Path) -> None:
         err = errors.read_text()
         assert run.returncode == 143
         assert "saunet-train: stopped by SIGTERM after step" in err
-        assert f"go on with resume={tmp_path}/r/checkpoints/last.ckpt" in err
+        assert f"resume with resume={tmp_path}/r/checkpoints/last.ckpt" in err
         assert record(tmp_path / "r")["status"] == "interrupted"
-        assert ("going on from" in heard + out) == (attempt == 1)
+        assert ("resuming from" in heard + out) == (attempt == 1)

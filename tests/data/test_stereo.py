@@ -187,8 +187,11 @@ def test_the_other_camera_of_a_sequence_that_has_one_only(tmp_path: Path) -> Non
 
 
 def test_assembling_needs_a_source() -> None:
-    from saunet.training.assemble import assemble
+    from saunet.registry import Spec
+    from saunet.training.tool import ModelOptions, TrainOptions, assemble
 
-    data = SyntheticDataModule(offsets=(), **SIZE)
+    nothing = Spec({})
+    model = ModelOptions(encoder=nothing, decoder=nothing)
+    options = TrainOptions(data=nothing, model=model, objective=nothing, output_dir="unused")
     with pytest.raises(ConfigError, match=r"data\.offsets is empty and data\.stereo is false"):
-        assemble({"model": {"pose": {"offsets": []}}}, data)
+        assemble(options, SyntheticDataModule(offsets=(), **SIZE))

@@ -17,8 +17,8 @@ from omegaconf import OmegaConf
 from saunet.data.module import DepthDataModule
 from saunet.data.windows import Selection
 from saunet.registry import REGISTRIES
-from saunet.training.assemble import assemble
 from saunet.training.module import SelfSupervisedDepth
+from saunet.training.tool import TrainOptions, assemble
 
 
 class Wall:
@@ -77,8 +77,9 @@ def config() -> dict[str, Any]:
         },
         "objective": plain_node("objective", "saunet"),
         "optim": {"lr": 3e-4},
-        "data": {},
+        "data": {"_target_": "Walls"},
         "protocol": None,
+        "output_dir": "unused",
     }
 
 
@@ -90,7 +91,7 @@ def walls() -> Walls:
 @pytest.fixture
 def model(config: dict[str, Any], walls: Walls) -> SelfSupervisedDepth:
     torch.manual_seed(0)
-    return assemble(config, walls)
+    return assemble(TrainOptions.from_plain(config), walls)
 
 
 @pytest.fixture

@@ -9,40 +9,44 @@ import pytest
 import tiny
 import torch
 from lightning import Callback, LightningModule, Trainer
-from torch import nn
 
-from saunet.training.averaging import WeightAverage
 from saunet.training.callbacks import LastCheckpoint
 from saunet.training.optim import Recipe
 
 
-def test_it_follows_its_formula_and_copies_counters() -> None:
-    network = nn.BatchNorm1d(1)
-    average = WeightAverage(network, 0.5)
-    expected = 1.0
-    for step in range(1, 30):
-        with torch.no_grad():
-            network.weight.fill_(step)
-            assert network.num_batches_tracked is not None
-            network.num_batches_tracked.fill_(step)
-        average.update(step)
-        decay = min(0.5, (1 + step) / (10 + step))
-        expected = decay * expected + (1 - decay) * step
-    assert float(average.values["weight"]) == pytest.approx(expected)
-    assert int(average.values["num_batches_tracked"]) == 29
+def test_it_follows_its_formula_from_the_first_step_and_copies_counters(tmp_path: Path) -> None:
+    """The warm-up: the decay is (1 + n) / (10 + n) after n steps, until it reaches the one that was asked for."""
+
+    class Follow(Callback):
+        def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+            self.expected = pl_module.pose.layer.weight.detach().clone()  # type: ignore[union-attr, operator]
+
+        def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+            steps = trainer.global_step - 1
+            decay = min(0.25, (1 + steps) / (10 + steps))
+            decays.append(decay)
+            live = pl_module.pose.layer.weight.detach()  # type: ignore[union-attr, operator]
+            self.expected = decay * self.expected + (1 - decay) * live
+
+    decays: list[float] = []
+    follow, model = Follow(), tiny.tiny_model(Recipe(lr=1e-1, ema=0.25))
+    tiny.tiny_trainer(tmp_path, max_epochs=2, limit_val_batches=0, callbacks=[follow]).fit(model, tiny.tiny_walls())
+    assert decays == pytest.approx([1 / 10, 2 / 11, 3 / 12, 0.25, 0.25, 0.25])
+    assert model.average is not None
+    torch.testing.assert_close(model.average.values["pose.layer.weight"], follow.expected)
+    assert int(model.average.values["depth.encoder.1.num_batches_tracked"]) == 6
 
 
-def test_it_stands_in_and_gives_back() -> None:
-    network = nn.Linear(1, 1)
-    average = WeightAverage(network, 0.9, {"weight": torch.tensor([[7.0]])})
-    own = network.weight.detach().clone()
-    average.put_in()
-    assert float(network.weight) == 7
-    assert torch.equal(average.training_weights()["weight"], own)
-    average.put_back()
-    assert torch.equal(network.weight.detach(), own)
-    average.put_back()  # nothing to give back: nothing happens
-    assert torch.equal(network.weight.detach(), own)
+def test_a_training_without_an_average_takes_up_the_weights_that_were_trained(tmp_path: Path) -> None:
+    last = str(tmp_path / "last.ckpt")
+    first = tiny.tiny_trainer(tmp_path, max_epochs=1, callbacks=[LastCheckpoint(str(tmp_path))])
+    first.fit(tiny.tiny_model(Recipe(lr=1e-2, ema=0.9)), tiny.tiny_walls())
+    stored = torch.load(last, weights_only=True)
+    again, model = tiny.tiny_trainer(tmp_path, max_epochs=1), tiny.tiny_model(Recipe(lr=1e-2))
+    again.fit(model, tiny.tiny_walls(), ckpt_path=last, weights_only=True)  # done already: nothing is trained
+    trained = stored["current_model_state"]["pose.layer.weight"]
+    assert torch.equal(model.pose.layer.weight.detach(), trained)  # type: ignore[union-attr, arg-type]
+    assert not torch.equal(trained, stored["state_dict"]["pose.layer.weight"])
 
 
 def test_the_average_is_validated_and_saved_and_the_weights_are_trained(tmp_path: Path) -> None:
@@ -60,7 +64,7 @@ def test_the_average_is_validated_and_saved_and_the_weights_are_trained(tmp_path
     assert torch.equal(validated[0], averaged)
     stored = torch.load(tmp_path / "last.ckpt", weights_only=True)
     assert torch.equal(stored["state_dict"]["pose.layer.weight"], averaged)
-    assert torch.equal(stored["saunet_training"]["weights"]["pose.layer.weight"], trained)  # type: ignore[arg-type]
+    assert torch.equal(stored["current_model_state"]["pose.layer.weight"], trained)  # type: ignore[arg-type]
 
 
 def test_frozen_parts_stay_as_they_are_statistics_included(tmp_path: Path) -> None:

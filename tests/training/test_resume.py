@@ -20,8 +20,7 @@ from saunet.registry import poses
 from saunet.runs.folder import Stopped
 from saunet.training.callbacks import LastCheckpoint
 from saunet.training.optim import Recipe
-from saunet.training.resume import resume_path, warm_start
-from saunet.training.resume_checks import changes
+from saunet.training.resume import changes, resume_path, warm_start
 from saunet.training.stopping import GracefulStop
 
 EPOCHS = 3
@@ -82,7 +81,7 @@ def test_asked_to_stop_it_saves_and_says_how_to_go_on(batch: int, whole: Path, t
     trainer = tiny.tiny_trainer(
         tmp_path, max_epochs=EPOCHS, callbacks=callbacks, accumulate_grad_batches=2, gradient_clip_val=1.0
     )
-    with pytest.raises(Stopped, match=r"stopped by SIGTERM after step \d+, .*go on with resume=.*last.ckpt") as stop:
+    with pytest.raises(Stopped, match=r"stopped by SIGTERM after step \d+, .*resume with resume=.*last.ckpt") as stop:
         trainer.fit(tiny.tiny_model(tiny.RECIPE), tiny.tiny_walls(batch_size=2))
     assert stop.value.code == 143
     assert trainer.global_step < BATCHES // 2
@@ -135,13 +134,13 @@ def test_where_a_run_resumes_from(tmp_path: Path) -> None:
 
 def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Path, config: Any, walls: Any) -> None:
     from saunet.runs.checkpoint import atomic_save
-    from saunet.training.assemble import assemble
+    from saunet.training.tool import TrainOptions, assemble
 
     with torch.no_grad():
         next(model.depth.parameters()).fill_(0.5)
     weights = {key: value for key, value in model.state_dict().items() if not key.startswith("pose.layers.0.")}
     atomic_save({"saunet": model.record, "state_dict": weights}, tmp_path / "a.ckpt")
-    other = assemble(config, walls)
+    other = assemble(TrainOptions.from_plain(config), walls)
     said = warm_start(other, tmp_path / "a.ckpt")
     count = len(other.depth.state_dict())
     assert f"all {count} tensors of the depth network" in said
@@ -238,20 +237,25 @@ def test_changed_networks_and_objectives_are_named(model: Any) -> None:
     }
     said = changes(before, now)
     assert said is not None
-    assert "goes on with the new objective.alpha 5.0 (it was 10.0), model.pose Other (it was PoseCNN);" in said
+    assert "uses the new objective.alpha 5.0 (it was 10.0), model.pose Other (it was PoseCNN);" in said
     assert changes({"objective": {}, "model": {}}, now) is None
 
 
 def test_a_changed_objective_is_not_kept_in_silence(
     config: dict[str, Any], walls: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from saunet.training.assemble import assemble
+    from saunet.training.tool import TrainOptions, assemble
 
     few = {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 0}
     first = tiny.tiny_trainer(tmp_path, **few, callbacks=[LastCheckpoint(str(tmp_path))])
-    first.fit(assemble(config, walls), walls)
+    first.fit(assemble(TrainOptions.from_plain(config), walls), walls)
     config["objective"]["alpha"] = 3.0
     again = tiny.tiny_trainer(tmp_path, **few)
     with caplog.at_level("INFO"):
-        again.fit(assemble(config, walls), walls, ckpt_path=str(tmp_path / "last.ckpt"), weights_only=True)
-    assert "goes on with the new objective.alpha 3.0 (it was 10.0)" in caplog.text
+        again.fit(
+            assemble(TrainOptions.from_plain(config), walls),
+            walls,
+            ckpt_path=str(tmp_path / "last.ckpt"),
+            weights_only=True,
+        )
+    assert "uses the new objective.alpha 3.0 (it was 10.0)" in caplog.text

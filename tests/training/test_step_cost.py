@@ -15,10 +15,10 @@ from saunet.data.module import DepthDataModule
 from saunet.losses import functional
 from saunet.losses.terms import photometric
 from saunet.registry import objectives
-from saunet.training.assemble import assemble
 from saunet.training.health import health
 from saunet.training.module import SelfSupervisedDepth
 from saunet.training.nonfinite import NonFinite
+from saunet.training.tool import TrainOptions, assemble
 
 WAITS = {
     "aten._local_scalar_dense",  # .item(), bool(), float()
@@ -59,7 +59,7 @@ def test_the_counter_counts() -> None:
 
 @pytest.mark.parametrize("objective", ["saunet", "monodepth2"])
 def test_nothing_in_a_step_waits_for_the_device(objective: str, config: dict[str, Any], walls: DepthDataModule) -> None:
-    model = assemble(config, walls)
+    model = assemble(TrainOptions.from_plain(config), walls)
     model.objective = objectives.build(objective)
     walls.setup("fit")
     loaded = next(iter(walls.train_dataloader()))

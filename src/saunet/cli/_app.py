@@ -210,7 +210,7 @@ def sentence(error: Exception) -> str | None:
         if type(each).__name__ == "MisconfigurationException":  # Lightning's word for a user's error
             return " ".join(str(each).split())
     if type(error).__name__ == "ProcessExitedException":  # a process that was spawned is gone
-        return f"{' '.join(str(error).split())}, so the run ends; go on with resume= and the run's last.ckpt"
+        return f"{' '.join(str(error).split())}, so the run ends; resume with resume= and the run's last.ckpt"
     text = f"{error}\n{error.__cause__ or ''}"
     if isinstance(error, MissingConfigException):  # which is an OSError too
         return _unknown_choice(text)

@@ -23,7 +23,7 @@ def demo(cfg: DictConfig) -> None:
     import saunet
     from saunet.evaluation import print_table, write_results
 
-    data, _ = fit(cfg)
+    data = fit(cfg).data
     folder = Path(cfg.output_dir)
     predictor = saunet.load(folder / "checkpoints" / "best.ckpt")
     result = evaluate_model(predictor.network, data, [])

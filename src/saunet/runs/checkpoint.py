@@ -7,7 +7,7 @@ plain containers. It is read with ``weights_only=True``, and only registered com
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,8 @@ class Checkpoint:
     """All weights, with their prefixes."""
     epoch: int | None
     global_step: int | None
+    rest: Mapping[str, Any] = field(default_factory=dict)
+    """All else that the file holds: what a training needs to be resumed."""
 
     def weights(self, part: str) -> dict[str, Tensor]:
         """Return the weights of ``"depth"`` or ``"pose"``, without prefix and without what ``torch.compile`` adds."""
@@ -150,7 +152,8 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     except CheckpointError as error:
         raise CheckpointError(f"{path}: {error}") from error
     state = {str(key): value for key, value in content["state_dict"].items() if isinstance(value, Tensor)}
-    return Checkpoint(path, record, state, content.get("epoch"), content.get("global_step"))
+    rest = {str(key): value for key, value in content.items() if key != "state_dict"}
+    return Checkpoint(path, record, state, content.get("epoch"), content.get("global_step"), rest)
 
 
 def store_scale(path: str | Path, scale: Scale) -> None:

@@ -2,62 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import WeightAveraging
+from torch import Tensor
 
 
-class WeightAverage:
-    """Exponential moving average of a model's parameters and buffers.
+class MovingAverage(WeightAveraging):
+    """Exponential moving average of a model's parameters and buffers, kept by Lightning.
 
     The first steps weigh more than ``decay`` says, so that the fresh weights are soon forgotten: after n steps the
-    decay is at most (1 + n) / (10 + n). What is no floating-point number (a counter) is copied.
+    decay is at most (1 + n) / (10 + n). What is no floating-point number (a counter) is copied. A checkpoint holds the
+    average as ``state_dict`` and the weights that are trained as ``current_model_state``.
 
     Args:
-        model: Whose weights.
         decay: Weight of the average so far, 0 to 1.
-        start: Where the average stands, by name; at the model's weights if None.
     """
 
-    def __init__(self, model: nn.Module, decay: float, start: Mapping[str, Tensor] | None = None) -> None:
-        self.model, self.decay = model, decay
-        self.values = {name: live.detach().clone() for name, live in self._live()}
-        for name, value in (start or {}).items():
-            if name in self.values:
-                self.values[name].copy_(value)
-        self._aside: dict[str, Tensor] | None = None
+    def __init__(self, decay: float) -> None:
+        super().__init__(multi_avg_fn=self._update)
+        self.decay = decay
 
-    @torch.no_grad()
-    def update(self, steps: int) -> None:
-        """Move the average towards the weights, after so many steps."""
-        decay = min(self.decay, (1 + steps) / (10 + steps))
-        pairs = [(self.values[name], live) for name, live in self._live()]
-        moving = [(average, live) for average, live in pairs if average.is_floating_point()]
-        torch._foreach_lerp_([average for average, _ in moving], [live.detach() for _, live in moving], 1 - decay)
-        for average, live in pairs:
-            if not average.is_floating_point():
-                average.copy_(live)
+    @property
+    def values(self) -> dict[str, Tensor]:
+        """The average, by name."""
+        assert self._average_model is not None
+        return dict(self._average_model.module.state_dict())
 
-    def training_weights(self) -> dict[str, Tensor]:
-        """Return the weights that are trained, also while the average stands in for them."""
-        return dict(self._aside) if self._aside is not None else {name: live.detach() for name, live in self._live()}
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Begin at the fresh weights."""
+        self._device = trainer.strategy.root_device  # where the model will be, but is not yet
+        super().setup(trainer, pl_module, stage)
+        if self._average_model is not None:
+            # At 0, the first step would be copied instead of averaged; on the CPU, reading it waits for no device.
+            self._average_model.n_averaged = torch.ones((), dtype=torch.long)
 
-    @torch.no_grad()
-    def put_in(self) -> None:
-        """Give the model the average, until `put_back`."""
-        self._aside = {name: live.detach().clone() for name, live in self._live()}
-        for name, live in self._live():
-            live.copy_(self.values[name])
+    def update(self, model: LightningModule) -> None:
+        """Move the average towards the weights, after a step."""
+        assert self._average_model is not None
+        self._average_model.update_parameters(model)
 
-    @torch.no_grad()
-    def put_back(self) -> None:
-        """Give the model its own weights again."""
-        aside, self._aside = self._aside, None
-        for name, live in self._live() if aside else ():
-            live.copy_(aside[name])  # type: ignore[index]
+    def on_train_batch_end(self, *_: Any) -> None:
+        """Do nothing: callbacks that came before this one would have saved an average without the last step."""
 
-    def _live(self) -> Iterator[tuple[str, Tensor]]:
-        yield from self.model.named_parameters()
-        wanted = self.model.state_dict().keys()  # buffers that are constants are in no checkpoint
-        yield from ((name, buffer) for name, buffer in self.model.named_buffers() if name in wanted)
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave the module its own weights; whoever wants the average loads a checkpoint."""
+
+    def _update(self, averages: Any, weights: Any, _: Any) -> None:
+        assert self._average_model is not None
+        steps = int(self._average_model.n_averaged) - 1
+        if averages[0].is_floating_point():  # all are of one type
+            torch._foreach_lerp_(averages, weights, 1 - min(self.decay, (1 + steps) / (10 + steps)))
+        else:
+            torch._foreach_copy_(averages, weights)

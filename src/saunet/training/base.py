@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from lightning import LightningModule
+from lightning import Callback, LightningModule
 from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities import rank_zero_info
-from torch import Tensor
 
-from saunet.training.averaging import WeightAverage
+from saunet.runs.folder import RunRecord
+from saunet.training.averaging import MovingAverage
 from saunet.training.optim import Recipe
-from saunet.training.resume_checks import changes, check_continues, settings
+from saunet.training.resume import continuation, settings
 from saunet.training.speed import Speed
 
 
 class TrainedModule(LightningModule):
-    """A module trained by a `Recipe`, that goes on after an interruption as if there had been none.
+    """A module trained by a `Recipe`, that resumes after an interruption as if there had been none.
 
     Args:
         recipe: Optimizer and schedule.
@@ -44,9 +44,17 @@ class TrainedModule(LightningModule):
         self.record = dict(record or {})
         self.objective_node: Mapping[str, Any] | None = None
         """Config node of the objective, where it is known; kept in checkpoints."""
-        self.average: WeightAverage | None = None
-        self._loaded_average: dict[str, Tensor] | None = None
+        self.run_record: RunRecord | None = None
+        """The run's ``run.json``, where there is one."""
+        self.average = MovingAverage(self.recipe.ema) if self.recipe.ema > 0 else None
         self._prepared = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "average": None}  # which holds a copy of this module
+
+    def configure_callbacks(self) -> list[Callback]:
+        """Let Lightning keep the average, and put it in while validating."""
+        return [self.average] if self.average is not None else []
 
     def setup(self, stage: str) -> None:
         """Freeze and switch on what the config asks for, once, in the process that trains."""
@@ -67,17 +75,11 @@ class TrainedModule(LightningModule):
             part.eval()
         return self
 
-    def on_fit_start(self) -> None:
-        """Begin or take up the average of the weights, on the training device."""
-        if self.recipe.ema > 0:
-            self.average = WeightAverage(self, self.recipe.ema, self._loaded_average)
-        self._loaded_average = None
-
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Make the step's randomness a function of seed, step and process: a resumed run draws what it would have."""
         micro = batch_idx % self.trainer.accumulate_grad_batches  # else accumulated batches would all draw the same
-        place = [self.seed, self.global_step, self.global_rank, micro]
-        torch.manual_seed(int(np.random.SeedSequence(place).generate_state(1)[0]))
+        position = [self.seed, self.global_step, self.global_rank, micro]
+        torch.manual_seed(int(np.random.SeedSequence(position).generate_state(1)[0]))
 
     def optimizer_step(
         self,
@@ -89,17 +91,7 @@ class TrainedModule(LightningModule):
         """Take one step, then move the average."""
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
         if self.average is not None:
-            self.average.update(self.global_step)
-
-    def on_validation_start(self) -> None:
-        """Validate the average, if there is one."""
-        if self.average is not None:
-            self.average.put_in()
-
-    def on_validation_end(self) -> None:
-        """Go on training the weights themselves."""
-        if self.average is not None:
-            self.average.put_back()
+            self.average.update(self)
 
     def configure_optimizers(self) -> Any:
         """Return the recipe's optimizer over all that is trained, and its schedule."""
@@ -121,29 +113,20 @@ class TrainedModule(LightningModule):
         return min(steps, trainer.max_steps) if trainer.max_steps != -1 else steps
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Store the record from which the networks are rebuilt, the recipe, and both kinds of weights."""
+        """Store the record from which the networks are rebuilt, and what a resumed training must share."""
         checkpoint["saunet"] = self.record
-        training: dict[str, Any] = {"recipe": self.recipe.to_plain(), "settings": self._settings()}
-        if self.average is not None:
-            training["weights"] = self.average.training_weights()
-            checkpoint["state_dict"] = {**checkpoint["state_dict"], **self.average.values}
-        checkpoint["saunet_training"] = training
+        checkpoint["saunet_training"] = self.training_state(getattr(self._trainer, "datamodule", None))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take up the weights that were trained, and the average apart; say what becomes of a changed recipe."""
+        """Check that the training continues, and say what becomes of a changed recipe, network or objective."""
         if self._trainer is None or self.trainer.state.fn != TrainerFn.FITTING:
             return
-        training = checkpoint.get("saunet_training", {})
-        before, now = training.get("settings", {}), self._settings()
-        check_continues(before, now)
-        if "weights" in training:
-            self._loaded_average = dict(checkpoint["state_dict"])
-            checkpoint["state_dict"] = {**checkpoint["state_dict"], **training["weights"]}
-        old = {"objective": before.get("objective", {}), "model": checkpoint.get("saunet", {}).get("model", {})}
-        new = {"objective": now.get("objective", {}), "model": self.record.get("model", {})}
-        for sentence in (self.recipe.resumed_from(training.get("recipe", {})), changes(old, new)):
-            if sentence:
-                rank_zero_info(sentence)
+        now = self.training_state(getattr(self.trainer, "datamodule", None))
+        for sentence in continuation(checkpoint, self.recipe, self.record, now["settings"]):
+            rank_zero_info(sentence)
+        if self.average is None and "current_model_state" in checkpoint:  # it is averaged no longer
+            checkpoint["state_dict"] = checkpoint["current_model_state"]
 
-    def _settings(self) -> dict[str, Any]:
-        return settings(self.seed, getattr(self._trainer, "datamodule", None), self.objective_node)
+    def training_state(self, data: Any) -> dict[str, Any]:
+        """Return what a checkpoint keeps of a training beside its networks."""
+        return {"recipe": self.recipe.to_plain(), "settings": settings(self.seed, data, self.objective_node)}

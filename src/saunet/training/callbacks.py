@@ -3,45 +3,31 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities import rank_zero_info
 from rich.console import Console
+from torch import Tensor
 
-from saunet.data.module import DepthDataModule
 from saunet.errors import CheckpointError, ConfigError, positive
 from saunet.io.atomic import replacing
+from saunet.io.colormaps import colorize
 from saunet.io.images import write_image
 from saunet.io.progress import watched
 from saunet.metrics.functional import RISING
+from saunet.prediction.panel import panel
 from saunet.runs.checkpoint import atomic_save
-from saunet.runs.folder import RunRecord
 from saunet.training.module import EPOCH_LOSS
-from saunet.training.pictures import training_panel
-from saunet.types import EvalBatch
-
-
-class SplitsRecorded(Callback):
-    """Write into ``run.json`` which frames a run sees, as one SHA-256 a split.
-
-    Args:
-        record: The run's record.
-    """
-
-    def __init__(self, record: RunRecord) -> None:
-        self.record = record
-
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write them once the data are set up."""
-        data = getattr(trainer, "datamodule", None)
-        if trainer.is_global_zero and isinstance(data, DepthDataModule):
-            self.record.write(splits=data.fingerprints())
+from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -101,6 +87,7 @@ class BestCheckpoint(ModelCheckpoint):
         super().__init__(folder, "best", monitor, mode=_direction(monitor), enable_version_counter=False)
         self.wanted = monitor
         self._scored_by, self._said = monitor, False
+        self._beside: Path | None = None
 
     @property
     def cost(self) -> float | None:
@@ -114,21 +101,31 @@ class BestCheckpoint(ModelCheckpoint):
         """Name in the checkpoint; without the monitor, which may have fallen back."""
         return "BestCheckpoint"
 
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Note where the checkpoint lies that is resumed: its best one lies beside it."""
+        self._beside = Path(str(trainer.ckpt_path)).parent if trainer.ckpt_path else None
+
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over the best so far from the run that is resumed, with its file: a new run has its own folder."""
-        best, folder = Path(state_dict["best_model_path"]), Path(str(self.dirpath))
-        if best.is_file() and best.parent != folder:
-            folder.mkdir(parents=True, exist_ok=True)
-            with replacing(folder / best.name, CheckpointError) as temporary:
+        """Take over the best so far from the run that is resumed, with its file, into this run's folder.
+
+        The recorded path is not followed: the folder may have been moved, and a foreign file may name any path.
+        """
+        folder = Path(str(self.dirpath))
+        own = folder / "best.ckpt"
+        best = self._beside / own.name if self._beside else own
+        if state_dict["best_model_path"] and best.is_file() and best.resolve() != own.resolve():
+            with replacing(own, CheckpointError) as temporary:
                 shutil.copyfile(best, temporary)
-            moved = str(folder / best.name)
-            state_dict = {
-                **state_dict,
-                "dirpath": str(folder),
-                "best_model_path": moved,
-                "kth_best_model_path": moved,
-                "best_k_models": {moved: state_dict["best_model_score"]},
-            }
+        path, score = (str(own), state_dict["best_model_score"]) if own.is_file() else ("", None)
+        known = {path: score} if path and score is not None else {}
+        state_dict = {
+            **state_dict,
+            "dirpath": str(self.dirpath),
+            "best_model_path": path,
+            "best_model_score": score,
+            "kth_best_model_path": path if known else "",
+            "best_k_models": known,
+        }
         super().load_state_dict(state_dict)
         self._scored_by = state_dict["monitor"]
 
@@ -188,12 +185,38 @@ class PicturePanel(Callback):
             return
         with torch.no_grad():
             pyramid, views, terms = pl_module.step(batch)  # type: ignore[operator]
-        panel = training_panel(batch, pyramid, views, terms, rows=self.rows)
+        picture = training_panel(batch, pyramid, views, terms, rows=self.rows)
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_image(self.folder / f"epoch_{trainer.current_epoch:03d}.png", panel)
+        write_image(self.folder / f"epoch_{trainer.current_epoch:03d}.png", picture)
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
-                logger.experiment.add_image("panel", panel, trainer.global_step, dataformats="HWC")
+                logger.experiment.add_image("panel", picture, trainer.global_step, dataformats="HWC")
+
+
+def training_panel(
+    batch: TrainBatch, pyramid: DepthPyramid, views: Sequence[View], terms: LossTerms, rows: int = 2
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw the first samples of a batch, one per row; maps of the loss are gray, white is 1 or the largest value."""
+    tiles: dict[str, UInt8[np.ndarray, "_ _ 3"]] = {}
+    count = min(rows, len(batch["name"]))
+    for row in range(count):
+        tag = f" {row + 1}" if count > 1 else ""
+        tiles[f"input{tag}"] = _rgb(batch["target"][row])
+        tiles[f"disparity{tag}"] = colorize(_array(pyramid.disparity[0][row, 0]))
+        tiles[f"warped neighbor{tag}"] = _rgb(views[0].image[row, 0])
+        for name, values in terms.maps.items():
+            shown = _array(values[row, 0].float())
+            top = max(float(shown.max()), 1e-6) if name != "automask" else 1.0
+            tiles[f"{name.replace('_', ' ')}{tag}"] = colorize(shown, (0.0, top), "gray")
+    return panel(tiles, columns=len(tiles) // count, tile_width=320)
+
+
+def _array(values: Tensor) -> Any:
+    return values.detach().float().cpu().numpy()
+
+
+def _rgb(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    return np.asarray((_array(image).transpose(1, 2, 0).clip(0, 1) * 255).round(), dtype=np.uint8)
 
 
 class Progress(TQDMProgressBar):

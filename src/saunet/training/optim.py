@@ -182,7 +182,7 @@ class Recipe:
         if not changed:
             return None
         parts = [f"keeps the checkpoint's {', '.join(kept)}"] * bool(kept)
-        parts += [f"goes on with the new {', '.join(taken)}"] * bool(taken)
+        parts += [f"uses the new {', '.join(taken)}"] * bool(taken)
         return (
             f"the resumed run {' and '.join(parts)}; "
             "to train on with other settings, start from its weights with init_from= instead of resume="

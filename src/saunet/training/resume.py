@@ -4,21 +4,32 @@ from __future__ import annotations
 
 import csv
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, ConfigError
-from saunet.runs.checkpoint import load_weights, read_checkpoint
-from saunet.training.module import SelfSupervisedDepth
+from saunet.runs.checkpoint import Checkpoint, load_weights, read_checkpoint
+from saunet.training.optim import Recipe
 from saunet.weights.files import read_model
+
+if TYPE_CHECKING:
+    from saunet.training.module import SelfSupervisedDepth
+
+BOUND = {
+    "seed": "seed",
+    "batch_size": "data.batch_size",
+    "train_split": "training frames (SHA-256 of their names)",
+}
+"""What decides the order of the data, with its name in a message."""
 
 
 def resume_path(resume: str | None, output_dir: str | Path, init_from: str | None = None) -> str | None:
-    """Return the checkpoint to go on from, or None.
+    """Return the checkpoint to resume from, or None.
 
     Args:
         resume: A path; ``auto`` for ``checkpoints/last.ckpt`` in the run's own folder, if there is one; or None.
@@ -33,44 +44,135 @@ def resume_path(resume: str | None, output_dir: str | Path, init_from: str | Non
         return str(last.resolve()) if last.is_file() else None
     if resume and init_from:
         raise ConfigError(
-            "resume= and init_from= are both set; resume= goes on with a training, init_from= starts a new one from "
+            "resume= and init_from= are both set; resume= continues a training, init_from= starts a new one from "
             "its weights: leave one out"
         )
     return str(Path(resume).expanduser().resolve()) if resume else None
 
 
 def check_unused(output_dir: str | Path) -> None:
-    """Check that a new training would not replace what an earlier one left.
-
-    Args:
-        output_dir: The run's folder.
+    """Check that a new training would not replace the checkpoints of an earlier one.
 
     Raises:
-        ConfigError: if it holds checkpoints.
+        ConfigError: if the folder holds any.
     """
     found = sorted((Path(output_dir) / "checkpoints").glob("*.ckpt"))
     if found:
         raise ConfigError(
-            f"{output_dir} holds {found[0].name} of an earlier run; go on with it by resume=auto, choose another "
+            f"{output_dir} holds {found[0].name} of an earlier run; continue it by resume=auto, choose another "
             "folder, or replace it with overwrite=true"
         )
 
 
-def check_resume(model: SelfSupervisedDepth, path: str) -> int:
-    """Check that a training can go on from a checkpoint, before the trainer finds out in its own words.
+def check_resume(model: SelfSupervisedDepth, path: str, data: Any) -> int:
+    """Check that a training can be resumed from a checkpoint, before the trainer finds out in its own words.
 
     Returns:
         The steps done by then.
 
     Raises:
-        CheckpointError: if the file cannot be read or belongs to another model or other data.
+        CheckpointError: if the file cannot be read, lacks what resuming needs, or belongs to other networks or data.
     """
     checkpoint = read_checkpoint(path)
+    missing = _missing(checkpoint)
+    if missing:
+        raise CheckpointError(
+            f"{path} has no {missing}, so the training cannot be resumed where it was; give the last.ckpt of a run, or "
+            f"start a new training from its weights with init_from={path}"
+        )
     checkpoint.record.check_same_training(model.record)
     load_weights(model.depth, checkpoint.weights("depth"), "depth network")
     if model.pose is not None:
         load_weights(model.pose, checkpoint.weights("pose"), "pose network")
+    list(continuation(checkpoint.rest, model.recipe, model.record, model.training_state(data)["settings"]))
     return checkpoint.global_step or 0
+
+
+def _missing(checkpoint: Checkpoint) -> str | None:
+    rest = checkpoint.rest
+    if not isinstance(rest.get("loops"), Mapping) or not rest["loops"] or checkpoint.global_step is None:
+        return "loop state (it holds weights only)"
+    states = rest.get("optimizer_states")
+    if not isinstance(states, list) or not states or not all(isinstance(each, Mapping) for each in states):
+        return "optimizer state (it holds weights only)"
+    if checkpoint.global_step > 0 and not all(each.get("state") for each in states):
+        return "optimizer state (it is empty)"
+    return None if rest.get("lr_schedulers") else "state of the learning-rate schedule"
+
+
+def settings(seed: int, data: Any, objective: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return what a checkpoint keeps of a training beside its recipe and its networks; what is unknown is left out."""
+    kept: dict[str, Any] = {"seed": seed}
+    if objective:
+        kept["objective"] = dict(objective)
+    batch_size, datasets = getattr(data, "batch_size", None), getattr(data, "datasets", {})
+    if batch_size is not None:
+        kept["batch_size"] = batch_size
+    if "train" in datasets:
+        kept["train_split"] = datasets["train"].fingerprint()
+    return kept
+
+
+def continuation(
+    checkpoint: Mapping[str, Any], recipe: Recipe, record: Mapping[str, Any], now: Mapping[str, Any]
+) -> Iterator[str]:
+    """Check that a resumed training sees the same samples in the same order; yield what it changes, in sentences.
+
+    Args:
+        checkpoint: Of the training so far.
+        recipe: Of the resumed training.
+        record: Its model record.
+        now: Its `settings`.
+
+    Raises:
+        CheckpointError: if it sees other samples.
+        ConfigError: if its optimizer is another one.
+    """
+    training = checkpoint.get("saunet_training", {})
+    before = training.get("settings", {})
+    for key, name in BOUND.items():
+        if key in before and key in now and before[key] != now[key]:
+            was, is_ = (str(each)[:16] for each in (before[key], now[key]))
+            raise CheckpointError(
+                f"the checkpoint was trained with {name} {was} and this run has {is_}, so it cannot be resumed where "
+                "it was; give the same settings, or start a new training from its weights with init_from= instead of "
+                "resume="
+            )
+    old = {"objective": before.get("objective", {}), "model": checkpoint.get("saunet", {}).get("model", {})}
+    new = {"objective": now.get("objective", {}), "model": record.get("model", {})}
+    for sentence in (recipe.resumed_from(training.get("recipe", {})), changes(old, new)):
+        if sentence:
+            yield sentence
+
+
+def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
+    """Say in one sentence which settings of networks and objective a resumed training changes; None for no change."""
+    found = [each for name in now if name in before for each in _differences(before[name], now[name], name)]
+    if not found:
+        return None
+    return (
+        f"the resumed run uses the new {', '.join(found)}; "
+        "to train on with other settings, start from its weights with init_from= instead of resume="
+    )
+
+
+def _differences(before: Any, now: Any, name: str) -> Iterator[str]:
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        if not before or not now:  # not known
+            return
+        kinds = [str(each.get("_target_")).rpartition(".")[2] for each in (before, now)]
+        if kinds[0] != kinds[1]:
+            yield f"{name} {kinds[1]} (it was {kinds[0]})"
+            return
+        for key in now:
+            if key in before and key != "weights":  # what the networks started from is behind them
+                yield from _differences(before[key], now[key], f"{name}.{key}")
+    elif _plain(before) != _plain(now):
+        yield f"{name} {now} (it was {before})"
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
 
 
 @rank_zero_only

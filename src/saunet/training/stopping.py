@@ -24,9 +24,9 @@ LAST = "last.ckpt"
 
 
 def way_on(folder: str | Path) -> str:
-    """Return how a run with this checkpoint folder is continued, as the end of a sentence."""
+    """Return how a run with this checkpoint folder is resumed, as the end of a sentence."""
     last = Path(folder) / LAST
-    return f"go on with resume={last}" if last.is_file() else "no checkpoint was written yet, so start again"
+    return f"resume with resume={last}" if last.is_file() else "no checkpoint was written yet, so start again"
 
 
 class GracefulStop(Callback):

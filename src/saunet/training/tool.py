@@ -1,0 +1,439 @@
+"""Train: typed options in, a run folder out. Everything is checked before anything is written."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lightning import Callback, Trainer, seed_everything
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.loggers import Logger
+
+from saunet.data.module import DepthDataModule
+from saunet.errors import ConfigError, SaunetError, divisible, in_range, one_of, positive, suggest
+from saunet.metrics.depth import DepthMetrics
+from saunet.metrics.functional import ERROR_NAMES
+from saunet.metrics.protocols import protocol
+from saunet.registry import Spec
+from saunet.runs.checkpoint import build_networks
+from saunet.runs.folder import locked, recording, remove_partial_files
+from saunet.runs.record import ModelRecord, Scale
+from saunet.training.callbacks import AtomicCheckpointIO, BestCheckpoint
+from saunet.training.module import SelfSupervisedDepth
+from saunet.training.optim import Recipe
+from saunet.training.resume import check_resume, check_unused, keep_rows, resume_path, warm_start
+from saunet.training.speed import Speed
+from saunet.training.stopping import way_on
+
+PRECISIONS = ("32-true", "32", "16-mixed", "16", "bf16-mixed", "bf16")
+"""Precisions in which a training runs: images and losses stay in float32."""
+TRAINER: Mapping[str, Any] = {
+    "accelerator": "auto",
+    "devices": 1,
+    "max_epochs": 80,
+    "log_every_n_steps": 10,
+    "num_sanity_val_steps": 0,
+    "enable_model_summary": False,
+    "use_distributed_sampler": False,  # our samplers are sharded already, and exact: no sample is repeated or dropped
+}
+"""What the trainer is given unless the options say otherwise."""
+CALLBACKS = {
+    "progress": "callbacks.Progress",
+    "best": "callbacks.BestCheckpoint",
+    "last": "callbacks.LastCheckpoint",  # after `best`, so that it knows the best of the epoch that it closes
+    "stop": "stopping.GracefulStop",
+    "processes": "stopping.ProcessWatch",
+    "non_finite": "nonfinite.NonFinite",
+    "health": "health.HealthMonitor",
+    "loader": "loading.LoaderMonitor",
+    "pictures": "callbacks.PicturePanel",
+}
+LOGGERS = {"csv": "CSVLogger", "tensorboard": "TensorBoardLogger"}
+_TRUSTED = ("lightning.", "torch.", "saunet.")
+"""Packages that nested nodes of callbacks, loggers and the trainer may name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions:
+    """Networks: depth (encoder and decoder) and pose."""
+
+    encoder: Spec
+    decoder: Spec
+    pose: Spec | None = None
+    min_depth: float = 0.1
+    max_depth: float = 100.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """A training: its parts, and where it goes.
+
+    Args:
+        data: Data module.
+        model: Networks; the pose network's ``offsets`` follow the data unless they are given.
+        objective: Loss.
+        output_dir: The run's folder.
+        optim: Optimizer and schedule.
+        speed: Speed switches.
+        trainer: Arguments of `lightning.Trainer`; for those left out see `TRAINER`.
+        callbacks: By name: a callback, a mapping with ``_target_`` and its parameters, or None; the usual ones if None.
+        logger: The same for loggers; CSV and TensorBoard if None.
+        seed: Decides order, augmentation and fresh weights.
+        name: Of the run.
+        monitor: What chooses ``best.ckpt``.
+        protocol: Of the validation; the data's own if None.
+        resume: Checkpoint of this training to continue from; ``auto`` for the folder's ``last.ckpt``, if there is one.
+        init_from: Checkpoint whose weights a new training starts from.
+        overwrite: Replace the checkpoints that an earlier run left in the folder.
+
+    Raises:
+        ConfigError: for values with which no training can run.
+    """
+
+    data: Spec
+    model: ModelOptions
+    objective: Spec
+    output_dir: str | Path
+    optim: Recipe = field(default_factory=Recipe)
+    speed: Speed = field(default_factory=Speed)
+    trainer: Mapping[str, Any] = field(default_factory=dict)
+    callbacks: Mapping[str, Any] | None = None
+    logger: Mapping[str, Any] | None = None
+    seed: int = 0
+    name: str = "train"
+    monitor: str = "val/abs_rel"
+    protocol: str | None = None
+    resume: str | None = None
+    init_from: str | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        in_range("seed", positive("seed", self.seed, allow_zero=True), 0, 2**32 - 1)
+        self._check_trainer({**TRAINER, **self.trainer})
+        gradient = self.objective.get("gradient") or {}
+        has_lidar = self.data.get("target_depth", False) or self.data.get("dense", "none") != "none"
+        if gradient.get("target") == "lidar" and not has_lidar:
+            raise ConfigError(
+                "objective.gradient.target=lidar needs LiDAR depth in the training batches; "
+                "set data.target_depth=true, or use objective.gradient.target=image"
+            )
+
+    def _check_trainer(self, trainer: Mapping[str, Any]) -> None:
+        """Check what Lightning's trainer takes in silence and stumbles over later."""
+        known = list(inspect.signature(Trainer).parameters)
+        for key in trainer:
+            if not key.startswith("_") and key not in known:
+                hint = suggest(key, known) or ";"
+                raise ConfigError(f"unknown key 'trainer.{key}'{hint} allowed: {', '.join(known)}")
+        for key in ("accumulate_grad_batches", "check_val_every_n_epoch", "val_check_interval"):
+            value = trainer.get(key)
+            if isinstance(value, int | float):
+                positive(f"trainer.{key}", value)
+        precision = str(trainer.get("precision") or "32-true")
+        one_of("trainer.precision", precision, PRECISIONS)
+        if trainer.get("overfit_batches"):
+            raise ConfigError(
+                f"trainer.overfit_batches is {trainer['overfit_batches']}, which loses the position in the data order "
+                "that a training keeps; use trainer.limit_train_batches with few frames instead"
+            )
+        if self.optim.fused and not precision.startswith("32") and trainer.get("gradient_clip_val"):
+            raise ConfigError(
+                f"optim.fused=true, trainer.precision={precision} and trainer.gradient_clip_val do not go together: "
+                "gradients would be clipped before the fused optimizer unscales them; set optim.fused=false, or "
+                "leave one of the others out"
+            )
+        if trainer.get("max_epochs") == -1 and trainer.get("max_steps", -1) == -1:
+            raise ConfigError(
+                "trainer.max_epochs is -1: a training without end has no schedule; set it, or trainer.max_steps"
+            )
+        if trainer.get("enable_progress_bar") is False and (self.callbacks is None or self.callbacks.get("progress")):
+            raise ConfigError(
+                "trainer.enable_progress_bar is false, but callbacks.progress draws a bar; "
+                "set callbacks.progress=null instead"
+            )
+        strategy = trainer.get("strategy", "auto")
+        strategy = str(strategy.get("_target_") if isinstance(strategy, Mapping) else strategy).lower()
+        if "spawn" in strategy or "fork" in strategy:
+            raise ConfigError(
+                f"trainer.strategy is {strategy}, whose first process only waits for the others: a signal would end "
+                "the training without saving it; use trainer=ddp, or start it with torchrun"
+            )
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> TrainOptions:
+        """Read options from plain containers: a composed configuration, or the ``config`` of a ``run.json``."""
+        model: dict[str, Any] = {
+            key: Spec(value) if isinstance(value, Mapping) else value for key, value in plain["model"].items()
+        }
+        optim, speed = (
+            {key: value for key, value in plain.get(part, {}).items() if not key.startswith("_")}
+            for part in ("optim", "speed")
+        )
+        parts = {
+            "model": ModelOptions(**model),
+            "data": Spec(plain["data"]),
+            "objective": Spec(plain["objective"]),
+            "optim": Recipe(**optim),
+            "speed": Speed(**speed),
+            "trainer": {key: value for key, value in plain.get("trainer", {}).items() if not key.startswith("_")},
+        }
+        return cls(**{**plain, **parts})
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return the options as plain containers."""
+        model = {key: getattr(self.model, key) for key in ("encoder", "decoder", "pose", "min_depth", "max_depth")}
+        return {
+            **{key: getattr(self, key) for key in self.__dataclass_fields__},
+            "model": {key: dict(value.node) if isinstance(value, Spec) else value for key, value in model.items()},
+            "data": dict(self.data.node),
+            "objective": dict(self.objective.node),
+            "optim": self.optim.to_plain(),
+            "speed": asdict(self.speed),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainResult:
+    """Where a training's results are, and what made them."""
+
+    folder: Path
+    best: Path | None
+    """The best checkpoint."""
+    cost: float | None
+    """The best monitored value as what a search minimizes: its negative where more is better."""
+    data: DepthDataModule
+    model: SelfSupervisedDepth
+
+
+def train(
+    options: TrainOptions,
+    *,
+    choices: Mapping[str, str] | None = None,
+    overrides: Sequence[str] = (),
+    describe: Callable[[Exception], str | None] = lambda error: None,
+) -> TrainResult:
+    """Train a depth network on driving video; ``run.json`` in the run's folder says how that went.
+
+    Args:
+        options: The training.
+        choices: What was chosen for each part by name, such as ``{"data": "kitti"}``, for the record.
+        overrides: What the command line said, for the record.
+        describe: Says in one sentence what went wrong, or None for a defect of the program.
+
+    Raises:
+        SaunetError: if the options do not fit together, or the data or checkpoints cannot be used. Nothing is written.
+    """
+    folder = Path(options.output_dir)
+    if not (options.resume or options.overwrite):
+        check_unused(folder)
+    resume = resume_path(options.resume, folder, options.init_from)
+    seed_everything(options.seed, workers=True, verbose=False)
+    data = options.data.build()
+    model = assemble(options, data, pretrained=resume is None and options.init_from is None)
+    loggers = _loggers(options)
+    trainer = _trainer(options, loggers)
+    data.setup("fit")
+    data.train_dataloader()  # knows whether there are enough samples
+    steps = check_resume(model, resume, data) if resume else 0
+    started = warm_start(model, options.init_from) if options.init_from and not resume else None
+    known = {
+        "config": options.to_plain(),
+        "choices": dict(choices or {}),
+        "overrides": list(overrides),
+        "protocol": options.protocol or data.protocol,
+        "splits": data.fingerprints(),
+        "resumed": resume,
+    }
+    with locked(folder):
+        if not (options.resume or options.overwrite):
+            check_unused(folder)  # once more: another run may have ended meanwhile
+        remove_partial_files(folder)
+        with recording(folder, options.name, describe, **known) as record:
+            model.run_record = record
+            for logger in loggers if resume else ():
+                keep_rows(logger, steps)
+            if resume or started:
+                print(f"resuming from {resume}" if resume else started)
+            try:
+                trainer.fit(model, datamodule=data, ckpt_path=resume, weights_only=True)
+            except RuntimeError as error:
+                if trainer.world_size > 1 and re.search(r"Connection|NCCL|Gloo|gloo|store", str(error)):
+                    lost = "the connection to another process of this run broke, most likely because it died"
+                    raise SaunetError(f"{lost}; {way_on(folder / 'checkpoints')}") from error
+                raise
+    if trainer.is_global_zero:
+        print(f"results: {folder}")
+    kept = [each for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint)]
+    return TrainResult(
+        folder=folder,
+        best=next((Path(each.best_model_path) for each in kept if each.best_model_path), None),
+        cost=next((each.cost for each in kept if each.cost is not None), None),
+        data=data,
+        model=model,
+    )
+
+
+def assemble(options: TrainOptions, data: DepthDataModule, pretrained: bool = True) -> SelfSupervisedDepth:
+    """Build networks, objective, recipe and metrics: the one place where all parts meet.
+
+    Args:
+        options: The training.
+        data: What the model will be trained on; it names the validation protocol if the options do not.
+        pretrained: Whether to start from the public weights that the model names; a resumed training has its own.
+
+    Raises:
+        ConfigError: if a part cannot be built, or the parts do not fit together.
+        CheckpointError: if public weights cannot be fetched, read or fitted.
+    """
+    pose = _pose(options.model.pose, data)
+    objective = options.objective.build()
+    measured = ["val/loss", *(f"val/{name}" for name in (*ERROR_NAMES, *getattr(objective, "terms", {}))), "train/loss"]
+    one_of("monitor", options.monitor, measured)
+    for name, node in (options.callbacks or {}).items():
+        given = node.get("monitor") if isinstance(node, Mapping) else getattr(node, "wanted", None)
+        if given is not None:
+            one_of(f"callbacks.{name}.monitor", given, measured)
+    record = ModelRecord(
+        encoder=options.model.encoder.node,
+        decoder=options.model.decoder.node,
+        pose=pose.node if pose else None,
+        min_depth=options.model.min_depth,
+        max_depth=options.model.max_depth,
+        height=data.height,
+        width=data.width,
+        offsets=tuple(data.offsets),
+        scale=Scale(1.0, "stereo training") if data.stereo else None,
+        data={"name": options.name, **options.data.node},
+    )
+    depth, pose_network = build_networks(record, pretrained)
+    divisible(data.height, data.width, depth.size_divisor, what="data.height x data.width", by="the encoder's stride")
+    rules = protocol(options.protocol or data.protocol)
+    if not rules.accepts(data.ground_truth):
+        raise ConfigError(
+            f"protocol '{rules.name}' is defined on '{rules.ground_truth}' ground truth and the data give "
+            f"'{data.ground_truth}'; leave protocol unset, or choose the matching ground truth"
+        )
+    module = SelfSupervisedDepth(
+        depth=depth,
+        pose=pose_network,
+        objective=objective,
+        recipe=options.optim,
+        metrics=DepthMetrics(rules),
+        seed=options.seed,
+        record=record.to_plain(),
+        speed=options.speed,
+    )
+    module.objective_node = options.objective.node
+    return module
+
+
+def _pose(pose: Spec | None, data: DepthDataModule) -> Spec | None:
+    """Return the pose network for what there is to synthesize the target from."""
+    if not data.offsets and not data.stereo:
+        raise ConfigError(
+            "data.offsets is empty and data.stereo is false, so there is no source image to learn from; "
+            "set data.offsets=[-1,1] for video, data.stereo=true for a stereo pair, or both"
+        )
+    if not data.offsets:  # the stereo rig's motion is known
+        return None
+    if pose is None:
+        raise ConfigError(
+            f"model.pose is null but the data give neighbors in time at {list(data.offsets)}, whose motion has to be "
+            "learned; choose a model/pose, or learn from a stereo pair alone with data.stereo=true data.offsets=[]"
+        )
+    offsets = pose.get("offsets", data.offsets)
+    if list(offsets) != list(data.offsets):
+        raise ConfigError(
+            f"model.pose.offsets is {list(offsets)} but the data give frames at {list(data.offsets)}; "
+            "set data.offsets only, the pose network follows"
+        )
+    return pose.changed(offsets=list(data.offsets))
+
+
+def _loggers(options: TrainOptions) -> list[Any]:
+    nodes = options.logger
+    if nodes is None:
+        where = {"save_dir": str(options.output_dir), "name": None}
+        nodes = {
+            name: {"_target_": f"lightning.pytorch.loggers.{target}", "version": name, **where}
+            for name, target in LOGGERS.items()
+        }
+    built = [_part(f"logger.{name}", node, Logger) for name, node in nodes.items()]
+    return [each for each in built if each is not None]
+
+
+def _callbacks(options: TrainOptions) -> list[Any]:
+    nodes: Mapping[str, Any] | None = options.callbacks
+    if nodes is None:
+        nodes = {name: {"_target_": f"saunet.training.{target}"} for name, target in CALLBACKS.items()}
+    folder = Path(options.output_dir)
+    places: dict[str, dict[str, Any]] = {
+        "best": {"folder": folder / "checkpoints", "monitor": options.monitor},
+        "last": {"folder": folder / "checkpoints"},
+        "stop": {"folder": folder / "checkpoints"},
+        "processes": {"folder": folder, "checkpoints": folder / "checkpoints"},
+        "non_finite": {"folder": folder / "nonfinite"},
+        "pictures": {"folder": folder / "pictures"},
+    }
+    built = []
+    for name, node in nodes.items():
+        if isinstance(node, Mapping):
+            node = {**{key: str(value) for key, value in places.get(name, {}).items()}, **node}
+        built.append(_part(f"callbacks.{name}", node, Callback))
+    return [each for each in built if each is not None]
+
+
+def _trainer(options: TrainOptions, loggers: list[Any]) -> Trainer:
+    arguments = {key: _part(f"trainer.{key}", value, object) for key, value in {**TRAINER, **options.trainer}.items()}
+    plugins = [AtomicCheckpointIO(), *(arguments.pop("plugins", None) or [])]
+    callbacks = [*_callbacks(options), *(arguments.pop("callbacks", None) or [])]
+    arguments |= {"logger": loggers or False, "default_root_dir": str(options.output_dir)}
+    try:
+        return Trainer(**arguments, callbacks=callbacks, plugins=plugins)
+    except (MisconfigurationException, ValueError, TypeError) as reason:
+        raise ConfigError(" ".join(f"trainer: {reason}".split())) from reason
+
+
+def _part(key: str, node: Any, kind: type) -> Any:
+    """Build a callback, logger or part of the trainer from its node; what is no node is returned as it is.
+
+    Raises:
+        ConfigError: if it cannot be built, or is of another kind.
+    """
+    if isinstance(node, list | tuple):
+        return [_part(key, each, object) for each in node]
+    if node is None or not isinstance(node, Mapping):
+        if node is not None and not isinstance(node, kind):
+            raise ConfigError(f"{key} is {node!r}; it must be a {kind.__name__}, or a mapping with '_target_'")
+        return node
+    if "_target_" not in node:
+        if kind is object:
+            return {each: _part(f"{key}.{each}", value, object) for each, value in node.items()}
+        raise ConfigError(f"{key} has no '_target_'; name its class, or set {key}=null")
+    path = str(node["_target_"])
+    module, _, name = path.rpartition(".")
+    if kind is object and not path.startswith(_TRUSTED):
+        raise ConfigError(
+            f"{key} asks for '{path}'; only parts of {', '.join(each[:-1] for each in _TRUSTED)} are built"
+        )
+    try:
+        target = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as reason:
+        raise ConfigError(f"{key} asks for '{path}', which cannot be imported: {reason}") from reason
+    if kind is not object and not (inspect.isclass(target) and issubclass(target, kind)):
+        raise ConfigError(f"{key} asks for '{path}', which is no {kind.__name__}")
+    values = {each: _part(f"{key}.{each}", value, object) for each, value in node.items() if each[:1] != "_"}
+    try:
+        return target(**values)
+    except ModuleNotFoundError as reason:
+        what = key.replace(".", "=", 1)  # as the command line chose it
+        raise ConfigError(
+            f"{what} needs a package that is not installed; run `pip install 'saunet[track]'`"
+        ) from reason
+    except (SaunetError, ValueError, TypeError) as reason:
+        raise ConfigError(" ".join(f"{key}: {reason}".split())) from reason
