@@ -14,6 +14,7 @@ from lightning import Trainer
 from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
+from saunet.cli.compose import structured
 from saunet.data.module import DepthDataModule
 from saunet.data.windows import Selection
 from saunet.registry import REGISTRIES
@@ -58,7 +59,7 @@ class Walls(DepthDataModule):
 
 def plain_node(kind: str, name: str, **changes: Any) -> dict[str, Any]:
     """Return a component's config node as plain containers."""
-    node = OmegaConf.merge(OmegaConf.structured(REGISTRIES[kind].node(name)), changes)
+    node = OmegaConf.merge(OmegaConf.structured(structured(REGISTRIES[kind].node(name))), changes)
     return dict(OmegaConf.to_container(node))  # type: ignore[arg-type, call-overload]
 
 

@@ -157,7 +157,7 @@ def test_a_warm_start_from_a_shipped_model(
 ) -> None:
     from saunet.exporting.box import pack
     from saunet.runs.checkpoint import atomic_save
-    from saunet.training.assemble import assemble
+    from saunet.training.tool import assemble
     from saunet.weights import locate
 
     monkeypatch.setattr(locate, "BOX", tmp_path)
