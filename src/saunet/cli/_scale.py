@@ -13,63 +13,6 @@ from saunet.errors import ConfigError, one_of, positive
 from saunet.roots import SCALE_METHODS
 
 
-def apply_scale(cfg: DictConfig, record: Any, network: Any, pose: Any, data: Any) -> tuple[Any, Any, dict[str, Any]]:
-    """Return depth and pose network with the scale applied that ``cfg.scale`` asks for, and what to report of it.
-
-    Args:
-        cfg: The root of ``saunet-evaluate``.
-        record: The model's record; it may store a scale.
-        network: The depth network, on its device.
-        pose: The pose network, on its device, or None.
-        data: The data module, set up.
-
-    Raises:
-        ConfigError: if the method is unknown or lacks what it needs.
-        DataError: if no frame could be measured.
-    """
-    from saunet.data.neighbors import surroundings
-    from saunet.data.stereo import measured_distance
-    from saunet.scale import METHODS, MetricDepth, MetricMotion, estimate_scale
-
-    method, scale = _check(cfg), record.scale
-    if method in METHODS:
-        device = next(network.parameters()).device
-        odometer = _odometer(cfg, data) if cfg.scale.speeds else measured_distance
-        batches = surroundings(
-            data,
-            cfg.split,
-            device,
-            offsets=record.offsets if method == "speed" else (),
-            stereo=method == "stereo",
-            odometer=odometer if method == "speed" else None,
-            most=cfg.scale.frames,
-        )
-        height = data.camera_height if cfg.scale.camera_height is None else cfg.scale.camera_height
-        network.eval()
-        estimate = estimate_scale(method, batches, lambda image: network(image).depth[0], pose, height)
-        scale = _report(cfg, estimate, Path(cfg.output_dir))
-    scale = _chosen(method, scale)
-    if scale is None:
-        return network, pose, {"method": method, "factor": None}
-    measured = estimate.as_json() if method in METHODS else {"source": scale.source, "factor": scale.factor}
-    measured.pop("per_frame", None)  # scale.json has it
-    motion = None if pose is None else MetricMotion(pose, scale)
-    return MetricDepth(network, scale), motion, {"method": method, **measured}
-
-
-def _odometer(cfg: DictConfig, data: Any) -> Any:
-    """Return the odometer of a table of speeds, which counts frames as they were recorded."""
-    from saunet.scale.speeds import read_speeds
-
-    table = read_speeds(cfg.scale.speeds)
-    table.check_drives([drive.name for drive in data.datasets[cfg.split].drives])
-
-    def distance(drive: Any, first: int, second: int) -> float:
-        return table.distance(drive.name, drive.recorded(first), drive.recorded(second), _fps(cfg, drive.fps))
-
-    return distance
-
-
 def _fps(cfg: DictConfig, recorded: float | None) -> float:
     """Return the frame rate as set, as recorded, or KITTI's."""
     return cfg.scale.fps if cfg.scale.fps is not None else recorded or 10.0
@@ -139,16 +82,15 @@ def _clip_batches(cfg: DictConfig, predictor: Any, method: str, offsets: Any) ->
 
 
 def _pose(cfg: DictConfig) -> tuple[Any, Any]:
-    from saunet.weights.files import read_model
+    from saunet.runs.checkpoint import read_checkpoint
 
-    checkpoint = read_model(cfg.checkpoint)
+    checkpoint = read_checkpoint(cfg.checkpoint)
     pose = checkpoint.networks()[1]
     return (None, ()) if pose is None else (pose.eval(), checkpoint.record.offsets)
 
 
 def _check(cfg: DictConfig) -> str:
     from saunet.scale import METHODS
-    from saunet.weights.locate import shipped
 
     method = one_of("scale.method", cfg.scale.method, SCALE_METHODS)
     positive("scale.frames", cfg.scale.frames)
@@ -158,11 +100,6 @@ def _check(cfg: DictConfig) -> str:
         raise ConfigError(
             f"scale.store=true stores what is measured and scale.method is '{method}'; "
             f"set scale.method to one of {', '.join(METHODS)}"
-        )
-    if cfg.scale.store and cfg.checkpoint in shipped():
-        raise ConfigError(
-            f"scale.store=true writes into the checkpoint, but '{cfg.checkpoint}' comes with saunet and stays as it "
-            "is; leave scale.store out"
         )
     return method
 

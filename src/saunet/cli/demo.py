@@ -11,7 +11,6 @@ from omegaconf import DictConfig
 
 from saunet import config
 from saunet.cli._app import run
-from saunet.cli.evaluate import evaluate_model
 from saunet.cli.train import fit
 
 PICTURES = 3
@@ -21,16 +20,18 @@ PICTURES = 3
 def demo(cfg: DictConfig) -> None:
     """Train, evaluate, draw; print where everything is."""
     import saunet
-    from saunet.evaluation import print_table, write_results
+    from saunet.evaluation import write_results
+    from saunet.evaluation.tool import evaluate_network
+    from saunet.tables import show
 
     data = fit(cfg).data
     folder = Path(cfg.output_dir)
     predictor = saunet.load(folder / "checkpoints" / "best.ckpt")
-    result = evaluate_model(predictor.network, data, [])
+    result = evaluate_network(predictor.network, data)
     write_results(result, folder)
     drive = data.datasets["test"].drives[0]
     draw(predictor, drive, folder)
-    print_table(result)
+    show(result.tables())
     print("The camera moved through a street that the network had never seen; no depth was used in training.")
     print(f"pictures  {folder / 'depth.png'}")
     print(f"video     {folder / 'depth.mp4'}")

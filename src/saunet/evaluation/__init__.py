@@ -1,23 +1,23 @@
-"""Scoring predictors against ground truth: running, summarizing, comparing, writing."""
+"""Scoring models and predictions against ground truth, and the camera's path against true poses."""
 
 from __future__ import annotations
 
-from saunet.evaluation.result import EvaluationResult, ImageRow, Summary
-from saunet.evaluation.runner import NetworkPredictor, Predictor, evaluate
-from saunet.evaluation.suite import evaluate_protocols, read_earlier, with_statistics
-from saunet.evaluation.tables import print_table
-from saunet.evaluation.writers import write_results
+from saunet.evaluation.files import write_results
+from saunet.evaluation.predictors import NetworkPredictor, Predictor
+from saunet.evaluation.result import EvaluationResult
+from saunet.evaluation.scoring import score
+from saunet.evaluation.tool import EvaluateOptions, evaluate
+from saunet.evaluation.tool_odometry import OdometryOptions, OdometryResult, odometry
 
 __all__ = [
+    "EvaluateOptions",
     "EvaluationResult",
-    "ImageRow",
     "NetworkPredictor",
+    "OdometryOptions",
+    "OdometryResult",
     "Predictor",
-    "Summary",
     "evaluate",
-    "evaluate_protocols",
-    "print_table",
-    "read_earlier",
-    "with_statistics",
+    "odometry",
+    "score",
     "write_results",
 ]

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
+from scipy import stats
 
-from saunet.errors import DataError, in_range, positive
+from saunet.errors import DataError, in_range
 from saunet.evaluation.result import Comparison, Difference, EvaluationResult, ImageRow, Spread
 from saunet.metrics.functional import ERROR_NAMES, HIGHER_IS_BETTER
 
-
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """Bounds of means, one for each column."""
-
-    low: Float64[ndarray, " k"]
-    high: Float64[ndarray, " k"]
-
-
 FEWEST_DRIVES = 5
 """With fewer drives than this, resampling them says nothing: images are resampled, and the result says so."""
+RESAMPLES = 2000
 
 
 def drive_of(name: str) -> str:
@@ -32,74 +25,89 @@ def drive_of(name: str) -> str:
     return re.sub(r" \d+( [lr])?$", "", name)
 
 
-def groups_of(names: Sequence[str]) -> tuple[str, int, list[str] | None]:
-    """Choose what to resample for these images: drives where there are `FEWEST_DRIVES`, else images.
+def groups_of(names: Sequence[str]) -> tuple[str, int, list[str]]:
+    """Choose what to resample: drives where there are `FEWEST_DRIVES`, else images.
 
     Returns:
-        ``drive`` or ``image``, how many there are, and the group of each image (None for images).
+        ``drive`` or ``image``, how many there are, and the group of each image.
     """
     drives = [drive_of(name) for name in names]
     count = len(set(drives))
-    return ("drive", count, drives) if count >= FEWEST_DRIVES else ("image", len(names), None)
+    return ("drive", count, drives) if count >= FEWEST_DRIVES else ("image", len(names), list(names))
 
 
-def spreads(result: EvaluationResult, level: float = 0.95, resamples: int = 2000, seed: int = 0) -> tuple[Spread, ...]:
-    """Compute bootstrap intervals of all means of a result that rest on at least one image.
-
-    Args:
-        result: The evaluation.
-        level: Share of resampled means inside each interval.
-        resamples: How often to resample.
-        seed: Of the resampling.
+def spreads(result: EvaluationResult, level: float = 0.95, seed: int = 0) -> tuple[Spread, ...]:
+    """Compute intervals of all means of a result that rest on at least two images.
 
     Raises:
-        ConfigError: as `bootstrap_mean`.
+        ConfigError: if the level is not in (0, 1).
     """
     found = []
     for protocol in result.protocols:
         for predictor in result.predictors:
             rows = [row for row in result.select(predictor, protocol.name) if row.pixels]
-            if not rows:
+            if len(rows) < 2:
                 continue
             by, count, groups = groups_of([row.name for row in rows])
             values = np.array([row.errors for row in rows], dtype=np.float64)
-            interval = bootstrap_mean(values, groups, level=level, resamples=resamples, seed=seed)
-            low, high = tuple(interval.low.tolist()), tuple(interval.high.tolist())
-            found.append(Spread(predictor, protocol.name, level, by, count, low, high))
+            low, high = bootstrap_mean(values, groups, level=level, seed=seed)
+            spread = Spread(predictor, protocol.name, level, by, count, tuple(low.tolist()), tuple(high.tolist()))
+            found.append(spread)
     return tuple(found)
 
 
 def bootstrap_mean(
     values: Float64[ndarray, "n k"],
-    groups: Sequence[str] | None = None,
+    groups: Sequence[str],
     *,
     level: float = 0.95,
-    resamples: int = 2000,
+    resamples: int = RESAMPLES,
     seed: int = 0,
-) -> Interval:
-    """Compute a percentile-bootstrap interval of the mean of each column.
+) -> tuple[Float64[ndarray, " k"], Float64[ndarray, " k"]]:
+    """Compute the bounds of a bootstrap interval of the mean of each column; NaN for fewer than two groups.
 
-    Neighboring frames of a drive are alike, so resampling images makes intervals too narrow: give the drives as
-    ``groups`` and whole drives are resampled.
+    Whole groups are resampled: neighboring frames of a drive are alike, so resampling images makes intervals too
+    narrow. Percentiles of the resampled mean of few groups are too narrow as well: they see the spread over n, not over
+    n - 1 degrees of freedom, and the tails of a normal distribution, not of Student's t (Hesterberg, What Teachers
+    Should Know about the Bootstrap, The American Statistician 69, 2015). So both bounds are moved away from the mean by
+    sqrt(n / (n - 1)) * t / z. BCa intervals correct for neither.
 
     Args:
-        values: One row an image.
-        groups: The group of each row; each row by itself by default.
-        level: Share of resampled means inside the interval.
+        values: One row per image.
+        groups: The group of each row.
+        level: Fraction of intervals that should contain the true mean.
         resamples: How often to resample.
         seed: Of the resampling.
 
     Raises:
-        ConfigError: if the level is not in (0, 1) or there are no resamples.
+        ConfigError: if the level is not in (0, 1).
         DataError: if there is no row, or not one group for each.
     """
     in_range("level", level, 1e-6, 1 - 1e-6)
-    positive("resamples", resamples)
     sums, counts = _by_group(values, groups)
-    draws = np.random.default_rng(seed).multinomial(len(sums), np.full(len(sums), 1 / len(sums)), size=resamples)
-    means = (draws @ sums) / (draws @ counts)[:, None]
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2], axis=0)
-    return Interval(low, high)
+    number = len(sums)
+    if number < 2:
+        return np.full(values.shape[1], math.nan), np.full(values.shape[1], math.nan)
+
+    def mean(of: ndarray, over: ndarray, axis: int) -> ndarray:
+        ratio: ndarray = of.sum(axis) / over.sum(axis)
+        return ratio
+
+    found = stats.bootstrap(
+        (sums.T, np.broadcast_to(counts, sums.T.shape)),
+        mean,
+        n_resamples=resamples,
+        batch=max(1, 4_000_000 // sums.size),
+        axis=-1,
+        confidence_level=level,
+        paired=True,
+        method="percentile",
+        random_state=np.random.default_rng(seed),
+    ).confidence_interval
+    tail = (1 + level) / 2
+    wider = math.sqrt(number / (number - 1)) * stats.t.ppf(tail, number - 1) / stats.norm.ppf(tail)
+    center = values.mean(0)
+    return center + wider * (found.low - center), center + wider * (found.high - center)
 
 
 def compare(
@@ -108,24 +116,23 @@ def compare(
     *,
     names: tuple[str, str] = ("first", "second"),
     level: float = 0.95,
-    resamples: int = 2000,
     seed: int = 0,
 ) -> Comparison:
     """Compare two predictors image by image, paired by name.
 
-    Whole drives are resampled and flipped, since frames of a drive are alike; single images where there are fewer than
-    `FEWEST_DRIVES` drives, and then intervals are too narrow.
+    Whole drives are resampled and flipped, since frames of a drive are alike. With fewer than `FEWEST_DRIVES` drives,
+    images are resampled, intervals are too narrow, and there is no p value: frames that are alike would make chance
+    look like proof.
 
     Args:
         first: Rows of one predictor under one protocol.
         second: Rows of the other under the same one, for the same images.
         names: What to call them.
         level: Of the intervals.
-        resamples: How often to resample and to flip.
-        seed: Of both.
+        seed: Of the resampling.
 
     Raises:
-        ConfigError: as `bootstrap_mean`.
+        ConfigError: if the level is not in (0, 1).
         DataError: if the images or protocols are not the same, a name occurs twice, or none has ground truth.
     """
     one, other = ({row.name: row for row in rows} for rows in (first, second))
@@ -144,46 +151,39 @@ def compare(
     )
     delta = theirs - ours
     by, count, groups = groups_of(images)
-    interval = bootstrap_mean(delta, groups, level=level, resamples=resamples, seed=seed)
-    p_values = _sign_flip(delta, groups, resamples, seed)
-    upwards = np.where(HIGHER_IS_BETTER, 1.0, -1.0)
-    better = ((np.sign(delta) * upwards + 1) / 2).mean(0)
+    low, high = (bound.tolist() for bound in bootstrap_mean(delta, groups, level=level, seed=seed))
+    p_values = _sign_flip(_by_group(delta, groups)[0], seed) if by == "drive" else [None] * 7
+    better = ((np.sign(delta) * np.where(HIGHER_IS_BETTER, 1.0, -1.0) + 1) / 2).mean(0).tolist()
+    one_mean, other_mean, change = (array.mean(0).tolist() for array in (ours, theirs, delta))
     differences = tuple(
-        Difference(
-            name,
-            float(ours[:, k].mean()),
-            float(theirs[:, k].mean()),
-            float(delta[:, k].mean()),
-            float(interval.low[k]),
-            float(interval.high[k]),
-            float(better[k]),
-            float(p_values[k]),
-        )
+        Difference(name, one_mean[k], other_mean[k], change[k], low[k], high[k], better[k], p_values[k])
         for k, name in enumerate(ERROR_NAMES)
     )
     return Comparison(protocols[0], *names, len(images), level, by, count, differences)
 
 
-def _sign_flip(
-    delta: Float64[ndarray, "n k"], groups: Sequence[str] | None, resamples: int, seed: int
-) -> Float64[ndarray, " k"]:
-    sums, _ = _by_group(delta, groups)
-    signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(resamples, len(sums)))
-    observed = np.abs(sums.sum(0))
-    extreme = (np.abs(signs @ sums) >= observed * (1 - 1e-12)).sum(0)
-    p_values: ndarray = (extreme + 1) / (resamples + 1)
+def _sign_flip(sums: Float64[ndarray, "g k"], seed: int) -> list[float]:
+    """Return two-sided p values of a permutation test that exchanges the predictors' labels within each group."""
+    found = stats.permutation_test(
+        (sums,),
+        lambda x, axis: x.sum(axis),
+        permutation_type="samples",
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        batch=max(1, 4_000_000 // sums.size),
+        axis=0,
+        random_state=np.random.default_rng(seed),
+    )
+    p_values: list[float] = found.pvalue.tolist()
     return p_values
 
 
 def _by_group(
-    values: Float64[ndarray, "n k"], groups: Sequence[str] | None
+    values: Float64[ndarray, "n k"], groups: Sequence[str]
 ) -> tuple[Float64[ndarray, "g k"], Float64[ndarray, " g"]]:
     """Sums and counts of each group."""
-    if len(values) == 0 or (groups is not None and len(groups) != len(values)):
-        count = "no" if groups is None else str(len(groups))
-        raise DataError(f"{len(values)} rows with {count} groups; give at least one row, and a group for each")
-    if groups is None:
-        return values, np.ones(len(values))
+    if len(values) == 0 or len(groups) != len(values):
+        raise DataError(f"{len(values)} rows with {len(groups)} groups; give at least one row, and a group for each")
     labels, index = np.unique(np.array(groups), return_inverse=True)
     sums = np.zeros((len(labels), values.shape[1]))
     np.add.at(sums, index, values)

@@ -1,4 +1,4 @@
-"""Running several predictors over the same images under several protocols."""
+"""Scoring predictors on batches of images: against ground truth, or by how well they explain the neighboring frames."""
 
 from __future__ import annotations
 
@@ -6,46 +6,24 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from saunet.errors import ConfigError, DataError, one_of
-from saunet.evaluation.breakdown import Buckets, BucketSums
-from saunet.evaluation.result import EvaluationResult, ImageRow
+from saunet.evaluation.buckets import Buckets, BucketSums
+from saunet.evaluation.predictors import Motion, Predictor, truths_of
+from saunet.evaluation.result import EvaluationResult, ImageRow, ViewRow
+from saunet.geometry.depth import disparity_to_depth
+from saunet.geometry.warp import synthesize
 from saunet.io.progress import bar
-from saunet.metrics.depth import native_depths
-from saunet.metrics.functional import flip_blend
+from saunet.losses.functional import automask, combine_sources, photometric_error
 from saunet.metrics.protocols import GROUND_TRUTHS, Protocol, sample_errors, sample_image
-from saunet.types import DepthPyramid, EvalBatch
+from saunet.types import EvalBatch
 
-Predictor = Callable[[EvalBatch], Tensor]
-"""Gives the disparity (1/meter up to scale) of a batch, b x 1 x any height x any width."""
-
-
-class NetworkPredictor:
-    """A depth network, or a trivial predictor, as something that `evaluate` can call.
-
-    Args:
-        network: Takes images (b 3 h w) and returns a `DepthPyramid` or a disparity (b 1 h w); put into evaluation mode.
-        flip: Also predict the mirrored image and blend (`flip_blend`): slower and a little better.
-    """
-
-    def __init__(self, network: nn.Module, flip: bool = False) -> None:
-        self.network, self.flip = network.eval(), flip
-
-    @torch.inference_mode()
-    def __call__(self, batch: EvalBatch) -> Tensor:
-        """Return the disparity of the batch's target images, b 1 h w."""
-        image = batch["target"]
-        disparity = self._disparity(image)
-        return flip_blend(disparity, self._disparity(image.flip(-1))) if self.flip else disparity
-
-    def _disparity(self, image: Tensor) -> Tensor:
-        output = self.network(image)
-        return output.disparity[0] if isinstance(output, DepthPyramid) else output
+_NO_IMAGE = "there is no image to evaluate; check the split and the data root"
 
 
 @torch.inference_mode()
-def evaluate(
+def score(
     predictors: Mapping[str, Predictor],
     batches: Iterable[EvalBatch],
     protocols: Sequence[Protocol],
@@ -85,7 +63,7 @@ def evaluate(
             rows += _score_batch(predictors, batch, protocols, sums, buckets)
             shown.advance(task, len(batch["name"]))
     if not rows:
-        raise DataError("there is no image to evaluate; check the split and the data root")
+        raise DataError(_NO_IMAGE)
     if not any(row.pixels for row in rows):
         count = len({row.name for row in rows})
         raise DataError(f"none of the {count} images has ground-truth depth to compare; evaluate on data that have it")
@@ -140,14 +118,71 @@ def _score_batch(
     return rows
 
 
-def truths_of(batch: EvalBatch) -> list[Float[Tensor, "_ _"]]:
-    """Return the ground truth of each image at its native size, meters, 0 where unknown; one such pixel without any.
+@torch.inference_mode()
+def score_views(
+    predictors: Mapping[str, tuple[Predictor, Motion]],
+    batches: Iterable[EvalBatch],
+    protocol: Protocol,
+    *,
+    group_of: Callable[[str], str],
+    total: int | None = None,
+    progress: bool = True,
+) -> EvaluationResult:
+    """Warp the neighbors of each image into it by predicted depth and motion, and compare.
+
+    A small error does not prove good depth (a flat wall is explained by any), but a model that does not beat the
+    neighbors as they are has learned nothing, and conditions that are worse than others show.
+
+    Args:
+        predictors: Depth and motion by the name that tables show; both at one scale.
+        batches: Images with neighbors.
+        protocol: One that needs no ground truth.
+        group_of: Gives the condition or the recording of an image by its name.
+        total: Number of images, for the progress bar.
+        progress: Show a progress bar on a terminal or in a notebook.
 
     Raises:
-        DataError: if the batch has depth without its sizes, or they do not fit.
+        ConfigError: if the protocol needs ground truth.
+        DataError: if there is no image, or a batch comes without neighbors.
     """
-    if "depth" not in batch:
-        return [batch["target"].new_zeros(1, 1) for _ in batch["name"]]
-    if "depth_size" not in batch:
-        raise DataError(f"image '{batch['name'][0]}' comes with depth but without depth_size; give its (height, width)")
-    return native_depths(batch["depth"], batch["depth_size"], len(batch["name"]))
+    if protocol.ground_truth != "none":
+        raise ConfigError(
+            f"protocol '{protocol.name}' compares with '{protocol.ground_truth}' ground truth; "
+            "score it with `score`, or choose one that needs none, such as campus"
+        )
+    rows: list[ViewRow] = []
+    with bar(progress, "images", taken=True) as shown:
+        task = shown.add_task(protocol.name, total=total)
+        for batch in batches:
+            if batch["sources"].shape[1] == 0:
+                raise DataError(f"image '{batch['name'][0]}' comes without neighboring frames to compare with")
+            for name, (depth, motion) in predictors.items():
+                columns = _explain(depth(batch), motion(batch), batch)
+                rows += [
+                    ViewRow(name, protocol.name, image, group_of(image), *values)
+                    for image, *values in zip(batch["name"], *columns, strict=True)
+                ]
+            shown.advance(task, len(batch["name"]))
+    if not rows:
+        raise DataError(_NO_IMAGE)
+    return EvaluationResult((protocol,), tuple(predictors), (), views=tuple(rows))
+
+
+def _explain(
+    disparity: Float[Tensor, "b 1 h w"], T_src_tgt: Float[Tensor, "b s 4 4"], batch: EvalBatch
+) -> list[list[float]]:
+    """Return what `ViewRow` holds of each image: warped, unwarped, explained, visible."""
+    depth = disparity_to_depth(disparity.float().clamp(min=1e-6))
+    view = synthesize(batch["sources"], depth, batch["K"], T_src_tgt)
+    target = batch["target"][:, None]
+    warped, seen = combine_sources(photometric_error(view.image, target), view.valid)
+    # Compared over the same pixels, or leaving out the hard ones would look like progress.
+    unwarped, _ = combine_sources(photometric_error(batch["sources"], target))
+    explained = automask(warped, unwarped) & seen
+    pixels = seen.flatten(1).sum(1).clamp(min=1)
+    return [
+        (torch.where(seen, warped, 0.0).flatten(1).sum(1) / pixels).tolist(),
+        (torch.where(seen, unwarped, 0.0).flatten(1).sum(1) / pixels).tolist(),
+        (explained.flatten(1).sum(1) / pixels).tolist(),
+        seen.flatten(1).float().mean(1).tolist(),
+    ]

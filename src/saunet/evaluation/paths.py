@@ -1,10 +1,7 @@
-"""How far off a predicted path is: published snippets, the whole path aligned, KITTI's relative errors; its files."""
+"""A predicted path: how far off it is (snippets, aligned, KITTI's relative errors), its files, its picture."""
 
 from __future__ import annotations
 
-import csv
-import io
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,11 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
-from rich.markup import escape
-from rich.table import Table
 
-from saunet.evaluation.tables import plain_table
-from saunet.evaluation.writers import without_nan
+from saunet.evaluation.files import without_nan
 from saunet.io.atomic import write_bytes, write_json
 from saunet.io.trajectories import write_kitti, write_tum
 from saunet.metrics.odometry import (
@@ -29,7 +23,10 @@ from saunet.metrics.odometry import (
     snippet_ate,
     trajectory_ate,
 )
+from saunet.tables import Column, Row, Table, csv_text
+from saunet.tables.drawing import new_figure, save
 
+_RED = "tab:red"
 PUBLISHED_SNIPPET = 5
 """Frames in a snippet of the published numbers."""
 MODEL = "pose network"
@@ -75,8 +72,8 @@ class Path3d:
     sequence: str
     predicted: Float64[ndarray, "n 4 4"]
     """``T_world_cam``; the world is the first camera, the scale the network's own."""
-    times: Float64[ndarray, " n"]
-    """Seconds of each frame."""
+    times: Float64[ndarray, " n"] | None = None
+    """Seconds of each frame; None if the recording does not know them."""
     true: Float64[ndarray, "n 4 4"] | None = None
     """``T_world_cam`` in meters."""
     predictor: str = MODEL
@@ -98,10 +95,10 @@ class Path3d:
         """
         if self.true is None:
             return 0.0
-        centerd = self.predicted[:, :3, 3] - self.predicted[:, :3, 3].mean(0)
-        driven = centerd @ (self.true[0, :3, :3] @ self.predicted[0, :3, :3].T).T
-        aligned = centerd @ self.alignment.rotation.T
-        energy = float((centerd**2).sum())
+        centered = self.predicted[:, :3, 3] - self.predicted[:, :3, 3].mean(0)
+        driven = centered @ (self.true[0, :3, :3] @ self.predicted[0, :3, :3].T).T
+        aligned = centered @ self.alignment.rotation.T
+        energy = float((centered**2).sum())
         return float(np.degrees(np.arccos(np.clip((driven * aligned).sum() / energy, -1, 1)))) if energy > 0 else 0.0
 
     @property
@@ -111,17 +108,14 @@ class Path3d:
 
 
 def path_of(drive: Any, predicted: Float64[ndarray, "n 4 4"]) -> Path3d:
-    """Return a predicted path beside what its recording knows: true poses of all frames, and when they were taken.
-
-    Where the recording does not say when, frames are taken to be a tenth of a second apart.
-    """
+    """Return a predicted path beside what its recording knows of all frames: when they were taken, and true poses."""
     numbers = list(drive.indices)
     times = [drive.time(number) for number in numbers]
     poses = [drive.pose(number) for number in numbers]
     return Path3d(
         drive.name,
         predicted,
-        np.array(numbers) * 0.1 if None in times else np.array(times, dtype=np.float64),
+        None if None in times else np.array(times, dtype=np.float64),
         None if any(pose is None for pose in poses) else np.stack(poses),
     )
 
@@ -129,7 +123,7 @@ def path_of(drive: Any, predicted: Float64[ndarray, "n 4 4"]) -> Path3d:
 def straight_ahead(path: Path3d) -> Path3d:
     """Return the path of a camera that moves by one unit along its axis from each frame to the next.
 
-    It looks at no image: a network that does not beat it has learnt nothing about motion.
+    It looks at no image: a network that does not beat it has learned nothing about motion.
     """
     poses = np.tile(np.eye(4), (len(path.predicted), 1, 1))
     poses[:, 2, 3] = np.arange(len(poses))
@@ -176,54 +170,44 @@ def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None 
 
 
 def path_table(errors: Sequence[PathErrors]) -> Table:
-    """Return one line a sequence and predictor."""
+    """Return one line per sequence and predictor."""
     snippet = errors[0].snippet
-    table = plain_table("[bold]odometry[/bold]: the path of the camera from the pose network")
-    table.add_column("sequence", min_width=9)
-    for heading in (
-        "frames",
-        "path m",
-        f"{snippet}-frame\nATE m",
-        "ATE m",
-        "scale",
-        "turned\n°",
-        "t_rel\n%",
-        "r_rel\n°/100m",
-    ):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in errors:
-        trivial = row.predictor == STRAIGHT
-        table.add_row(
-            row.predictor if trivial else escape(row.sequence),
-            *(("", "") if trivial else (str(row.frames), f"{row.meters:.1f}")),
-            f"{row.snippet_ate:.4f} ± {row.snippet_std:.4f}",
-            f"{row.ate:.3f}",
-            f"{row.scale:.3g}",
-            f"{row.turn:.0f}",
-            _number(row.t_rel),
-            _number(row.r_rel),
-            style="dim" if trivial else None,
-        )
+    columns = (
+        Column("sequence"),
+        Column("frames"),
+        Column("path m", ".1f"),
+        Column(f"{snippet}-frame ATE m"),
+        Column("ATE m", ".3f"),
+        Column("scale", ".3g"),
+        Column("turned °", ".0f"),
+        Column("t_rel %", ".2f"),
+        Column("r_rel °/100m", ".2f"),
+    )
+    rows = []
+    for one in errors:
+        trivial = one.predictor == STRAIGHT
+        about = (one.predictor, "", "") if trivial else (one.sequence, one.frames, one.meters)
+        numbers = (one.ate, one.scale, one.turn, one.t_rel, one.r_rel)
+        told = f"{one.snippet_ate:.4f} ± {one.snippet_std:.4f}"
+        rows.append(Row((*about, told, *numbers), "dim" if trivial else "plain"))
     published = "as published" if snippet == PUBLISHED_SNIPPET else f"published numbers use {PUBLISHED_SNIPPET} frames"
-    notes = [f"{snippet}-frame ATE: own scale a snippet, {published}; the rest after 7-DoF alignment"]
+    notes = [f"{snippet}-frame ATE: own scale per snippet, {published}; the rest after 7-DoF alignment"]
     lengths = [f"{row.lengths[0]:g} to {row.lengths[-1]:g} m" for row in errors if row.segments]
     if lengths:
         notes.append(f"t_rel and r_rel over segments of {', '.join(sorted(set(lengths)))}")
     bare = {row.sequence: row for row in errors if not row.segments}
     notes += [
-        f"no segment of {min(row.lengths):g} m or more fits into the {row.meters:.1f} m of {escape(name)}"
+        f"no segment of {min(row.lengths):g} m or more fits into the {row.meters:.1f} m of {name}"
         for name, row in bare.items()
     ]
-    table.caption = "; ".join(notes)
-    return table
-
-
-def _number(value: float) -> str:
-    return f"{value:.2f}" if math.isfinite(value) else "–"
+    title = "odometry: the path of the camera from the pose network"
+    return Table("odometry", title, columns, tuple(rows), tuple(notes))
 
 
 def write_path(path: Path3d, folder: Path) -> None:
-    """Write a path in KITTI's and TUM's format: as predicted and, with a truth, aligned to it and the truth itself.
+    """Write a path as predicted and, with a truth, aligned to it and the truth itself.
+
+    In KITTI's format, and in TUM's if the recording knows its times.
 
     Raises:
         DataError: if a file cannot be written.
@@ -233,11 +217,12 @@ def write_path(path: Path3d, folder: Path) -> None:
         kinds |= {"aligned": path.aligned, "true": path.true}
     for kind, poses in kinds.items():
         write_kitti(folder / f"{kind}_kitti.txt", poses)
-        write_tum(folder / f"{kind}_tum.txt", poses, path.times)
+        if path.times is not None:
+            write_tum(folder / f"{kind}_tum.txt", poses, path.times)
 
 
 def write_errors(errors: Sequence[PathErrors], folder: Path, settings: dict[str, object]) -> None:
-    """Write ``odometry.json`` and ``odometry.csv``, one entry a sequence and predictor.
+    """Write ``odometry.json`` and ``odometry.csv``, one entry per sequence and predictor.
 
     Raises:
         DataError: if a file cannot be written.
@@ -245,9 +230,50 @@ def write_errors(errors: Sequence[PathErrors], folder: Path, settings: dict[str,
     rows: list[dict[str, object]] = [without_nan(asdict(row)) for row in errors]
     write_json(folder / "odometry.json", {"settings": settings, "results": rows})
     if rows:
-        table = io.StringIO(newline="")
-        writer = csv.DictWriter(table, list(rows[0]))
-        writer.writeheader()
-        for row, plain in zip(errors, rows, strict=True):
-            writer.writerow({**plain, "lengths": " ".join(map(str, row.lengths))})
-        write_bytes(folder / "odometry.csv", table.getvalue().encode())
+        lines = ({**asdict(row), "lengths": " ".join(map(str, row.lengths))}.values() for row in errors)
+        write_bytes(folder / "odometry.csv", csv_text(list(rows[0]), map(tuple, lines)).encode())
+
+
+def draw_path(path: Path3d, file: Path, errors: Sequence[PathErrors] = ()) -> None:
+    """Draw a path from above and, where the true one is known, both and the distance between them.
+
+    Args:
+        path: The path; its world's x is to the right and z is forward, as KITTI's.
+        file: Picture file to write; its suffix chooses the format.
+        errors: Of the path, and of predictors that look at no image, for the title.
+
+    Raises:
+        DataError: if the file cannot be written.
+    """
+    known = path.true is not None
+    figure, (above, *more) = new_figure(1 + known, 9 if known else 5, 4.5)
+    ours = spots = path.aligned[:, :3, 3]
+    unit = "m" if known else "network's own unit"
+    if path.true is not None:
+        theirs = path.true[:, :3, 3]
+        spots = np.concatenate([ours, theirs])
+        above.plot(theirs[:, 0], theirs[:, 2], color="0.45", linewidth=4, alpha=0.6, label="true")
+        driven = np.concatenate(([0.0], np.linalg.norm(np.diff(theirs, axis=0), axis=1).cumsum()))
+        off = np.linalg.norm(ours - theirs, axis=1)
+        more[0].plot(driven, off, color=_RED)
+        more[0].set(xlabel="distance driven (m)", ylabel="distance from the true position (m)", ylim=(0, None))
+        more[0].set_title(f"off by {np.sqrt((off**2).mean()):.2f} m (root mean square)", fontsize=10)
+    label = "predicted,\n7-DoF aligned" if known else "predicted"
+    above.plot(ours[:, 0], ours[:, 2], color=_RED, linewidth=1.5, label=label)
+    above.plot(ours[0, 0], ours[0, 2], "o", color=_RED, markersize=6, label="start")
+    # Equal scales, and room to the sides of a straight road, which would otherwise be a line in a sliver.
+    center, reach = (spots.max(0) + spots.min(0)) / 2, max(np.ptp(spots[:, 0]), np.ptp(spots[:, 2]), 1e-6) * 0.55
+    above.set(xlim=(center[0] - reach, center[0] + reach), ylim=(center[2] - reach, center[2] + reach))
+    above.set(xlabel=f"x to the right ({unit})", ylabel=f"z forward ({unit})", aspect="equal")
+    above.set_title(path.sequence, fontsize=10)
+    if errors:
+        figure.suptitle("\n".join(map(_told, errors)), fontsize=9)
+    above.legend(fontsize=8)
+    save(figure, file)
+
+
+def _told(errors: PathErrors) -> str:
+    """Say how good a path is before any alignment could flatter it, and how far that had to turn it."""
+    relative = f", t_rel {errors.t_rel:.1f} %" if errors.segments else ""
+    snippets = f"{errors.snippet}-frame ATE {errors.snippet_ate:.4f} m"
+    return f"{errors.predictor}: {snippets}{relative}, turned by {errors.turn:.0f}° to align"

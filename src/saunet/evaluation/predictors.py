@@ -1,0 +1,241 @@
+"""What can be scored: a depth network, or the predictions of another system in files; and how predictions are kept."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor, nn
+
+from saunet.errors import DataError, one_of
+from saunet.io.colormaps import depth_to_png16
+from saunet.io.images import natural_order, read_depth, write_image
+from saunet.metrics.depth import native_depths
+from saunet.metrics.functional import flip_blend
+from saunet.metrics.protocols import Protocol, resize_disparity, sample_image
+from saunet.types import DepthPyramid, EvalBatch
+
+Predictor: TypeAlias = Callable[[EvalBatch], Tensor]
+"""Gives the disparity (1/meter up to scale) of a batch, b x 1 x any height x any width."""
+Motion: TypeAlias = Callable[[EvalBatch], Tensor]
+"""Gives ``T_src_tgt`` of a batch's sources, b x s x 4 x 4, at the scale of the predicted depth."""
+SUFFIXES: tuple[str, ...] = (".npy", ".png")
+"""Files of a folder that are read: arrays, and 16-bit PNG with values x 256 (KITTI's format)."""
+
+
+class NetworkPredictor:
+    """A depth network, or a trivial predictor, as something that can be scored.
+
+    Args:
+        network: Takes images (b 3 h w) and returns a `DepthPyramid` or a disparity (b 1 h w); put into evaluation mode.
+        flip: Also predict the mirrored image and blend (`flip_blend`): slower and a little better.
+    """
+
+    def __init__(self, network: nn.Module, flip: bool = False) -> None:
+        self.network, self.flip = network.eval(), flip
+
+    @torch.inference_mode()
+    def __call__(self, batch: EvalBatch) -> Tensor:
+        """Return the disparity of the batch's target images, b 1 h w."""
+        image = batch["target"]
+        disparity = self._disparity(image)
+        return flip_blend(disparity, self._disparity(image.flip(-1))) if self.flip else disparity
+
+    def _disparity(self, image: Tensor) -> Tensor:
+        output = self.network(image)
+        return output.disparity[0] if isinstance(output, DepthPyramid) else output
+
+
+class NetworkMotion:
+    """A pose network as the source of the camera's motion; put into evaluation mode."""
+
+    def __init__(self, network: nn.Module) -> None:
+        self.network = network.eval()
+
+    @torch.inference_mode()
+    def __call__(self, batch: EvalBatch) -> Tensor:
+        """Return ``T_src_tgt`` of the batch's sources, b s 4 4."""
+        motion: Tensor = self.network(batch["target"], batch["sources"])
+        return motion
+
+
+class FilePredictor:
+    """Predictions of another system, read from files as they are needed.
+
+    Args:
+        path: A ``.npy`` array, images x height x width (a channel of 1 is accepted), such as Monodepth2's
+            ``disps_eigen_split.npy``; or a folder with one file per image, ``.npy`` (height x width) or 16-bit ``.png``
+            (values x 256).
+        names: The images in the order of the predictions; some need not be evaluated (for want of ground truth).
+        values: ``disparity`` (up to scale) or ``depth``; by default disparity in an array and depth in a folder.
+        match: How files of a folder find their image: ``order`` takes them by the numbers in their names, ``name``
+            looks for the `file_stem` of each image's name.
+
+    Raises:
+        ConfigError: for another word.
+        DataError: if the files are missing, cannot be read, or do not fit the images.
+    """
+
+    def __init__(self, path: Path, names: Sequence[str] = (), values: str | None = None, match: str = "order") -> None:
+        one_of("match", match, ("order", "name"))
+        if values is not None:
+            one_of("predicted", values, ("disparity", "depth"))
+        self.path = path
+        self.values = values or ("depth" if path.is_dir() else "disparity")
+        self._array: ndarray | None = None
+        self._files: list[Path] = []
+        self._by_stem: dict[str, Path] = {}
+        if existing(path).is_dir():
+            self._files = sorted((f for f in path.iterdir() if f.suffix.lower() in SUFFIXES), key=natural_order)
+            if not self._files:
+                raise DataError(f"'{path}' holds no prediction; its files must end in {' or '.join(SUFFIXES)}")
+            if match == "name":
+                self._by_stem = {file.stem: file for file in self._files}
+                return
+        else:
+            self._array = _load_array(path)
+            if self._array.ndim == 4 and self._array.shape[1] == 1:
+                self._array = self._array[:, 0]
+            if self._array.ndim != 3:
+                raise DataError(f"'{path}' holds shape {self._array.shape}; predictions are images x height x width")
+        found = len(self._files) if self._array is None else len(self._array)
+        if found != len(names):
+            raise DataError(
+                f"'{path}' holds {found} predictions for {len(names)} images; give one for each, in the same order"
+            )
+        self._place = {name: place for place, name in enumerate(names)}
+
+    def __call__(self, batch: EvalBatch) -> Float[Tensor, "b 1 h w"]:
+        """Return the disparity of the batch's images; they must be of one size.
+
+        Raises:
+            DataError: if a prediction is missing, cannot be read, is not positive, or differs in size from others.
+        """
+        maps = [self._read(name) for name in batch["name"]]
+        if len({one.shape for one in maps}) > 1:
+            raise DataError(f"predictions of one batch in '{self.path}' differ in size; evaluate with batch size 1")
+        return torch.stack(maps)
+
+    def _read(self, name: str) -> Float[Tensor, "1 h w"]:
+        if self._array is not None:
+            return self._disparity(np.array(self._array[self._index(name)], dtype=np.float32), self.path)
+        file = self._by_name(name) if self._by_stem else self._files[self._index(name)]
+        if file.suffix.lower() == ".png":
+            return self._disparity(read_depth(file), file)
+        array = np.squeeze(np.array(_load_array(file), dtype=np.float32))
+        if array.ndim != 2:
+            raise DataError(f"'{file}' holds shape {array.shape}; a prediction is height x width")
+        return self._disparity(array, file)
+
+    def _index(self, name: str) -> int:
+        if name not in self._place:
+            raise DataError(f"'{self.path}' has no prediction for image '{name}'; it belongs to another split")
+        return self._place[name]
+
+    def _by_name(self, name: str) -> Path:
+        if file_stem(name) not in self._by_stem:
+            raise DataError(
+                f"'{self.path}' has no file '{file_stem(name)}.npy' or '.png' for image '{name}'; "
+                "name the files so, or let them follow the order of the images (match=order)"
+            )
+        return self._by_stem[file_stem(name)]
+
+    def _disparity(self, values: ndarray, path: Path) -> Float[Tensor, "1 h w"]:
+        if self.values == "disparity":
+            if (values <= 0).all():  # it would score like depth that is the same everywhere
+                raise DataError(
+                    f"'{path}' has disparity that is nowhere above 0 in an image; disparity is 1/depth, so give "
+                    "positive numbers (predicted=depth for depth)"
+                )
+            return torch.from_numpy(values)[None]
+        if not (values > 0).all():
+            raise DataError(f"'{path}' has pixels without depth (0, negative or NaN); predictions must be dense")
+        return torch.from_numpy(1 / values)[None]
+
+
+class ExportingPredictor:
+    """A predictor that also writes what it predicts, one 16-bit PNG per image (KITTI's format), named by `file_stem`.
+
+    The folder can be scored again (``predictions=FOLDER match=name``) with the same result, up to the PNG's 1/256 m.
+
+    Args:
+        predict: The predictor.
+        folder: Where files go; made if missing.
+        protocol: Its factor, its scaling and its limits make depth of disparity. With median scaling an image needs
+            ground truth, and one that has none is not written.
+    """
+
+    def __init__(self, predict: Predictor, folder: Path, protocol: Protocol) -> None:
+        self.predict, self.folder, self.protocol = predict, folder, protocol
+        self.written = self.left_out = 0
+
+    def __call__(self, batch: EvalBatch) -> Float[Tensor, "b 1 h w"]:
+        """Return the disparity of the batch's images, having written their depth."""
+        disparity = self.predict(batch)
+        for name, image, truth in zip(batch["name"], disparity[:, 0].cpu(), truths_of(batch), strict=True):
+            depth = self._depth(image, truth.cpu())
+            if depth is None:
+                self.left_out += 1
+                continue
+            write_image(self.folder / f"{file_stem(name)}.png", depth_to_png16(depth.numpy()))
+            self.written += 1
+        return disparity
+
+    def __str__(self) -> str:
+        rest = f", {self.left_out} left out that have no ground truth to be scaled by" if self.left_out else ""
+        return f"export: {self.written} images as '{self.protocol.name}' scales them{rest}; in {self.folder}"
+
+    def _depth(self, disparity: Float[Tensor, "h w"], truth: Float[Tensor, "hg wg"]) -> Float[Tensor, "_ _"] | None:
+        rules = self.protocol
+        sample = sample_image(disparity, truth, rules)
+        if rules.scaling == "median" and sample.target.numel() == 0:
+            return None
+        size = (truth.shape[0], truth.shape[1]) if truth.numel() > 1 else (disparity.shape[0], disparity.shape[1])
+        factor = rules.factor * (float(sample.ratio) if rules.scaling == "median" else 1.0)
+        depth = factor / resize_disparity(disparity, size).double()
+        return torch.clamp(depth, rules.min_depth, rules.max_depth)
+
+
+def truths_of(batch: EvalBatch) -> list[Float[Tensor, "_ _"]]:
+    """Return the ground truth of each image at its native size, meters, 0 where unknown; one such pixel without any.
+
+    Raises:
+        DataError: if the batch has depth without its sizes, or they do not fit.
+    """
+    if "depth" not in batch:
+        return [batch["target"].new_zeros(1, 1) for _ in batch["name"]]
+    if "depth_size" not in batch:
+        raise DataError(f"image '{batch['name'][0]}' comes with depth but without depth_size; give its (height, width)")
+    return native_depths(batch["depth"], batch["depth_size"], len(batch["name"]))
+
+
+def existing(path: Path) -> Path:
+    """Return the path of predictions if there is something at it.
+
+    Raises:
+        DataError: otherwise.
+    """
+    if not path.exists():
+        raise DataError(f"no predictions at '{path}'; give a .npy array or a folder of .npy or .png files")
+    return path
+
+
+def file_stem(name: str) -> str:
+    """Return the file name, without ending, that stands for an image: all but letters, digits, - and . become ``_``."""
+    return re.sub(r"[^A-Za-z0-9.-]+", "_", name)
+
+
+def _load_array(path: Path) -> ndarray:
+    try:
+        array: ndarray = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DataError(f"cannot read '{path}' as a numpy array ({error}); give a .npy file of numbers") from error
+    if not isinstance(array, ndarray) or array.dtype.kind != "f":
+        raise DataError(f"'{path}' does not hold floating-point numbers; give a .npy file of disparity or depth")
+    return array

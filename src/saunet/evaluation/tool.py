@@ -1,0 +1,436 @@
+"""`evaluate`: score a checkpoint, or predictions made elsewhere, beside predictors that look at no image."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol, get_args
+
+import torch
+from torch import nn
+
+from saunet.checkpoint import read_checkpoint, store_scale
+from saunet.data.drive import ClockedDrive
+from saunet.data.neighbors import mounting_height, surroundings
+from saunet.data.partners import measured_distance
+from saunet.data.truth_cache import cache_truths
+from saunet.errors import ConfigError, DataError, one_of, usable_device
+from saunet.evaluation.buckets import Buckets
+from saunet.evaluation.files import read_rows, write_results
+from saunet.evaluation.predictors import (
+    ExportingPredictor,
+    FilePredictor,
+    Motion,
+    NetworkMotion,
+    NetworkPredictor,
+    Predictor,
+    existing,
+)
+from saunet.evaluation.result import EvaluationResult, ImageRow
+from saunet.evaluation.scoring import score, score_views
+from saunet.evaluation.statistics import compare, drive_of, spreads
+from saunet.io.atomic import check_folder, write_json
+from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
+from saunet.metrics.protocols import Protocol as Rules
+from saunet.metrics.protocols import protocol
+from saunet.models.depth import DepthNet
+from saunet.registry import Spec
+from saunet.runs.record import ModelRecord, Scale
+from saunet.scale import MetricDepth, MetricMotion, ScaleEstimate, estimate_scale
+from saunet.scale.options import ScaleOptions
+from saunet.scale.speeds import read_speeds
+from saunet.types import EvalBatch
+
+STAGES = {"test": "test", "val": "validate"}
+"""Splits that can be evaluated, and the stage that sets each up."""
+
+
+class EvaluationData(Protocol):
+    """What an evaluation needs of a data module."""
+
+    ground_truth: str
+    protocol: str
+    neighbors: Sequence[str]
+    datasets: Mapping[str, Any]
+
+    @property
+    def protocols(self) -> Sequence[str]:
+        """Names of the protocols that fit it, its own first."""
+
+    def setup(self, stage: str | None = None) -> None:
+        """Find the images of a stage's splits."""
+
+    def batches(self, split: str, device: str | torch.device) -> Iterator[EvalBatch]:
+        """Yield the batches of a split, on a device."""
+
+    def listed(self, split: str) -> list[str]:
+        """Return the names of a split's images, in the order of its list."""
+
+    def ground_truths(self, split: str) -> Iterator[torch.Tensor]:
+        """Yield true depth maps of a split, 1 h w."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """What `evaluate` scores, on which images, and how.
+
+    Args:
+        data: The data module; the size of its images follows the checkpoint.
+        checkpoint: A trained model. Give either it or ``predictions``.
+        predictions: What another system predicted: a ``.npy`` array, or a folder of ``.npy`` or 16-bit ``.png`` files.
+        predicted: ``disparity`` or ``depth``: what ``predictions`` hold; by default disparity in an array and depth in
+            a folder.
+        match: How files of a folder find their images: by ``order`` or ``name``.
+        protocols: Names of protocols, side by side, each on the ground truth that it needs; the data set's own by
+            default.
+        split: ``test`` or ``val``.
+        flip: Blend with the prediction of the mirrored image (Monodepth's post-processing).
+        baselines: Also score predictors that look at no image.
+        scale: How depth becomes meters.
+        buckets: Also report errors by distance, image region and at depth edges.
+        distances: Limits of the distance ranges in meters, ascending.
+        intervals: Level of the bootstrap intervals of the means; None for none.
+        compare: Folder of another evaluation of the same images, to compare with.
+        truth_cache: Folder that keeps projected LiDAR ground truth.
+        export: Folder for the predictions as 16-bit PNG, meters x 256.
+        device: Where to predict; ``auto`` takes a GPU if there is one.
+        output_dir: Folder for the results; None writes none.
+
+    Raises:
+        ConfigError: if an option cannot work, or not beside another one.
+    """
+
+    data: Spec
+    checkpoint: str | None = None
+    predictions: str | None = None
+    predicted: str | None = None
+    match: str = "order"
+    protocols: tuple[str, ...] | None = None
+    split: str = "test"
+    flip: bool = False
+    baselines: bool = True
+    scale: ScaleOptions = field(default_factory=ScaleOptions)
+    buckets: bool = False
+    distances: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0, 50.0, 80.0)
+    intervals: float | None = 0.95
+    compare: str | None = None
+    truth_cache: str | None = None
+    export: str | None = None
+    device: str = "auto"
+    output_dir: str | None = None
+
+    def __post_init__(self) -> None:
+        if (self.checkpoint is None) == (self.predictions is None):
+            raise ConfigError(
+                "give checkpoint=FILE to score a model, or predictions=FILE_OR_FOLDER to score what another system "
+                f"predicted; {'neither is' if self.checkpoint is None else 'both are'} set"
+            )
+        if self.intervals and not 0 < self.intervals < 1:
+            raise ConfigError(f"intervals is {self.intervals:g}; it must lie between 0 and 1, such as intervals=0.95")
+        one_of("split", self.split, STAGES)
+        one_of("match", self.match, ("order", "name"))
+        if self.predicted is not None:
+            one_of("predicted", self.predicted, ("disparity", "depth"))
+        for name in self.protocols or ():
+            protocol(name)
+        Buckets(tuple(self.distances))
+        if self.predictions is not None and self.flip:
+            raise ConfigError("flip=true blends two predictions of a model; leave it out with predictions=...")
+        if self.predictions is not None and self.scale.method != "auto":
+            raise ConfigError("scale.method measures the scale of a model; leave it out with predictions=...")
+
+
+def evaluate(options: EvaluateOptions) -> EvaluationResult:
+    """Score a model or the predictions of another system, and write the results.
+
+    Args:
+        options: What and how.
+
+    Returns:
+        The errors of each image with their means and tables; `EvaluationResult.show` prints them.
+
+    Raises:
+        ConfigError: if a protocol does not fit the data, or needs motion and there is none.
+        CheckpointError: if the checkpoint cannot be read.
+        DataError: if there is no image, none has ground truth, or files cannot be read or written.
+
+    Example:
+        >>> data = Spec.of("data", "synthetic_tiny")
+        >>> evaluate(EvaluateOptions(data=data, checkpoint="best.ckpt")).show()  # doctest: +SKIP
+    """
+    earlier = read_rows(Path(options.compare)) if options.compare else None
+    device = usable_device(options.device)
+    folder = Path(options.output_dir) if options.output_dir is not None else None
+    if folder is not None:
+        check_folder(folder)
+    settings: dict[str, object] = {"data": options.data.name}
+    motion: Motion | None = None
+    if options.checkpoint is not None:
+        checkpoint = read_checkpoint(options.checkpoint)
+        networks = checkpoint.networks()
+        passes = _passes(options, _resized(options.data, checkpoint.record), motion=networks[1] is not None)
+        _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth is of the same images
+        depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device)
+        predictor = NetworkPredictor(depth, options.flip)
+        motion = NetworkMotion(pose) if pose is not None else None
+        scored: _Subject = lambda data: ("model", predictor)  # noqa: E731
+        settings |= {"checkpoint": options.checkpoint, "scale": scale}
+    else:
+        path = existing(Path(str(options.predictions)))
+        passes = _passes(options, options.data.changed(batch_size=1), motion=False)  # files may differ in size
+        scored = lambda data: (  # noqa: E731
+            "predictions",
+            FilePredictor(path, data.listed(options.split), options.predicted, options.match),
+        )
+        settings |= {"predictions": options.predictions, "match": options.match}
+    settings |= {"split": options.split, "post_processing": "monodepth blend of two flips" if options.flip else None}
+    result, exported = _score_passes(options, passes, scored, motion, device)
+    sources = tuple(options.data.get("sources") or ())
+    result = replace(result, settings=settings, sources=sources, folder=folder, notes=exported)
+    if folder is not None and earlier is not None:
+        write_results(result, folder)  # an evaluation that does not compare is not lost
+    result = with_statistics(result, options.intervals, earlier, options.compare)
+    if folder is not None:
+        write_results(result, folder)
+    return result
+
+
+def evaluate_network(
+    network: nn.Module, data: EvaluationData, protocols: Sequence[str] = (), *, split: str = "test"
+) -> EvaluationResult:
+    """Score a depth network, on its device, beside the trivial predictors on one split of a data module.
+
+    Args:
+        network: Takes images, b x 3 x h x w, and returns a `saunet.types.DepthPyramid`.
+        data: A data module, not necessarily set up, at the network's size.
+        protocols: Names of protocols for its ground truth; its own by default.
+        split: ``test`` or ``val``.
+
+    Raises:
+        ConfigError: if a protocol does not fit the data set's ground truth.
+        DataError: if the split has no frame with ground truth.
+    """
+    _set_up(data, split)
+    predictors: dict[str, Predictor] = {"model": NetworkPredictor(network), **trivial(data)}
+    batches = data.batches(split, next(network.parameters()).device)
+    rules = [protocol(name) for name in protocols or _fitting(data, motion=False)]
+    return score(predictors, batches, rules, ground_truth=data.ground_truth, total=len(data.datasets[split]))
+
+
+_Subject = Callable[[EvaluationData], tuple[str, Predictor]]
+"""Gives what is scored on a data module that is set up: its name in tables, and itself."""
+
+
+def _resized(data: Spec, record: ModelRecord) -> Spec:
+    """Return the data at the size of a model, and with the neighbors that its pose network looks at."""
+    wanted = {"height": record.height, "width": record.width}
+    if record.pose:
+        wanted["offsets"] = list(record.offsets)  # type: ignore[assignment]
+    return data.changed(**{key: value for key, value in wanted.items() if key in data.parameters})
+
+
+def _set_up(data: EvaluationData, split: str) -> None:
+    if split not in data.datasets:
+        data.setup(STAGES[split])
+
+
+def _fitting(data: EvaluationData, motion: bool) -> list[str]:
+    """Return the data set's own protocols, of which those that need motion are left out where there is none."""
+    return [name for name in data.protocols if motion or protocol(name).ground_truth != "none"] or list(data.protocols)
+
+
+def _passes(options: EvaluateOptions, spec: Spec, motion: bool) -> list[tuple[EvaluationData, list[Rules]]]:
+    """Return the data modules to go through, not set up, one for each ground truth, with the protocols for each.
+
+    Raises:
+        ConfigError: if a protocol needs ground truth that these data cannot give, or motion and there is none.
+    """
+    first: EvaluationData | None = spec.build()
+    assert first is not None
+    own, choice = first.ground_truth, spec.parameters.get("depth")
+    kinds = tuple(dict.fromkeys([own, *get_args(choice.annotation if choice else None)]))
+    rules = [protocol(name) for name in options.protocols or _fitting(first, motion)]
+    found = []
+    for kind, each in passes(rules, own).items():
+        if kind not in ("none", *kinds):
+            raise ConfigError(
+                f"protocols names '{each[0].name}', which is defined on '{kind}' ground truth, and "
+                f"these data give {' or '.join(kinds)}; choose other protocols or data"
+            )
+        if kind == "none" and not motion:
+            raise ConfigError(
+                f"protocol '{each[0].name}' needs the motion of the camera, which only a model with a pose network "
+                "predicts; evaluate such a checkpoint, or choose a protocol with ground truth"
+            )
+        # The data that were asked for their own ground truth serve the pass that wants it; others start anew.
+        data = first if kind in (own, "none") and first is not None else None
+        first = None if data is first else first
+        if data is None:
+            data = spec.build(**({} if kind in (own, "none") else {"depth": kind}))
+        if kind == "none":
+            data.neighbors = (*data.neighbors, options.split)
+        found.append((data, each))
+    return found
+
+
+def passes(protocols: Sequence[Rules], own: str) -> dict[str, list[Rules]]:
+    """Sort protocols by the ground truth to load for them: the data set's own wherever it serves."""
+    found: dict[str, list[Rules]] = {}
+    for rules in protocols:
+        found.setdefault(own if rules.accepts(own) else rules.ground_truth, []).append(rules)
+    return found
+
+
+def _score_passes(
+    options: EvaluateOptions,
+    passes: Sequence[tuple[EvaluationData, list[Rules]]],
+    scored: _Subject,
+    motion: Motion | None,
+    device: torch.device,
+) -> tuple[EvaluationResult, tuple[str, ...]]:
+    """Go through the images once for each ground truth; return the result, and what was exported."""
+    split, joined, exporter = options.split, None, None
+    buckets = Buckets(tuple(options.distances)) if options.buckets else None
+    for data, rules in passes:
+        _set_up(data, split)
+        if options.truth_cache:
+            cache_truths(data.datasets[split].drives, options.truth_cache)
+        name, predictor = scored(data)
+        if options.export and exporter is None:  # in the first pass, which is of the first protocol's truth
+            predictor = exporter = ExportingPredictor(predictor, Path(options.export), rules[0])
+        batches, total = data.batches(split, device), len(data.datasets[split])
+        if rules[0].ground_truth == "none":
+            assert motion is not None
+            pair, group_of = {name: (predictor, motion)}, _conditions(data, split)
+            found = [score_views(pair, batches, rule, group_of=group_of, total=total) for rule in rules]
+        else:
+            predictors = {name: predictor, **(trivial(data, options.truth_cache) if options.baselines else {})}
+            truth = data.ground_truth
+            found = [score(predictors, batches, rules, ground_truth=truth, buckets=buckets, total=total)]
+        for result in found:
+            joined = joined.joined(result) if joined else result
+    assert joined is not None
+    asked = [protocol(name) for name in options.protocols or [rule.name for _, rules in passes for rule in rules]]
+    return replace(joined, protocols=tuple(asked)), (str(exporter),) if exporter else ()
+
+
+def _conditions(data: EvaluationData, split: str) -> Callable[[str], str]:
+    """Return how images are grouped: by the condition that their recording names, or else by recording."""
+    dataset = data.datasets[split]
+    named = {drive.name: getattr(drive, "condition", None) for drive in dataset.drives}
+    by_image = {
+        dataset.name(place): named[dataset.drives[position].name] for place, (position, _) in enumerate(dataset.windows)
+    }
+    return lambda image: by_image.get(image) or drive_of(image)
+
+
+def trivial(data: EvaluationData, truth_cache: str | None = None) -> dict[str, Predictor]:
+    """Return constant depth and, where the training split has depth, its mean map; say so where it has none."""
+    found, mean = {"constant depth": NetworkPredictor(ConstantDepth())}, MeanDepthMap()
+    try:
+        data.setup("fit")
+        if truth_cache:
+            cache_truths(data.datasets["train"].drives, truth_cache)
+        for depth in data.ground_truths("train"):
+            mean.update(depth[None], torch.tensor([depth.shape[-2:]]))
+        mean.depth_map()
+    except DataError as reason:
+        print(f"the mean depth map is left out: {reason}", file=sys.stderr)
+        return dict(found)
+    return {**found, "mean depth map": NetworkPredictor(mean)}
+
+
+def with_statistics(
+    result: EvaluationResult, level: float | None, earlier: Sequence[ImageRow] | None = None, source: str | None = None
+) -> EvaluationResult:
+    """Add bootstrap intervals of the means, and what changed since another evaluation of the same images.
+
+    Args:
+        result: The evaluation.
+        level: Of the intervals, such as 0.95; None leaves them out (comparisons then use 0.95).
+        earlier: Rows of the other evaluation, whose first predictor is compared with the first one here, under each
+            protocol that both have.
+        source: Where the earlier rows come from.
+
+    Raises:
+        ConfigError: if the level is not between 0 and 1, or the evaluations share no protocol.
+        DataError: if the earlier evaluation is of other images.
+    """
+    comparisons = []
+    if earlier is not None:
+        who = earlier[0].predictor if earlier else ""
+        for rules in result.protocols:
+            rows = [row for row in earlier if (row.predictor, row.protocol) == (who, rules.name)]
+            now = result.select(result.predictors[0], rules.name)
+            if rows and now:
+                names = (f"{who} of {source}", result.predictors[0])
+                comparisons.append(compare(rows, now, names=names, level=level or 0.95))
+        if not comparisons:
+            there = ", ".join(dict.fromkeys(row.protocol for row in earlier)) or "none"
+            raise ConfigError(
+                f"'{source}' has no protocol in common with this evaluation (its protocols: {there}); "
+                "evaluate both under the same one"
+            )
+    return replace(result, spreads=spreads(result, level) if level else (), comparisons=tuple(comparisons))
+
+
+def _scaled(
+    options: EvaluateOptions,
+    record: ModelRecord,
+    networks: tuple[DepthNet, nn.Module | None],
+    data: Any,
+    device: torch.device,
+) -> tuple[nn.Module, nn.Module | None, dict[str, object]]:
+    """Return depth and pose network on the device, in meters if the options ask for it, and what to report of that."""
+    depth, pose = networks[0].to(device).eval(), None if networks[1] is None else networks[1].to(device).eval()
+    method, scale, report = options.scale.method, record.scale, dict[str, object]()
+    if options.scale.measures:
+        height = options.scale.camera_height
+        batches = surroundings(
+            data,
+            options.split,
+            device,
+            offsets=record.offsets if method == "speed" else (),
+            stereo=method == "stereo",
+            odometer=_odometer(options, data) if method == "speed" else None,
+            most=options.scale.frames,
+        )
+        height = mounting_height(data) if height is None else height
+        estimate = estimate_scale(method, batches, lambda image: depth(image).depth[0], pose, height)
+        report = {key: value for key, value in estimate.as_json().items() if key != "per_frame"}  # scale.json has it
+        scale = _kept(options, estimate)
+    scale = options.scale.chosen(scale)
+    if scale is None:
+        return depth, pose, {"method": method, "factor": None}
+    report = {"method": method, **(report or {"source": scale.source, "factor": scale.factor})}
+    return MetricDepth(depth, scale), None if pose is None else MetricMotion(pose, scale), report
+
+
+def _kept(options: EvaluateOptions, estimate: ScaleEstimate) -> Scale:
+    """Print a measured scale, write it to the results and, if that is wanted, into the checkpoint."""
+    print(estimate)
+    if options.output_dir is not None:
+        write_json(Path(options.output_dir) / "scale.json", estimate.as_json())
+    scale = estimate.scale()
+    if options.scale.store:
+        store_scale(str(options.checkpoint), scale)
+        print(f"stored in {options.checkpoint}")
+    return scale
+
+
+def _odometer(options: EvaluateOptions, data: EvaluationData) -> Callable[[Any, int, int], float]:
+    """Return the odometer of the recordings, or of a table of speeds, which counts frames as they were recorded."""
+    if not options.scale.speeds:
+        return measured_distance
+    table = read_speeds(options.scale.speeds)
+    table.check_drives([drive.name for drive in data.datasets[options.split].drives])
+
+    def distance(drive: Any, first: int, second: int) -> float:
+        fps = None
+        if isinstance(drive, ClockedDrive):
+            first, second, fps = drive.recorded(first), drive.recorded(second), drive.fps
+        return table.distance(drive.name, first, second, options.scale.fps or fps or 10.0)
+
+    return distance

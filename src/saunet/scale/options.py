@@ -1,0 +1,71 @@
+"""How depth becomes meters: the options that evaluation and prediction share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from saunet.errors import ConfigError, one_of, positive
+from saunet.runs.record import Scale
+from saunet.scale.estimate import METHODS
+
+SCALE_METHODS = ("auto", "none", "stored", *METHODS)
+"""``auto``: the factor stored in the checkpoint, where there is one; `METHODS` measure it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleOptions:
+    """How depth becomes meters without ground truth; see docs/scale.md.
+
+    Args:
+        method: One of `SCALE_METHODS`.
+        camera_height: Meters from the road to the camera; by default what the data say.
+        speeds: A CSV file with the columns drive, frame, speed.
+        fps: Frames per second of the speeds.
+        partner: Images of the other camera of a stereo pair.
+        baseline: Meters to the other camera.
+        frames: Of more frames, only so many are measured, evenly spread.
+        store: Write the measured factor into the checkpoint.
+
+    Raises:
+        ConfigError: if a value is out of range, or nothing is measured that could be stored.
+    """
+
+    method: str = "auto"
+    camera_height: float | None = None
+    speeds: str | None = None
+    fps: float | None = None
+    partner: str | None = None
+    baseline: float | None = None
+    frames: int = 100
+    store: bool = False
+
+    def __post_init__(self) -> None:
+        one_of("scale.method", self.method, SCALE_METHODS)
+        positive("scale.frames", self.frames)
+        if self.fps is not None:
+            positive("scale.fps", self.fps)
+        if self.store and not self.measures:
+            raise ConfigError(
+                f"scale.store=true stores what is measured and scale.method is '{self.method}'; "
+                f"set scale.method to one of {', '.join(METHODS)}"
+            )
+
+    @property
+    def measures(self) -> bool:
+        """Whether the scale is measured on images, not taken from the checkpoint."""
+        return self.method in METHODS
+
+    def chosen(self, known: Scale | None) -> Scale | None:
+        """Return the scale to apply, given the measured or stored one.
+
+        Raises:
+            ConfigError: if a stored one is wanted and there is none.
+        """
+        if self.method == "none":
+            return None
+        if self.method == "stored" and known is None:
+            raise ConfigError(
+                "scale.method=stored and the checkpoint stores no scale; measure one, "
+                "such as with scale.method=camera_height, and keep it with scale.store=true"
+            )
+        return known

@@ -1,0 +1,7 @@
+"""One table for every tool, and the drawings beside it."""
+
+from __future__ import annotations
+
+from saunet.tables.table import Cell, Column, Row, Table, csv_text, show, stdout
+
+__all__ = ["Cell", "Column", "Row", "Table", "csv_text", "show", "stdout"]

@@ -1,0 +1,251 @@
+"""A table of plain values that becomes text for a terminal, Markdown, HTML or CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table as RichTable
+
+Cell = str | float | int | None
+Kind = Literal["plain", "published", "measured", "failed", "dim"]
+Mark = Literal["good", "bad"]
+
+_ARROWS = {-1: "↓", 0: "", 1: "↑"}
+_PLAIN_WIDTH = 160
+"""Characters in a line where the output is not a terminal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column: its heading, how its numbers are written, and which of them are better."""
+
+    heading: str
+    format: str = ""
+    """Format of its numbers, such as ``.3f``; empty for text and whole numbers."""
+    better: Literal[-1, 0, 1] = 0
+    """Whether smaller (-1) or larger (1) numbers are better."""
+
+    @property
+    def label(self) -> str:
+        """The heading with an arrow towards better numbers."""
+        return f"{self.heading} {_ARROWS[self.better]}".rstrip()
+
+    def text(self, value: Cell) -> str:
+        """Return a value as people read it; a dash where there is none."""
+        if value is None or (isinstance(value, float) and math.isnan(value)):
+            return "–"
+        if isinstance(value, str):
+            return value
+        if self.format:
+            return format(value, self.format)
+        return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row of a table."""
+
+    cells: tuple[Cell, ...]
+    kind: Kind = "plain"
+    group: str = ""
+    """Rows of one group stand together under this heading and are compared with each other only."""
+    note: str = ""
+    """A sentence about the row, such as why a run failed."""
+    marks: Mapping[int, Mark] = field(default_factory=dict)
+    """Cells, by their column, that are clearly good or bad."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    r"""A table of plain values.
+
+    Example:
+        >>> columns = (Column("model"), Column("Abs Rel", ".3f", better=-1))
+        >>> table = Table("scores", "Scores", columns, (Row(("ours", 0.1)), Row(("theirs", 0.25))))
+        >>> print(table.markdown())
+        **Scores**
+        <BLANKLINE>
+        | model | Abs Rel ↓ |
+        |---|---:|
+        | ours | **0.100** |
+        | theirs | 0.250 |
+        >>> table.csv()
+        'model,Abs Rel\nours,0.1\ntheirs,0.25\n'
+    """
+
+    name: str
+    """Name of its CSV file."""
+    title: str
+    """What stands before a colon is bold."""
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()
+    bold_best: bool = True
+    """Whether the best value of each column that has a better side is bold."""
+
+    def text(self, row: Row, column: int) -> str:
+        """Return a cell as people read it."""
+        return self.columns[column].text(row.cells[column])
+
+    def best(self, row: Row, column: int) -> bool:
+        """Return whether a cell is the best, as printed, of at least two in its group."""
+        better, value = self.columns[column].better, row.cells[column]
+        if not self.bold_best or not better or not _is_number(value):
+            return False
+        rivals = [other.cells[column] for other in self.rows if other.group == row.group]
+        numbers = [number for number in rivals if isinstance(number, int | float) and not math.isnan(number)]
+        top = max(numbers) if better > 0 else min(numbers)
+        return len(numbers) > 1 and self.columns[column].text(top) == self.text(row, column)
+
+    def numeric(self, column: int) -> bool:
+        """Return whether a column holds numbers and is aligned to the right."""
+        return bool(self.columns[column].format) or any(_is_number(row.cells[column]) for row in self.rows)
+
+    def grouped(self) -> list[tuple[str, list[Row]]]:
+        """Return neighboring rows of one group together."""
+        found: list[tuple[str, list[Row]]] = []
+        for row in self.rows:
+            if not found or found[-1][0] != row.group:
+                found.append((row.group, []))
+            found[-1][1].append(row)
+        return found
+
+    def rich(self) -> RichTable:
+        """Return the table for a terminal, narrow enough for 80 columns where its texts are short."""
+        from rich.box import HORIZONTALS
+        from rich.table import Table as RichTable
+        from rich.text import Text
+
+        bold, rest = _split_title(self.title)
+        title = Text.assemble((bold, "bold"), rest)
+        shown = RichTable(title=title, box=HORIZONTALS, padding=0, show_edge=False, title_justify="left")
+        shown.title_style, shown.caption_justify = "", "left"
+        for index, column in enumerate(self.columns):
+            if self.numeric(index):
+                heading = "\n".join(textwrap.wrap(column.heading, 6, break_long_words=False))
+                label = f"{heading} {_ARROWS[column.better]}".rstrip()
+                shown.add_column(Text(label), justify="right", no_wrap=True, min_width=6)
+            else:
+                shown.add_column(Text(column.label), overflow="fold", min_width=min(9, len(column.label)))
+        for group, rows in self.grouped():
+            if group:
+                shown.add_row(Text(group, "italic"))
+            for row in rows:
+                cells = [Text(self.text(row, index), self._style(row, index)) for index in range(len(row.cells))]
+                shown.add_row(*cells, style="dim" if row.kind == "dim" else None)
+        notes = [*self.notes, *(f"{self.text(row, 0)}: {row.note}" for row in self.rows if row.note)]
+        if notes:
+            shown.caption = Text("\n".join(notes))
+        return shown
+
+    def markdown(self) -> str:
+        """Return the table as Markdown; the sentence about a row follows its second cell."""
+        bold, rest = _split_title(self.title)
+        lines = [f"**{_plain(bold)}**{_plain(rest)}", "", _line([_plain(column.label) for column in self.columns])]
+        lines.append("|" + "".join("---:|" if self.numeric(index) else "---|" for index in range(len(self.columns))))
+        for group, rows in self.grouped():
+            if group:
+                lines.append(_line([f"*{_plain(group)}*", *[""] * (len(self.columns) - 1)]))
+            for row in rows:
+                cells = [_plain(self.text(row, index)) for index in range(len(row.cells))]
+                bolds = [bool(cell and self._style(row, index)) for index, cell in enumerate(cells)]
+                cells = [f"**{cell}**" if bold else cell for cell, bold in zip(cells, bolds, strict=True)]
+                if row.note:
+                    cells[1] += f": {_plain(row.note)}"
+                lines.append(_line(cells))
+        notes = [f"{_plain(note)}  " for note in self.notes]
+        return "\n".join([*lines, *([""] if notes else []), *notes])
+
+    def html(self) -> str:
+        """Return the table as HTML: a heading, the table in a box that scrolls, and the notes."""
+        kinds = ["number" if self.numeric(index) else "text" for index in range(len(self.columns))]
+        width = len(self.columns)
+        head = "".join(
+            f"<th class={kind}>{escape(column.heading)}{f' <i>{_ARROWS[column.better]}</i>' * bool(column.better)}</th>"
+            for column, kind in zip(self.columns, kinds, strict=True)
+        )
+        body = []
+        for group, rows in self.grouped():
+            if group:
+                body.append(f'<tr class="group {rows[0].kind}"><th colspan={width}>{escape(group)}</th></tr>')
+            for row in rows:
+                cells = "".join(f"<td class={kind}>{self._html_cell(row, i)}</td>" for i, kind in enumerate(kinds))
+                body.append(f"<tr class={row.kind}>{cells}</tr>")
+                if row.note:
+                    body.append(f'<tr class="{row.kind} why"><td colspan={width}>{escape(row.note)}</td></tr>')
+        notes = "".join(f"<p class=note>{escape(note)}</p>" for note in self.notes)
+        return (
+            f"<h3>{escape(self.title)}</h3><div class=scroll><table><thead><tr>{head}</tr></thead>"
+            f"<tbody>{''.join(body)}</tbody></table></div>{notes}"
+        )
+
+    def csv(self) -> str:
+        """Return the table as CSV: numbers in full, columns for the group and the note where there are any."""
+        grouped, noted = any(row.group for row in self.rows), any(row.note for row in self.rows)
+        header = [column.heading for column in self.columns] + ["Source"] * grouped + ["Note"] * noted
+        return csv_text(header, ([*row.cells, *[row.group] * grouped, *[row.note] * noted] for row in self.rows))
+
+    def _style(self, row: Row, column: int) -> str:
+        if column in row.marks:
+            return {"good": "bold green", "bad": "bold red"}[row.marks[column]]
+        return "bold" if self.best(row, column) else ""
+
+    def _html_cell(self, row: Row, column: int) -> str:
+        text = escape(self.text(row, column))
+        if column in row.marks:
+            return f"<b class={row.marks[column]}>{text}</b>"
+        if self.columns[column].heading == "Status":
+            return f'<span class="chip {escape(str(row.cells[column]))}">{text}</span>'
+        return f"<b>{text}</b>" if self.best(row, column) else text
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return values as CSV, floating-point numbers in full; None and NaN become empty cells."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    for row in rows:
+        writer.writerow(["" if cell is None or cell != cell else cell for cell in row])
+    return stream.getvalue()
+
+
+def stdout() -> Console:
+    """Return the standard output as rich sees it: as wide as the terminal, and wide where it is a file or a pipe."""
+    from rich.console import Console
+
+    console = Console()
+    return console if console.is_terminal or console.is_jupyter else Console(width=_PLAIN_WIDTH)
+
+
+def show(tables: Iterable[Table], console: Console | None = None) -> None:
+    """Print tables, an empty line after each."""
+    console = console or stdout()
+    for table in tables:
+        console.print(table.rich(), "")
+
+
+def _is_number(value: Cell) -> bool:
+    return isinstance(value, int | float)
+
+
+def _split_title(title: str) -> tuple[str, str]:
+    head, colon, rest = title.partition(": ")
+    return head, colon + rest
+
+
+def _plain(text: str) -> str:
+    """Return text that cannot become markup in Markdown."""
+    return text.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;")
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
