@@ -14,8 +14,9 @@ from collections.abc import Iterator
 
 import torch
 
-from saunet.evaluation import NetworkPredictor, evaluate, with_statistics
-from saunet.evaluation.breakdown import Buckets
+from saunet.evaluation import NetworkPredictor, score
+from saunet.evaluation.buckets import Buckets
+from saunet.evaluation.tool import with_statistics
 from saunet.metrics.baselines import ConstantDepth
 from saunet.metrics.protocols import protocol
 from saunet.models.depth import DepthNet
@@ -58,7 +59,7 @@ def main() -> None:
         predictors = {"model": NetworkPredictor(network), **dict(list(predictors.items())[1:])}
     memory: list[float] = []
     wall, cpu = time.perf_counter(), time.process_time()
-    result = evaluate(
+    result = score(
         predictors,
         batches(arguments.samples, arguments.batch, height, width, arguments.known, memory),
         [protocol("eigen_camera_z"), protocol("metric")],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import shutil
 from collections.abc import Callable
@@ -16,14 +17,17 @@ import torch
 from omegaconf import OmegaConf
 
 import saunet
-from saunet.cli._scale import apply_scale, scale_predictor
+from saunet.cli._scale import scale_predictor
 from saunet.data.camera_file import CameraFile, write_camera
 from saunet.errors import CheckpointError, ConfigError
+from saunet.evaluation.tool import EvaluateOptions, _scaled
 from saunet.geometry.pose import pose_matrix
 from saunet.prediction.pipeline import ImagePredictor
-from saunet.roots import EvaluateConfig, PredictConfig
+from saunet.registry import Spec
+from saunet.roots import PredictConfig
 from saunet.runs.checkpoint import read_checkpoint, store_scale
 from saunet.runs.record import Scale
+from saunet.scale.options import ScaleOptions
 from saunet.synthetic import SyntheticDrive
 
 Tool = Callable[..., Any]
@@ -222,11 +226,11 @@ def test_speeds_of_a_clip_of_which_every_third_frame_is_used(given: float | None
     )
     data.setup("test")
     (tmp_path / "speeds.csv").write_text("frame,speed\n0,0\n44,44\n")  # a meter a second more with each frame
-    cfg = OmegaConf.structured(EvaluateConfig)
-    cfg.output_dir = str(tmp_path / "out")
-    cfg.scale = OmegaConf.merge(cfg.scale, {"method": "speed", "speeds": str(tmp_path / "speeds.csv"), "fps": given})
-    record = SimpleNamespace(scale=None, offsets=(-1, 1))
-    apply_scale(cfg, record, Flat(), StraightOn(), data)
+    scale = ScaleOptions(method="speed", speeds=str(tmp_path / "speeds.csv"), fps=given)
+    options = EvaluateOptions(data=Spec({}), checkpoint="x", scale=scale, output_dir=str(tmp_path / "out"))
+    inspect.unwrap(_scaled)(
+        options, SimpleNamespace(scale=None, offsets=(-1, 1)), (Flat(), StraightOn()), data, torch.device("cpu")
+    )
     found = json.loads((tmp_path / "out" / "scale.json").read_text())["per_frame"]
     (drive,) = data.datasets["test"].drives
     assert len(found) >= 3

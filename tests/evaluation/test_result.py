@@ -14,11 +14,11 @@ import pytest
 from rich.console import Console
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation.result import EvaluationResult, ImageRow, summarize
-from saunet.evaluation.tables import print_table
-from saunet.evaluation.writers import as_json, markdown, read_rows, write_results
+from saunet.evaluation.files import as_json, markdown, read_rows, write_results
+from saunet.evaluation.result import EvaluationResult, ImageRow, ViewRow, summarize
 from saunet.metrics.functional import ERROR_HEADINGS
 from saunet.metrics.protocols import protocol
+from saunet.tables import show
 
 NAN = (math.nan,) * 7
 
@@ -80,7 +80,7 @@ def test_joined_refuses_what_does_not_belong_together():
 @pytest.mark.parametrize("width", [80, 140])
 def test_terminal_table_is_whole_on_a_narrow_terminal(width):
     stream = io.StringIO()
-    print_table(result(predictors=("mean depth map", "[odd] name")), Console(file=stream, width=width))
+    show(result(predictors=("mean depth map", "[odd] name")).tables(), Console(file=stream, width=width))
     text = stream.getvalue()
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in text
@@ -97,7 +97,7 @@ def test_terminal_table_is_whole_on_a_narrow_terminal(width):
 def test_best_value_is_bold():
     stream = io.StringIO()
     console = Console(file=stream, width=140, force_terminal=True, color_system="standard")
-    print_table(result(protocols=("metric",)), console)
+    show(result(protocols=("metric",)).tables(), console)
     lines = stream.getvalue().splitlines()
     model, constant = (line for line in lines if line.startswith(("model", "constant")))
     assert model.count("\x1b[1m") == 4
@@ -106,8 +106,26 @@ def test_best_value_is_bold():
 
 def test_markdown():
     lines = markdown(result(protocols=("metric",))).splitlines()
-    assert lines[2] == f"| predictor | {' | '.join(ERROR_HEADINGS)} |"
-    assert lines[4] == "| model | 0.200 | 0.201 | 0.202 | 0.203 | 0.204 | 0.205 | 0.206 |"
+    assert lines[2] == f"| predictor | {' | '.join(ERROR_HEADINGS)} | scale |"
+    assert lines[4].startswith("| model | **0.200** | **0.201** |")
+    assert lines[4].endswith(" 0.206 | 3 ± 0.82 |")
+    assert lines[5].endswith(" **0.216** | 3 ± 0.82 |")
+
+
+def test_a_model_that_explains_nothing_is_said():
+    """Doubled frames: a photometric error of 0 with and without warping is no proof of anything."""
+
+    def views(warped):
+        rows = tuple(ViewRow("model", "campus", f"d {i}", "day", warped, 0.1, 0.5, 1.0) for i in range(3))
+        return EvaluationResult((protocol("campus"),), ("model",), (), views=rows)
+
+    for warped in (0.1, 0.2):
+        (sentence,) = views(warped).warnings
+        assert "nothing was learned" in sentence
+        assert sentence in markdown(views(warped))
+        assert as_json(views(warped))["warnings"] == [sentence]
+    assert views(0.09).warnings == ()
+    assert "warnings" not in as_json(views(0.09))
 
 
 def test_files(tmp_path):
@@ -141,7 +159,7 @@ def test_nothing_is_left_behind_when_writing_fails(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(DataError, match=r"cannot write .*metrics.json: No space left"):
+    with pytest.raises(DataError, match=r"cannot write .*: No space left"):
         write_results(result(), tmp_path)
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
     assert (tmp_path / "metrics.json").read_text() == "old"

@@ -82,15 +82,16 @@ def _clip_batches(cfg: DictConfig, predictor: Any, method: str, offsets: Any) ->
 
 
 def _pose(cfg: DictConfig) -> tuple[Any, Any]:
-    from saunet.runs.checkpoint import read_checkpoint
+    from saunet.weights.files import read_model
 
-    checkpoint = read_checkpoint(cfg.checkpoint)
+    checkpoint = read_model(cfg.checkpoint)
     pose = checkpoint.networks()[1]
     return (None, ()) if pose is None else (pose.eval(), checkpoint.record.offsets)
 
 
 def _check(cfg: DictConfig) -> str:
     from saunet.scale import METHODS
+    from saunet.weights.locate import shipped
 
     method = one_of("scale.method", cfg.scale.method, SCALE_METHODS)
     positive("scale.frames", cfg.scale.frames)
@@ -100,6 +101,11 @@ def _check(cfg: DictConfig) -> str:
         raise ConfigError(
             f"scale.store=true stores what is measured and scale.method is '{method}'; "
             f"set scale.method to one of {', '.join(METHODS)}"
+        )
+    if cfg.scale.store and cfg.checkpoint in shipped():
+        raise ConfigError(
+            f"scale.store=true writes into the checkpoint, but '{cfg.checkpoint}' comes with saunet and stays as it "
+            "is; leave scale.store out"
         )
     return method
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from saunet.data.drive import Drive
 from saunet.evaluation.files import without_nan
 from saunet.io.atomic import write_bytes, write_json
 from saunet.io.trajectories import write_kitti, write_tum
@@ -107,7 +107,7 @@ class Path3d:
         return self.alignment.poses(self.predicted)
 
 
-def path_of(drive: Any, predicted: Float64[ndarray, "n 4 4"]) -> Path3d:
+def path_of(drive: Drive, predicted: Float64[ndarray, "n 4 4"]) -> Path3d:
     """Return a predicted path beside what its recording knows of all frames: when they were taken, and true poses."""
     numbers = list(drive.indices)
     times = [drive.time(number) for number in numbers]
@@ -115,7 +115,7 @@ def path_of(drive: Any, predicted: Float64[ndarray, "n 4 4"]) -> Path3d:
     return Path3d(
         drive.name,
         predicted,
-        None if None in times else np.array(times, dtype=np.float64),
+        None if times is None or np.isnan(times).any() else times,
         None if any(pose is None for pose in poses) else np.stack(poses),
     )
 
@@ -246,7 +246,7 @@ def draw_path(path: Path3d, file: Path, errors: Sequence[PathErrors] = ()) -> No
         DataError: if the file cannot be written.
     """
     known = path.true is not None
-    figure, (above, *more) = new_figure(1 + known, 9 if known else 5, 4.5)
+    figure, (above, *more) = new_figure(1 + known, 9.0 if known else 5.0, 4.5)
     ours = spots = path.aligned[:, :3, 3]
     unit = "m" if known else "network's own unit"
     if path.true is not None:

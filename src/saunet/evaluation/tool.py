@@ -6,15 +6,14 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, get_args
+from typing import Any, Protocol, get_args, runtime_checkable
 
 import torch
 from torch import nn
 
-from saunet.checkpoint import read_checkpoint, store_scale
-from saunet.data.drive import ClockedDrive
-from saunet.data.neighbors import mounting_height, surroundings
-from saunet.data.partners import measured_distance
+from saunet.data.drive import Drive
+from saunet.data.neighbors import surroundings
+from saunet.data.stereo import measured_distance
 from saunet.data.truth_cache import cache_truths
 from saunet.errors import ConfigError, DataError, one_of, usable_device
 from saunet.evaluation.buckets import Buckets
@@ -37,16 +36,20 @@ from saunet.metrics.protocols import Protocol as Rules
 from saunet.metrics.protocols import protocol
 from saunet.models.depth import DepthNet
 from saunet.registry import Spec
+from saunet.runs.checkpoint import store_scale
 from saunet.runs.record import ModelRecord, Scale
 from saunet.scale import MetricDepth, MetricMotion, ScaleEstimate, estimate_scale
 from saunet.scale.options import ScaleOptions
 from saunet.scale.speeds import read_speeds
 from saunet.types import EvalBatch
+from saunet.weights.files import read_model
+from saunet.weights.locate import shipped
 
 STAGES = {"test": "test", "val": "validate"}
 """Splits that can be evaluated, and the stage that sets each up."""
 
 
+@runtime_checkable
 class EvaluationData(Protocol):
     """What an evaluation needs of a data module."""
 
@@ -140,6 +143,11 @@ class EvaluateOptions:
             raise ConfigError("flip=true blends two predictions of a model; leave it out with predictions=...")
         if self.predictions is not None and self.scale.method != "auto":
             raise ConfigError("scale.method measures the scale of a model; leave it out with predictions=...")
+        if self.scale.store and self.checkpoint in shipped():
+            raise ConfigError(
+                f"scale.store=true writes into the checkpoint, but '{self.checkpoint}' comes with saunet and stays as "
+                "it is; leave scale.store out"
+            )
 
 
 def evaluate(options: EvaluateOptions) -> EvaluationResult:
@@ -168,7 +176,7 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
     settings: dict[str, object] = {"data": options.data.name}
     motion: Motion | None = None
     if options.checkpoint is not None:
-        checkpoint = read_checkpoint(options.checkpoint)
+        checkpoint = read_model(options.checkpoint)
         networks = checkpoint.networks()
         passes = _passes(options, _resized(options.data, checkpoint.record), motion=networks[1] is not None)
         _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth is of the same images
@@ -178,8 +186,8 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
         scored: _Subject = lambda data: ("model", predictor)  # noqa: E731
         settings |= {"checkpoint": options.checkpoint, "scale": scale}
     else:
-        path = existing(Path(str(options.predictions)))
         passes = _passes(options, options.data.changed(batch_size=1), motion=False)  # files may differ in size
+        path = existing(Path(str(options.predictions)))
         scored = lambda data: (  # noqa: E731
             "predictions",
             FilePredictor(path, data.listed(options.split), options.predicted, options.match),
@@ -319,7 +327,7 @@ def _score_passes(
 def _conditions(data: EvaluationData, split: str) -> Callable[[str], str]:
     """Return how images are grouped: by the condition that their recording names, or else by recording."""
     dataset = data.datasets[split]
-    named = {drive.name: getattr(drive, "condition", None) for drive in dataset.drives}
+    named = {drive.name: drive.condition for drive in dataset.drives}
     by_image = {
         dataset.name(place): named[dataset.drives[position].name] for place, (position, _) in enumerate(dataset.windows)
     }
@@ -397,7 +405,7 @@ def _scaled(
             odometer=_odometer(options, data) if method == "speed" else None,
             most=options.scale.frames,
         )
-        height = mounting_height(data) if height is None else height
+        height = data.camera_height if height is None else height
         estimate = estimate_scale(method, batches, lambda image: depth(image).depth[0], pose, height)
         report = {key: value for key, value in estimate.as_json().items() if key != "per_frame"}  # scale.json has it
         scale = _kept(options, estimate)
@@ -420,17 +428,15 @@ def _kept(options: EvaluateOptions, estimate: ScaleEstimate) -> Scale:
     return scale
 
 
-def _odometer(options: EvaluateOptions, data: EvaluationData) -> Callable[[Any, int, int], float]:
+def _odometer(options: EvaluateOptions, data: EvaluationData) -> Callable[[Drive, int, int], float]:
     """Return the odometer of the recordings, or of a table of speeds, which counts frames as they were recorded."""
     if not options.scale.speeds:
         return measured_distance
     table = read_speeds(options.scale.speeds)
     table.check_drives([drive.name for drive in data.datasets[options.split].drives])
 
-    def distance(drive: Any, first: int, second: int) -> float:
-        fps = None
-        if isinstance(drive, ClockedDrive):
-            first, second, fps = drive.recorded(first), drive.recorded(second), drive.fps
-        return table.distance(drive.name, first, second, options.scale.fps or fps or 10.0)
+    def distance(drive: Drive, first: int, second: int) -> float:
+        fps = options.scale.fps or drive.fps or 10.0
+        return table.distance(drive.name, drive.recorded(first), drive.recorded(second), fps)
 
     return distance

@@ -20,13 +20,13 @@ from saunet.evaluation.paths import (
     write_path,
 )
 from saunet.evaluation.predictors import file_stem
-from saunet.exporting.folder import read_model
 from saunet.io.atomic import check_folder
 from saunet.metrics.odometry import check_lengths, check_snippet
-from saunet.prediction.load import locate
 from saunet.prediction.odometer import Odometer, follow
 from saunet.registry import Spec
 from saunet.tables import Table, show
+from saunet.weights.files import read_model
+from saunet.weights.locate import locate
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,9 +11,9 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from saunet.errors import ConfigError, DataError
+from saunet.evaluation.files import read_rows
 from saunet.evaluation.result import Comparison, ImageRow
 from saunet.evaluation.statistics import compare as paired
-from saunet.evaluation.writers import read_rows
 from saunet.reporting.document import Column, Row, Table
 from saunet.reporting.evaluations import read_evaluation
 from saunet.reporting.groups import Groups

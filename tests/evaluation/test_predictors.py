@@ -1,8 +1,6 @@
-"""Other systems' files give the numbers that the same predictions give in memory."""
+"""Files of predictions, read and written, give the numbers that the same predictions give in memory."""
 
 from __future__ import annotations
-
-import inspect
 
 import cv2
 import numpy as np
@@ -10,8 +8,9 @@ import pytest
 import torch
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation import evaluate
-from saunet.evaluation.foreign import ForeignArray, ForeignFolder, file_stem, foreign_predictor
+from saunet.evaluation import score as score_all
+from saunet.evaluation.predictors import ExportingPredictor, FilePredictor, file_stem
+from saunet.io.images import read_depth
 from saunet.metrics.protocols import protocol
 
 DISPARITY = np.random.default_rng(0).random((5, 6, 10)).astype(np.float32) * 0.2 + 0.02
@@ -32,7 +31,7 @@ def batches(sizes=(2, 2, 1)):
 
 
 def score(predictor):
-    return evaluate({"m": predictor}, batches(), [protocol("metric")], progress=False).errors("m", "metric")
+    return score_all({"m": predictor}, batches(), [protocol("metric")], progress=False).errors("m", "metric")
 
 
 def in_memory():
@@ -49,12 +48,12 @@ def in_memory():
 @pytest.mark.parametrize("shape", [(5, 6, 10), (5, 1, 6, 10)])
 def test_array_of_disparities(tmp_path, shape):
     np.save(tmp_path / "disps.npy", DISPARITY.reshape(shape))
-    np.testing.assert_array_equal(score(ForeignArray(tmp_path / "disps.npy", NAMES)), in_memory())
+    np.testing.assert_array_equal(score(FilePredictor(tmp_path / "disps.npy", NAMES)), in_memory())
 
 
 def test_array_of_depths(tmp_path):
     np.save(tmp_path / "depth.npy", 1 / DISPARITY.astype(np.float64))
-    np.testing.assert_allclose(score(ForeignArray(tmp_path / "depth.npy", NAMES, "depth")), in_memory(), rtol=1e-5)
+    np.testing.assert_allclose(score(FilePredictor(tmp_path / "depth.npy", NAMES, "depth")), in_memory(), rtol=1e-5)
 
 
 def test_reference_array_gives_the_published_loop(tmp_path, reference):
@@ -62,8 +61,8 @@ def test_reference_array_gives_the_published_loop(tmp_path, reference):
     np.save(tmp_path / "disps.npy", data["eigen_disparity"])
     truth = torch.from_numpy(data["eigen_gt"])[:, None]
     batch = {"name": ["a", "b"], "target": None, "depth": truth, "depth_size": torch.tensor([[375, 1242]] * 2)}
-    result = evaluate(
-        {"m": ForeignArray(tmp_path / "disps.npy", ["a", "b"])}, [batch], [protocol("eigen_camera_z")], progress=False
+    result = score_all(
+        {"m": FilePredictor(tmp_path / "disps.npy", ["a", "b"])}, [batch], [protocol("eigen_camera_z")], progress=False
     )
     expected = data["eigen_metrics_median_scaled"].mean(0)
     np.testing.assert_allclose(result.summaries()[0].errors[:4], expected[:4], rtol=1e-6)
@@ -79,34 +78,44 @@ def test_folder(tmp_path, match, kind):
         else:
             cv2.imwrite(str(tmp_path / f"{stem}.png"), np.round(256 / disparity).astype(np.uint16))
     (tmp_path / "notes.txt").write_text("not a prediction")
-    found = score(ForeignFolder(tmp_path, NAMES, "disparity", match))
+    found = score(FilePredictor(tmp_path, NAMES, "disparity" if kind == "npy" else "depth", match))
     np.testing.assert_allclose(
         found, in_memory(), **({"atol": 0.0} if kind == "npy" else {"rtol": 0.01, "atol": 0.005})
     )
+
+
+def test_png_of_disparity_is_read_as_disparity(tmp_path):
+    """A perfect predictor that writes pixels of disparity x 256, as KITTI's stereo benchmark does."""
+    depth = np.linspace(4, 40, 240, dtype=np.float32).reshape(12, 20)
+    cv2.imwrite(str(tmp_path / "0.png"), np.round(256 * 400 / depth).astype(np.uint16))
+    batch = {"name": ["a"], "target": None, "depth": torch.from_numpy(depth)[None, None]}
+    batch["depth_size"] = torch.tensor([[12, 20]])
+    predictor = FilePredictor(tmp_path, ["a"], "disparity")
+    result = score_all({"m": predictor}, [batch], [protocol("eigen_camera_z")], progress=False)
+    assert result.summaries()[0].errors[0] < 1e-3
 
 
 def test_an_array_may_hold_images_that_are_not_evaluated_and_in_another_order(tmp_path):
     order = [NAMES[3], "no truth", *NAMES[:3], NAMES[4]]
     array = np.stack([DISPARITY[3], np.full((6, 10), 9.0), *DISPARITY[:3], DISPARITY[4]]).astype(np.float32)
     np.save(tmp_path / "disps.npy", array)
-    np.testing.assert_array_equal(score(ForeignArray(tmp_path / "disps.npy", order)), in_memory())
+    np.testing.assert_array_equal(score(FilePredictor(tmp_path / "disps.npy", order)), in_memory())
 
 
 def test_a_path_says_what_it_is(tmp_path):
     np.save(tmp_path / "disps.npy", DISPARITY)
-    array = foreign_predictor(tmp_path / "disps.npy", NAMES)
-    assert isinstance(array, ForeignArray)
+    array = FilePredictor(tmp_path / "disps.npy", NAMES)
     assert array.values == "disparity"
     (tmp_path / "depth").mkdir()
     for name, disparity in zip(NAMES, DISPARITY, strict=True):
         np.save(tmp_path / "depth" / f"{file_stem(name)}.npy", 1 / disparity)
-    np.testing.assert_allclose(score(foreign_predictor(tmp_path / "depth", (), match="name")), in_memory(), rtol=1e-5)
+    np.testing.assert_allclose(score(FilePredictor(tmp_path / "depth", match="name")), in_memory(), rtol=1e-5)
     with pytest.raises(DataError, match="no predictions at"):
-        foreign_predictor(tmp_path / "nothing", NAMES)
+        FilePredictor(tmp_path / "nothing", NAMES)
     with pytest.raises(ConfigError, match="match is 'nam'"):
-        foreign_predictor(tmp_path / "depth", NAMES, match="nam")
-    with pytest.raises(ConfigError, match="values is 'depths'"):
-        foreign_predictor(tmp_path / "depth", NAMES, "depths")
+        FilePredictor(tmp_path / "depth", NAMES, match="nam")
+    with pytest.raises(ConfigError, match="predicted is 'depths'"):
+        FilePredictor(tmp_path / "depth", NAMES, "depths")
 
 
 def test_file_stem():
@@ -116,15 +125,15 @@ def test_file_stem():
 def test_wrong_count(tmp_path):
     np.save(tmp_path / "disps.npy", DISPARITY)
     with pytest.raises(DataError, match="holds 5 predictions for 6 images"):
-        ForeignArray(tmp_path / "disps.npy", [*NAMES, "one more"])
+        FilePredictor(tmp_path / "disps.npy", [*NAMES, "one more"])
     with pytest.raises(DataError, match=f"no prediction for image '{NAMES[0]}'; it belongs to another split"):
-        score(ForeignArray(tmp_path / "disps.npy", [f"other {i}" for i in range(5)]))
+        score(FilePredictor(tmp_path / "disps.npy", [f"other {i}" for i in range(5)]))
     (tmp_path / "folder").mkdir()
     np.save(tmp_path / "folder" / "0.npy", DISPARITY[0])
     with pytest.raises(DataError, match="holds 1 predictions for 2 images"):
-        ForeignFolder(tmp_path / "folder", NAMES[:2], match="order")
+        FilePredictor(tmp_path / "folder", NAMES[:2], match="order")
     with pytest.raises(DataError, match=r"has no file 'day_drive_0_0000000000_l\.npy'"):
-        score(ForeignFolder(tmp_path / "folder", match="name"))
+        score(FilePredictor(tmp_path / "folder", match="name"))
 
 
 @pytest.mark.parametrize(
@@ -142,19 +151,19 @@ def test_broken_arrays(tmp_path, content, message):
     else:
         np.save(path, content)
     with pytest.raises(DataError, match=message):
-        ForeignArray(path, NAMES)
+        FilePredictor(path, NAMES)
 
 
 def read_all(folder):
     names = NAMES[: len(list(folder.iterdir()))]
-    return ForeignFolder(folder, names, match="order")({"name": names})
+    return FilePredictor(folder, names, match="order")({"name": names})
 
 
 def test_broken_files_of_a_folder(tmp_path):
-    with pytest.raises(DataError, match="there is no folder"):
-        ForeignFolder(tmp_path / "missing")
+    with pytest.raises(DataError, match="no predictions at"):
+        FilePredictor(tmp_path / "missing")
     with pytest.raises(DataError, match="holds no prediction"):
-        ForeignFolder(tmp_path)
+        FilePredictor(tmp_path)
     path = tmp_path / "0000.png"
     whole = cv2.imencode(".png", np.full((6, 10), 2560, np.uint16))[1].tobytes()
     for data, message in ((b"", "is empty"), (b"junk", "is not an image"), (whole[:-12], "is truncated")):
@@ -178,20 +187,53 @@ def test_broken_files_of_a_folder(tmp_path):
         read_all(tmp_path)
 
 
-def test_unknown_words(tmp_path):
-    np.save(tmp_path / "a.npy", DISPARITY)
-    with pytest.raises(ConfigError, match="did you mean 'depth'"):
-        inspect.unwrap(ForeignArray.__init__)(ForeignArray.__new__(ForeignArray), tmp_path / "a.npy", NAMES, "depths")
-    with pytest.raises(ConfigError, match="match is 'names'"):
-        inspect.unwrap(ForeignFolder.__init__)(ForeignFolder.__new__(ForeignFolder), tmp_path, NAMES, "depth", "names")
-
-
 @pytest.mark.parametrize("value", [0.0, -1.0])
 def test_disparity_that_is_nowhere_positive_is_no_prediction(tmp_path, value):
     maps = np.full((2, 3, 4), value, np.float32)
     maps[0, 1, 1] = 0.5  # some pixels that are infinitely far away are normal
     np.save(tmp_path / "disps.npy", maps)
-    predict = ForeignArray(tmp_path / "disps.npy", ["a", "b"])
+    predict = FilePredictor(tmp_path / "disps.npy", ["a", "b"])
     assert predict({"name": ["a"]}).max() == 0.5
     with pytest.raises(DataError, match=r"disps.npy' has disparity that is nowhere above 0 in an image"):
         predict({"name": ["b"]})
+
+
+def export_batch():
+    generator = torch.Generator().manual_seed(0)
+    depth = torch.rand(3, 1, 24, 40, generator=generator) * 60 + 2
+    depth[2] = 0
+    return {
+        "target": torch.zeros(3, 3, 8, 16),
+        "name": ["day/a 0 l", "day/b 1 l", "day/c 2 l"],
+        "depth": depth,
+        "depth_size": torch.tensor([[24, 40], [20, 36], [24, 40]]),
+    }
+
+
+def disparity_of(batch):
+    return torch.rand(3, 1, 8, 16, generator=torch.Generator().manual_seed(1)) * 0.2 + 0.02
+
+
+def test_scaled_by_the_median_at_native_size_and_only_where_there_is_truth(tmp_path):
+    rules = protocol("eigen_improved")
+    exporting = ExportingPredictor(disparity_of, tmp_path, rules)
+    first = score_all({"m": exporting}, [export_batch()], [rules], ground_truth="improved", progress=False)
+    assert exporting.written == 2
+    assert str(exporting).startswith("export: 2 images as 'eigen_improved' scales them, 1 left out that have no ground")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["day_a_0_l.png", "day_b_1_l.png"]
+    assert read_depth(tmp_path / "day_b_1_l.png").shape == (20, 36)
+    for place in range(2):
+        one = {key: value[place : place + 1] for key, value in export_batch().items()}
+        again = score_all(
+            {"m": FilePredictor(tmp_path, match="name")}, [one], [rules], ground_truth="improved", progress=False
+        )
+        np.testing.assert_allclose(again.rows[0].errors, first.rows[place].errors, rtol=5e-3, atol=2e-3)
+        assert abs(again.rows[0].scale - 1) < 1e-3
+
+
+def test_meters_as_predicted_also_without_truth(tmp_path):
+    without = {key: value for key, value in export_batch().items() if not key.startswith("depth")}
+    ExportingPredictor(lambda _: torch.full((3, 1, 8, 16), 0.1), tmp_path, protocol("metric"))(without)
+    stored = read_depth(tmp_path / "day_c_2_l.png")
+    assert stored.shape == (8, 16)
+    assert np.unique(stored).tolist() == [10.0]

@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation import NetworkPredictor, evaluate
-from saunet.evaluation.breakdown import Buckets
+from saunet.evaluation import NetworkPredictor, score
+from saunet.evaluation.buckets import Buckets
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.functional import ERROR_NAMES, flip_blend
@@ -46,7 +46,7 @@ def test_agrees_with_the_metric_for_every_predictor_and_protocol():
         name: NetworkPredictor(network)
         for name, network in {"model": Pyramid(), "constant": ConstantDepth(), "mean map": mean_map}.items()
     }
-    result = evaluate(predictors, iter(data), PROTOCOLS, total=6, progress=False)
+    result = score(predictors, iter(data), PROTOCOLS, total=6, progress=False)
     assert result.predictors == ("model", "constant", "mean map")
     assert len(result.rows) == 6 * 3 * 2
     for summary in result.summaries():
@@ -62,7 +62,7 @@ def test_agrees_with_the_metric_for_every_predictor_and_protocol():
 
 
 def test_progress_goes_to_standard_error(capsys):
-    evaluate({"constant": NetworkPredictor(ConstantDepth())}, batches(), PROTOCOLS, total=6)
+    score({"constant": NetworkPredictor(ConstantDepth())}, batches(), PROTOCOLS, total=6)
     assert capsys.readouterr().out == ""
 
 
@@ -80,7 +80,7 @@ def test_images_without_truth_are_kept_as_rows_and_left_out_of_means():
     data = list(batches())
     data[1]["depth"][0] = 0
     data[2]["depth_size"][1] = 0
-    result = evaluate({"m": NetworkPredictor(Pyramid())}, data, PROTOCOLS, buckets=Buckets(), progress=False)
+    result = score({"m": NetworkPredictor(Pyramid())}, data, PROTOCOLS, buckets=Buckets(), progress=False)
     summary = result.summaries()[0]
     assert (summary.images, summary.images_without_truth) == (4, 2)
     assert all(value == value for value in summary.errors)
@@ -103,7 +103,7 @@ def test_only_one_batch_is_pulled_at_a_time():
         seen.append(len(alive))
         return batch["target"][:, :1] + 0.1
 
-    evaluate({"m": predictor}, watched(), PROTOCOLS, progress=False)
+    score({"m": predictor}, watched(), PROTOCOLS, progress=False)
     assert seen == [1, 2, 3]
 
 
@@ -119,17 +119,17 @@ def test_only_one_batch_is_pulled_at_a_time():
 )
 def test_impossible_requests(predictors, protocols, ground_truth, message):
     with pytest.raises(ConfigError, match=message):
-        evaluate(predictors, batches(), protocols, ground_truth=ground_truth, progress=False)
+        score(predictors, batches(), protocols, ground_truth=ground_truth, progress=False)
 
 
 def test_bad_data():
     predictors = {"m": NetworkPredictor(ConstantDepth())}
     with pytest.raises(DataError, match="no image to evaluate"):
-        evaluate(predictors, [], PROTOCOLS, progress=False)
+        score(predictors, [], PROTOCOLS, progress=False)
     batch = next(batches())
     del batch["depth_size"]
     with pytest.raises(DataError, match="'drive 000' comes with depth but without depth_size"):
-        evaluate(predictors, [batch], PROTOCOLS, progress=False)
+        score(predictors, [batch], PROTOCOLS, progress=False)
 
 
 def without_truth(batch):
@@ -147,10 +147,10 @@ def test_a_batch_without_truth_is_counted_and_not_scored(place):
         return batch["target"][:, :1] + 0.1
 
     others = [batch for position, batch in enumerate(data) if position != place]
-    expected = evaluate({"m": predictor}, others, PROTOCOLS, buckets=Buckets(), progress=False)
+    expected = score({"m": predictor}, others, PROTOCOLS, buckets=Buckets(), progress=False)
     data[place] = without_truth(data[place])
     asked.clear()
-    result = evaluate({"m": predictor}, data, PROTOCOLS, buckets=Buckets(), progress=False)
+    result = score({"m": predictor}, data, PROTOCOLS, buckets=Buckets(), progress=False)
     assert asked == ["drive 000", "drive 002", "drive 004"]
     for got, wanted in zip(result.summaries(), expected.summaries(), strict=True):
         assert got == dataclasses.replace(wanted, images_without_truth=2)
@@ -163,7 +163,7 @@ def test_no_truth_at_all_is_refused():
     empty = [{**batch, "depth": batch["depth"] * 0} for batch in batches()]
     for data in (absent, empty, absent[:1] + empty[1:]):
         with pytest.raises(DataError, match="none of the 6 images has ground-truth depth to compare; evaluate on"):
-            evaluate(predictors, data, PROTOCOLS, progress=False)
+            score(predictors, data, PROTOCOLS, progress=False)
 
 
 def test_bad_predictions():
@@ -174,13 +174,13 @@ def test_bad_predictions():
         return torch.ones(1, 1, 4, 4)
 
     with pytest.raises(DataError, match="'m' gives values that are not finite for image 'drive 000'"):
-        evaluate({"m": nan}, batches(), PROTOCOLS, progress=False)
+        score({"m": nan}, batches(), PROTOCOLS, progress=False)
     with pytest.raises(DataError, match=r"returned shape \(1, 1, 4, 4\) for 2 images"):
-        evaluate({"m": short}, batches(), PROTOCOLS, progress=False)
+        score({"m": short}, batches(), PROTOCOLS, progress=False)
 
 
 def test_factor_protocol_runs_beside_the_named_one():
     factor = dataclasses.replace(protocol("metric"), name="metric x2", factor=2.0)
-    result = evaluate({"m": NetworkPredictor(Pyramid())}, batches(), [protocol("metric"), factor], progress=False)
+    result = score({"m": NetworkPredictor(Pyramid())}, batches(), [protocol("metric"), factor], progress=False)
     first, second = result.summaries()
     assert first.scale == pytest.approx(2 * second.scale)

@@ -11,10 +11,11 @@ import torch
 from rich.console import Console
 
 from saunet.errors import ConfigError
-from saunet.evaluation import evaluate, print_table, write_results
-from saunet.evaluation.breakdown import Buckets, BucketSums, near_edge
+from saunet.evaluation import score, write_results
+from saunet.evaluation.buckets import Buckets, BucketSums, depth_edges, near_edge
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import evaluate_image, protocol, sample_image
+from saunet.tables import show
 
 RULES = protocol("synthetic")
 
@@ -25,7 +26,7 @@ def test_every_pixel_is_in_one_bucket_of_each_group():
     maps = buckets.maps(truth)
     groups = [group for group, _ in buckets.names]
     assert len(maps) == len(groups)
-    for group in ("distance", "row", "column", "edge"):
+    for group in ("distance", "row", "column", "edge", "edges"):
         chosen = torch.tensor([name == group for name in groups])
         assert (maps[chosen].sum(0) == 1).all(), group
 
@@ -64,6 +65,56 @@ def test_edges_between_sparse_points():
     assert not near_edge(torch.zeros(4, 9), 2, 1.25).any()
 
 
+def test_depth_edges_are_where_neither_surface_goes_on():
+    """A box before a wall, a pole one pixel wide, and surfaces that recede fast."""
+    truth = torch.full((24, 40), 40.0)
+    truth[6:18, 10:20] = 10.0
+    edges = depth_edges(truth, radius=0)
+    expected = torch.zeros_like(edges)
+    for row in range(6, 18):
+        expected[row, [9, 10, 19, 20]] = True
+    for column in range(10, 20):
+        expected[[5, 6, 17, 18], column] = True
+    assert torch.equal(edges, expected)
+    assert depth_edges(truth)[11].nonzero()[:, 0].tolist() == [*range(7, 13), *range(17, 23)]
+    pole = torch.full((10, 21), 30.0)
+    pole[:, 10] = 8.0
+    assert depth_edges(pole)[4].nonzero()[:, 0].tolist() == [*range(7, 14)]
+    road = (60 / torch.arange(1.0, 25.0)).flip(0)[:, None].expand(24, 40)
+    for plane in (road, road.flip(0), (30 / torch.arange(1.0, 41.0))[None].expand(24, 40)):
+        assert plane.max() / plane.min() > 20
+        assert not depth_edges(plane).any()
+
+
+def test_depth_edges_need_dense_truth_and_known_neighbors():
+    truth = torch.full((12, 30), 40.0)
+    truth[:, 15:] = 10.0
+    holes = truth.clone()
+    holes[:, 14] = 0
+    assert not depth_edges(holes).any()
+    assert not depth_edges(torch.zeros(4, 9)).any()
+    assert depth_edges(torch.zeros(0, 0)).shape == (0, 0)
+    names = Buckets().names
+    at, off = (names.index(("edges", f"{side} depth edges")) for side in ("at", "off"))
+    dense = Buckets().maps(truth)
+    assert (dense[at].sum().item(), dense[off].sum().item()) == (12 * 6, 12 * 24)
+    scan = torch.where(torch.arange(12)[:, None] % 3 == 0, truth, 0.0)
+    sparse = Buckets().maps(scan)
+    assert not sparse[at].any()
+    assert not sparse[off].any()
+
+
+def test_an_error_planted_at_edges_shows_there():
+    truth = torch.full((20, 40), 30.0)
+    truth[:, 25:] = 10.0
+    disparity = 1 / truth
+    disparity[:, 22:28] /= 1.1
+    sums = BucketSums(Buckets())
+    sums.add(sample_image(disparity, truth, RULES), Buckets().maps(truth))
+    found = {row.bucket: row.errors[0] for row in sums.rows("m", "synthetic") if row.group == "edges"}
+    assert found == pytest.approx({"at depth edges": 0.1, "off depth edges": 0.0}, abs=1e-6)
+
+
 def test_buckets_add_up_to_the_whole_image():
     torch.manual_seed(3)
     disparity, truth = torch.rand(6, 10) * 0.2 + 0.02, torch.rand(12, 20) * 79
@@ -72,7 +123,7 @@ def test_buckets_add_up_to_the_whole_image():
     sums.add(sample_image(disparity, truth, RULES), buckets.maps(truth))
     rows = sums.rows("m", RULES.name)
     whole = evaluate_image(disparity, truth, RULES)
-    for group in ("distance", "row", "column", "edge"):
+    for group in ("distance", "row", "column", "edge", "edges"):
         mine = [row for row in rows if row.group == group]
         assert sum(row.pixels for row in mine) == whole.pixels
         weights = np.array([row.pixels for row in mine]) / whole.pixels
@@ -106,12 +157,12 @@ def test_in_an_evaluation(tmp_path):
             }
 
     predictors = {"one": lambda batch: batch["target"][:, :1] + 0.1, "two": lambda batch: batch["target"][:, 1:2] + 0.1}
-    result = evaluate(predictors, batches(), [RULES], ground_truth="exact", buckets=Buckets(), progress=False)
+    result = score(predictors, batches(), [RULES], ground_truth="exact", buckets=Buckets(), progress=False)
     for predictor in predictors:
         rows = [row for row in result.buckets if row.predictor == predictor and row.group == "row"]
         assert sum(row.pixels for row in rows) == 2 * (12 * 20 + 10 * 19)
     stream = io.StringIO()
-    print_table(result, Console(file=stream, width=150))
+    show(result.tables(), Console(file=stream, width=150))
     assert "near an edge" in stream.getvalue()
     with write_results(result, tmp_path)["buckets.csv"].open(newline="") as file:
         table = list(csv.DictReader(file))
