@@ -14,7 +14,6 @@ from drives import NumberDrive
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from saunet.data.drive import Drive
 from saunet.errors import ConfigError
 from saunet.evaluation.paths import (
     STRAIGHT,
@@ -97,11 +96,6 @@ class Recording(NumberDrive):
     def __init__(self, times, poses):
         super().__init__("odometry/99 l", (4, 5, 6))
         self.times, self.poses = times, poses
-
-    def image(self, index):
-        raise NotImplementedError
-
-    intrinsics = image
 
     def time(self, index):
         return self.times.get(index)

@@ -109,14 +109,13 @@ class Path3d:
 
 def path_of(drive: Drive, predicted: Float64[ndarray, "n 4 4"]) -> Path3d:
     """Return a predicted path beside what its recording knows of all frames: when they were taken, and true poses."""
-    numbers = list(drive.indices)
-    times = [drive.time(number) for number in numbers]
-    poses = [drive.pose(number) for number in numbers]
+    times = drive.timestamps
+    poses = [pose for number in drive.indices if (pose := drive.pose(number)) is not None]
     return Path3d(
         drive.name,
         predicted,
         None if times is None or np.isnan(times).any() else times,
-        None if any(pose is None for pose in poses) else np.stack(poses),
+        np.stack(poses) if len(poses) == len(predicted) else None,
     )
 
 
