@@ -159,40 +159,6 @@ class ReportConfig:
 
 
 @dataclass
-class DoctorConfig:
-    """Root of ``saunet-doctor``."""
-
-    data: Any = MISSING
-    splits: list[str] = field(default_factory=lambda: ["train", "val", "test"])
-    frames: int = 1000
-    output_dir: str = MISSING
-
-
-@dataclass
-class CalibrateConfig:
-    """Root of ``saunet-calibrate``; ``columns`` and ``rows`` count the board's squares.
-
-    ``lens`` is what camera.yaml calls ``model``: on the command line that word chooses networks.
-    """
-
-    input: str | None = None
-    output: str = "camera.yaml"
-    board: str = "chessboard"
-    columns: int = 10
-    rows: int = 7
-    square: float = 0.025
-    marker: float = 0.75
-    dictionary: str = "DICT_4X4_100"
-    lens: str = "pinhole"
-    views: int = 40
-    max_error: float = 1.0
-    camera_height: float | None = None
-    condition: str | None = None
-    print_board: str | None = None
-    overwrite: bool = False
-
-
-@dataclass
 class OdometryConfig:
     """Root of ``saunet-odometry``; see docs/evaluation.md."""
 
@@ -206,33 +172,7 @@ class OdometryConfig:
     output_dir: str = MISSING
 
 
-@dataclass
-class PrepareConfig:
-    """Root of ``saunet-prepare``; see `saunet.tools.prepare.tool.PrepareOptions`."""
-
-    job: str = MISSING
-    data: Any = None
-    root: str | None = None
-    folder: str | None = None
-    cameras: list[str] = field(default_factory=lambda: ["left", "right"])
-    drives: list[str] = field(default_factory=list)
-    split: str = "all"
-    kinds: list[str] = field(default_factory=lambda: ["linear"])
-    depth: str = "camera_z"
-    checkpoint: str | None = None
-    input: str | None = None
-    values: str = "depth"
-    device: str = "auto"
-    height: int = 202
-    width: int = 672
-    format: str = "jpg"
-    quality: int = 95
-    workers: int | None = None
-    on_error: str = "raise"
-
-
 ROOTS = (
-    PrepareConfig,
     TrainConfig,
     EvaluateConfig,
     PredictConfig,
@@ -240,8 +180,6 @@ ROOTS = (
     BenchmarkConfig,
     OdometryConfig,
     ReportConfig,
-    DoctorConfig,
-    CalibrateConfig,
     ModelConfig,
     ScaleConfig,
 )

@@ -1,16 +1,16 @@
-"""``saunet-components``: what there is, its options, and its size."""
+"""``saunet components``: what there is, its options, and its size."""
 
 from __future__ import annotations
 
 import pytest
 
 import saunet
-from saunet.cli.components import main
+from saunet.cli import app
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
-    monkeypatch.setattr("sys.argv", ["saunet-components", *arguments])
-    main()
+    monkeypatch.setattr("sys.argv", ["saunet"])
+    app.main(["components", *arguments])
 
 
 def test_every_component_is_listed_with_its_options(
@@ -43,8 +43,11 @@ def test_sizes_are_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
         (("objective", "--count"), "--count is for networks"),
     ],
 )
-def test_mistakes_are_one_sentence(arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(SystemExit) as stop:
+def test_mistakes_are_one_sentence(
+    arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
         run(monkeypatch, *arguments)
-    assert str(stop.value).startswith("saunet-components: ")
-    assert message in str(stop.value)
+    said = capsys.readouterr().err
+    assert said.startswith("saunet components: ")
+    assert message in said

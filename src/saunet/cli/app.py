@@ -86,18 +86,23 @@ TOOLS: dict[str, Tool] = {
     ),
     "doctor": Tool(
         "look at a data set before hours of training",
-        function="saunet.cli.doctor:main",
+        "saunet.tools.doctor.tool:DoctorOptions",
+        "saunet.tools.doctor.tool:doctor",
         examples=("doctor data=kitti data.root=/data/kitti/raw",),
     ),
     "calibrate": Tool(
         "make camera.yaml from a video or pictures of a board",
-        function="saunet.cli.calibrate:main",
+        "saunet.tools.calibrate.tool:CalibrateOptions",
+        "saunet.tools.calibrate.tool:calibrate",
         examples=("calibrate print_board=board.png", "calibrate board.mp4 columns=10 rows=7 square=0.025"),
+        positional="input",
     ),
     "prepare": Tool(
         "do once before training: dense depth, a teacher's depth, smaller copies of images",
-        function="saunet.cli.prepare:main",
+        "saunet.tools.prepare.tool:PrepareOptions",
+        "saunet.tools.prepare.tool:prepare",
         examples=("prepare densify root=/data/kitti/raw",),
+        positional="job",
     ),
     "components": Tool(
         "list every registered component with its keys",

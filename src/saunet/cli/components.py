@@ -1,43 +1,34 @@
-"""``saunet-components``: print every registered component with its options, defaults and one-line description."""
+"""``saunet components``: every registered component with its keys, defaults and a sentence for each."""
 
 from __future__ import annotations
 
 import argparse
-import inspect
-import sys
-from collections.abc import Mapping
-from typing import Any
 
 from saunet import schema
-from saunet.errors import ConfigError, SaunetError
-from saunet.registry import REGISTRIES, Entry, Registry, registry
+from saunet.cli import app
+from saunet.cli.help import written
+from saunet.errors import ConfigError, one_of
+from saunet.registry import REGISTRIES, registry
 
-NETWORKS = ["encoder", "decoder", "attention", "pose"]
+NETWORKS = ("encoder", "decoder", "attention", "pose")
 """Kinds whose components are networks."""
 COUNTED = {"decoder": ", after stratified_tiny", "attention": ", for 64 channels"}
 """What `count` assumes, for the kinds whose size depends on their neighbors."""
 
 
-def describe(owner: Registry, entry: Entry) -> str:
-    """Return one component as text: how to choose it, what it is, and its parameters with their defaults."""
-    choose = f"{owner.group}={entry.name}" if owner.group else f'saunet.build("{owner.kind}", "{entry.name}", ...)'
-    lines = [f"  {entry.name}", f"      {entry.summary}", f"      choose: {choose}"]
-    for name, parameter in schema.parameters(entry.target).items():
-        if name not in owner.late:
-            lines.append(f"      {name}: {_type(parameter)}{_default(name, parameter, entry.preset)}")
+def describe(kind: str, name: str, node: schema.Node) -> str:
+    """Return one component as text: how to choose it, what it is, and its keys."""
+    group = REGISTRIES[kind].group
+    choose = f"{group}={name}" if group else f'saunet.build("{kind}", "{name}", ...)'
+    lines = [f"  {name}", f"      {node.summary}", f"      choose: {choose}"]
+    for key in node.keys:
+        default = "  (required)" if key.default == schema.REQUIRED else f" = {written(key.default)}"
+        shown = key.annotation or (key.node.name if key.node else key.type)
+        lines.append(f"      {key.name}: {shown}{'' if key.node else default}{f'  {key.help}' if key.help else ''}")
     return "\n".join(lines)
 
 
-def _type(parameter: inspect.Parameter) -> str:
-    return inspect.formatannotation(parameter.annotation).replace("typing.", "").replace("collections.abc.", "")
-
-
-def _default(name: str, parameter: inspect.Parameter, preset: Mapping[str, Any]) -> str:
-    value = preset.get(name, parameter.default)
-    return "  (required)" if value is inspect.Parameter.empty else f" = {value!r}"
-
-
-def count(owner: Registry, entry: Entry) -> str:
+def count(kind: str, name: str) -> str:
     """Return the number of parameters of a network, in millions or as it is.
 
     Decoders follow the features of ``stratified_tiny``, attention sees 64 channels, AU-Net's width.
@@ -46,42 +37,37 @@ def count(owner: Registry, entry: Entry) -> str:
 
     from saunet.tools.benchmark import count_parameters
 
+    owner = registry(kind)
     with torch.device("meta"):  # shapes without memory
-        late: dict[str, Any] = {"channels": 64} if "channels" in owner.late else {}
+        late: dict[str, object] = {"channels": 64} if "channels" in owner.late else {}
         if "features" in owner.late:
             late["features"] = registry("encoder").build("stratified_tiny").features
-        network = owner.build(entry.name, **late)
+        network = owner.build(name, **late)
     number = count_parameters(network)
     return f"{number / 1e6:.2f} M" if number > 9999 else str(number)
 
 
 def main() -> None:
-    """Entry point of ``saunet-components``.
+    """Print what is registered.
 
     Raises:
-        SystemExit: with one sentence, for an unknown kind or name.
+        ConfigError: for an unknown kind or name.
     """
-    parser = argparse.ArgumentParser(prog="saunet-components", description=__doc__.partition("``: ")[2])
+    parser = argparse.ArgumentParser(prog="saunet components", description=(__doc__ or "").partition("``: ")[2])
     parser.add_argument("kind", nargs="?", help=f"one of: {', '.join(REGISTRIES)}; all by default")
     parser.add_argument("name", nargs="?", help="one component of that kind")
     parser.add_argument("--count", action="store_true", help="only names and numbers of trainable weights, of networks")
-    arguments = parser.parse_args()
-    try:
-        kinds = NETWORKS if arguments.count and not arguments.kind else list(REGISTRIES)
-        owners = [registry(kind) for kind in ([arguments.kind] if arguments.kind else kinds)]
-        for owner in owners:
-            entries = [owner.entry(arguments.name)] if arguments.name else list(owner)
-            if arguments.count and owner.kind not in NETWORKS:
-                raise ConfigError(f"--count is for networks: {', '.join(NETWORKS)}; got '{owner.kind}'")
-            assumed = COUNTED.get(owner.kind, "") if arguments.count else ""
-            print(f"{owner.kind} ({len(list(owner))} registered{assumed})")
-            if arguments.count:
-                print("\n".join(f"  {entry.name:20}{count(owner, entry):>12}" for entry in entries) + "\n")
-            else:
-                print("\n".join(describe(owner, entry) for entry in entries) + "\n")
-    except SaunetError as error:
-        sys.exit(f"saunet-components: {error}")
-
-
-if __name__ == "__main__":
-    main()
+    given = parser.parse_args()
+    kinds = (
+        [one_of("the kind", given.kind, REGISTRIES)] if given.kind else NETWORKS if given.count else list(REGISTRIES)
+    )
+    found = app.table().components
+    for kind in kinds:
+        if given.count and kind not in NETWORKS:
+            raise ConfigError(f"--count is for networks: {', '.join(NETWORKS)}; got '{kind}'")
+        names = [one_of(kind, given.name, found[kind])] if given.name else sorted(found[kind])
+        print(f"{kind} ({len(found[kind])} registered{COUNTED.get(kind, '') if given.count else ''})")
+        if given.count:
+            print("\n".join(f"  {name:20}{count(kind, name):>12}" for name in names) + "\n")
+        else:
+            print("\n".join(describe(kind, name, found[kind][name]) for name in names) + "\n")

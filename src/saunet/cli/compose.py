@@ -27,10 +27,11 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from saunet import schema
 from saunet.cli import words
 from saunet.cli.table import Table
-from saunet.errors import ConfigError
+from saunet.errors import ConfigError, one_of
 from saunet.registry import Spec
 
 T = TypeVar("T")
+_CONVERTED = (tuple, Sequence, Mapping, typing.Literal)
 _TYPES: Mapping[str, object] = {"bool": bool, "int": int, "float": float, "str": str}
 
 
@@ -198,7 +199,7 @@ def _value(annotation: object, value: object, composed: Composed, table: Table, 
         return None
     if typing.get_origin(annotation) in (Union, types.UnionType):
         for each in typing.get_args(annotation):
-            if each is Spec or dataclasses.is_dataclass(each) or typing.get_origin(each) in (tuple, Sequence, Mapping):
+            if each is Spec or dataclasses.is_dataclass(each) or typing.get_origin(each) in _CONVERTED:
                 return _value(each, value, composed, table, key)
     if annotation is Spec:
         assert isinstance(value, Mapping)
@@ -208,10 +209,13 @@ def _value(annotation: object, value: object, composed: Composed, table: Table, 
         return _build(annotation, value, composed, table, f"{key}.")
     if isinstance(value, Mapping) and key in table.library:  # a config group of arguments
         return {name: each for name, each in value.items() if not str(name).startswith("_")}
+    if typing.get_origin(annotation) is typing.Literal:
+        return one_of(key, str(value), typing.get_args(annotation))
     if annotation is Path:
         return Path(str(value))
     if isinstance(value, list) and typing.get_origin(annotation) in (tuple, Sequence):
-        return tuple(value)
+        item, *_ = typing.get_args(annotation)
+        return tuple(_value(item, each, composed, table, key) for each in value)
     return value
 
 

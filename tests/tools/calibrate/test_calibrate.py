@@ -58,7 +58,7 @@ def test_a_fisheye_is_calibrated_on_the_command_line(tmp_path):
     save(tmp_path / "pictures", pictures)
 
     def calibrated(*overrides):
-        command = [sys.executable, "-m", "saunet.cli.calibrate", "input=pictures", *overrides]
+        command = [sys.executable, "-m", "saunet", "calibrate", "input=pictures", *overrides]
         return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
 
     done = calibrated("lens=fisheye")

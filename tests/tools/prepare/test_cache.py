@@ -128,7 +128,8 @@ def test_killed_with_several_processes_through_the_command_line(tree, tmp_path):
     command = [
         sys.executable,
         "-m",
-        "saunet.cli.prepare",
+        "saunet",
+        "prepare",
         "cache",
         f"root={tree}",
         "height=10",

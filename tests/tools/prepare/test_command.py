@@ -8,7 +8,7 @@ import pytest
 from jaxtyping import TypeCheckError
 from prepare_tree import name
 
-from saunet.cli import prepare
+from saunet.cli import app
 from saunet.errors import CheckpointError, ConfigError, DataError
 from saunet.registry import Spec
 from saunet.tools.prepare.tool import PrepareOptions
@@ -21,9 +21,9 @@ def command(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
 
     def run(*words):
-        monkeypatch.setattr(sys, "argv", ["saunet-prepare", *words])
+        monkeypatch.setattr(sys, "argv", ["saunet"])
         try:
-            prepare.main()
+            app.main(["prepare", *words])
             code = 0
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else 1
@@ -51,11 +51,11 @@ def test_each_job_runs_and_leaves_only_its_results(command, tree, tmp_path):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["densfy"], "did you mean 'densify'? jobs: densify, teacher, cache"),
-        ([], "the first word is the job"),
+        (["densfy"], "job is 'densfy'; did you mean 'densify'? allowed: densify, teacher, cache"),
+        ([], "job is not set; add job=..."),
         (["densify"], "root is not set; add root=..."),
         (["cache", "data=synthetic", "folder=c"], "SyntheticDataModule reads no copies made by saunet-prepare; use"),
-        (["densify", "root=raw", "kinds=linear"], "kinds is 'linear'; it must be a list: kinds=[linear]"),
+        (["densify", "root=raw", "kinds=liner"], "kinds is 'liner'; did you mean 'linear'?"),
         (["densify", "root=raw", "workers=-1", "folder=maps"], "workers is -1; it must be at least 0"),
     ],
 )
@@ -118,5 +118,5 @@ def test_skipped_frames_are_named(command, tree):
     code, out, err = command("densify", f"root={tree}", "cameras=[left]", "workers=0", "on_error=skip")
     assert code == 0
     assert "1 skipped" in out
-    assert "skipped:" in err
+    assert "0000000002.bin has 3 bytes" in err
     assert "0000000002.bin" in err

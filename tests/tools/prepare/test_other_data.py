@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from saunet.cli import prepare
+from saunet.cli import app
 from saunet.data.image_cache import CacheSettings, ImageCache
 from saunet.errors import DataError
 from saunet.registry import datamodules
@@ -76,8 +76,8 @@ def test_campus_clips_through_the_command_line(clips, tmp_path, monkeypatch, cap
     words = ["cache", "data=campus", f"data.root={clips}", f"data.frames_cache={tmp_path / 'cache'}", "data.fps=5"]
     words += [f"folder={tmp_path / 'small'}", "height=40", "width=80", "workers=0"]
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["saunet-prepare", *words])
-    prepare.main()
+    monkeypatch.setattr(sys, "argv", ["saunet"])
+    app.main(["prepare", *words])
     assert capsys.readouterr().out.startswith("12 copies made")
     plain, cached = campus(clips, fps=5.0), campus(clips, fps=5.0, cache=str(tmp_path / "small"))
     for data in (plain, cached):

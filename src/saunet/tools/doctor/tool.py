@@ -64,6 +64,11 @@ class Diagnosis:
         """Whether there is no error among the findings."""
         return all(finding.level != "error" for finding in self.findings)
 
+    @property
+    def exit_code(self) -> int:
+        """1 if the data cannot be trained on as they are."""
+        return 0 if self.usable else 1
+
     def __str__(self) -> str:
         found, path = self.survey, self.manifest.path
         lines = [*map(str, self.findings), f"pictures: {self.sheet}"]
