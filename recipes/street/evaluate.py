@@ -9,14 +9,16 @@ from pathlib import Path
 from real import real_frames, score
 from train_pose import score as pose_score
 
-from saunet.checkpoint import read_checkpoint
+from saunet.runs.checkpoint import read_checkpoint
 
 
 def main() -> None:
     """Print one line per clip, with and without the mirrored image, and one for the motion."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("root", type=Path, nargs="?", default=Path(os.environ.get("SAUNET_TEST_DATA", "../../../shared")) / "kitti_mini")
+    parser.add_argument(
+        "root", type=Path, nargs="?", default=Path(os.environ.get("SAUNET_TEST_DATA", "../../../shared")) / "kitti_mini"
+    )
     options = parser.parse_args()
     found = read_checkpoint(options.checkpoint)
     depth, pose = found.networks()

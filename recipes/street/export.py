@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 from train_depth import DECODER, MAX_DEPTH
 
-from saunet.checkpoint import atomic_save
 from saunet.registry import Spec
+from saunet.runs.checkpoint import atomic_save
 from saunet.runs.record import ModelRecord
 
 

@@ -61,7 +61,9 @@ class Frames:
         """Return a frame, h w 3 RGB."""
         return cv2.imdecode(self.images[index], cv2.IMREAD_COLOR)[..., ::-1]
 
-    def depth_sample(self, rng: np.random.Generator, index: int, size: tuple[int, int], augment: bool = True) -> tuple[Array, Array]:
+    def depth_sample(
+        self, rng: np.random.Generator, index: int, size: tuple[int, int], augment: bool = True
+    ) -> tuple[Array, Array]:
         """Return an image in [0, 1], h w 3, and its canonical depth, h w (0 in the sky)."""
         image, depth = self.image(index), self.depths[index].astype(np.float32)
         window = crop_window(rng, image.shape[:2], size, augment)
@@ -75,7 +77,9 @@ class Frames:
                 x, z = x[:, ::-1], z[:, ::-1]
         return x.astype(np.float32) / 255, np.ascontiguousarray(z)
 
-    def pair_sample(self, rng: np.random.Generator, pair: int, size: tuple[int, int], augment: bool = True) -> tuple[Array, Array, NDArray[np.float64]]:
+    def pair_sample(
+        self, rng: np.random.Generator, pair: int, size: tuple[int, int], augment: bool = True
+    ) -> tuple[Array, Array, NDArray[np.float64]]:
         """Return two images, h w 3 in [0, 1] in the order of time, and the canonical T_later_earlier, 4 4."""
         first = self.pairs[pair]
         images = [self.image(first), self.image(first + 1)]
@@ -85,7 +89,9 @@ class Frames:
             R = cv2.Rodrigues(turned)[0]
             K = self.K[first].astype(float)
             H = K @ R @ np.linalg.inv(K)
-            images[1] = cv2.warpPerspective(images[1], H, images[1].shape[1::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+            images[1] = cv2.warpPerspective(
+                images[1], H, images[1].shape[1::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+            )
             T[:3] = R @ T[:3]
         window = crop_window(rng, images[0].shape[:2], size, augment, zoom=0.85)
         images = [crop(x, window, size, cv2.INTER_AREA) for x in images]
@@ -104,7 +110,9 @@ class Frames:
         return images[0].astype(np.float32) / 255, images[1].astype(np.float32) / 255, T
 
 
-def crop_window(rng: np.random.Generator, shape: tuple[int, ...], size: tuple[int, int], augment: bool, zoom: float = 0.55) -> tuple[float, float, float, float]:
+def crop_window(
+    rng: np.random.Generator, shape: tuple[int, ...], size: tuple[int, int], augment: bool, zoom: float = 0.55
+) -> tuple[float, float, float, float]:
     """Return top, bottom, left, right of a crop with about the aspect of ``size``."""
     height, width = shape[:2]
     aspect = size[1] / size[0] * (np.exp(rng.normal(0, 0.06)) if augment else 1.0)
@@ -115,18 +123,24 @@ def crop_window(rng: np.random.Generator, shape: tuple[int, ...], size: tuple[in
     return top, top + h, left, left + w
 
 
-def crop(image: NDArray, window: tuple[float, float, float, float], size: tuple[int, int], interpolation: int) -> NDArray:
+def crop(
+    image: NDArray, window: tuple[float, float, float, float], size: tuple[int, int], interpolation: int
+) -> NDArray:
     """Cut a window out of an image and resize it to (height, width)."""
     top, bottom, left, right = (round(x) for x in window)
     return cv2.resize(np.ascontiguousarray(image[top:bottom, left:right]), size[::-1], interpolation=interpolation)
 
 
-def photometric(rng: np.random.Generator, image: NDArray[np.uint8], fresh: np.random.Generator | None = None) -> NDArray[np.uint8]:
+def photometric(
+    rng: np.random.Generator, image: NDArray[np.uint8], fresh: np.random.Generator | None = None
+) -> NDArray[np.uint8]:
     """Change an 8-bit RGB image as cameras and weather do; ``fresh`` draws what differs between frames of a pair."""
     fresh = fresh or rng
     x = image.astype(np.float32) / 255
     if rng.uniform() < 0.3:  # haze or dirt: a smooth bright veil
-        veil = cv2.resize(rng.uniform(0, 1, (2, 4)).astype(np.float32), image.shape[1::-1], interpolation=cv2.INTER_CUBIC)[..., None]
+        veil = cv2.resize(
+            rng.uniform(0, 1, (2, 4)).astype(np.float32), image.shape[1::-1], interpolation=cv2.INTER_CUBIC
+        )[..., None]
         x = x + rng.uniform(0, 0.25) * veil * (rng.uniform(0.3, 1.0) - x)
     if rng.uniform() < 0.8:
         x = x.clip(0, 1) ** np.exp(rng.normal(0, 0.3))

@@ -297,12 +297,20 @@ def car(rng: np.random.Generator, paint: int, glass: int, dark: int, lamps: tupl
     back = {"hatch": -0.46, "wagon": -0.485, "sedan": -0.38, "suv": -0.48, "van": -0.495}[shape] * length
     trunk = belt * (0.97 if shape == "sedan" else 1.0)
     points = [
-        (h - 0.1, low, w * 0.9, paint), (h, low + 0.2, w * 0.95, paint), (h - 0.03, hood * 0.78, w * 0.95, paint),
-        (h - 0.25, hood * 0.93, w * 0.96, paint), (screen, belt, w * 0.98, glass), (roof0, height * 0.98, w * 0.76, paint),
-        ((roof0 + roof1) / 2, height, w * 0.76, paint), (roof1, height * 0.97, w * 0.76, glass),
-        (back, belt, w * 0.96, paint), (-h + 0.04, trunk, w * 0.95, paint), (-h, trunk * 0.6, w * 0.97, paint),
-        (-h + 0.02, low + 0.15, w * 0.95, paint), (-h + 0.1, low, w * 0.9, dark),
-    ]  # fmt: skip
+        (h - 0.1, low, w * 0.9, paint),
+        (h, low + 0.2, w * 0.95, paint),
+        (h - 0.03, hood * 0.78, w * 0.95, paint),
+        (h - 0.25, hood * 0.93, w * 0.96, paint),
+        (screen, belt, w * 0.98, glass),
+        (roof0, height * 0.98, w * 0.76, paint),
+        ((roof0 + roof1) / 2, height, w * 0.76, paint),
+        (roof1, height * 0.97, w * 0.76, glass),
+        (back, belt, w * 0.96, paint),
+        (-h + 0.04, trunk, w * 0.95, paint),
+        (-h, trunk * 0.6, w * 0.97, paint),
+        (-h + 0.02, low + 0.15, w * 0.95, paint),
+        (-h + 0.1, low, w * 0.9, dark),
+    ]
     profile = np.array([(p[0], p[1]) for p in points], np.float32)
     half = np.array([p[2] for p in points], np.float32)
     skin, material = _extrude(profile, half, [p[3] for p in points])
@@ -315,10 +323,15 @@ def car(rng: np.random.Generator, paint: int, glass: int, dark: int, lamps: tupl
         top = np.stack([side * at, outline[:, 1], outline[:, 0]], 1)
         bottom = np.stack([side * at * 0.97, np.full(8, low), outline[:, 0]], 1)
         soup.add(quads(top[:-1], top[1:], bottom[1:], bottom[:-1]), paint)
-        upper = [(screen, belt, w * 0.98), (roof0, height * 0.98, w * 0.76), (roof1, height * 0.97, w * 0.76), (back, belt, w * 0.96)]
+        upper = [
+            (screen, belt, w * 0.98),
+            (roof0, height * 0.98, w * 0.76),
+            (roof1, height * 0.97, w * 0.76),
+            (back, belt, w * 0.96),
+        ]
         u = np.array([[side * x, y, z] for z, y, x in upper], np.float32)
         soup.add(quads(u[0], u[1], u[2], u[3]), paint)
-        center = u.mean(0) + [0, -0.02, 0]
+        center = np.add(u.mean(0), [0, -0.02, 0])
         pane = center + (u - center) * 0.86 + [side * 0.012, 0, 0]
         cuts = [0.0, 0.47, 0.53, 1.0] if shape != "van" else [0.55, 0.75, 0.8, 1.0]
         for a, b in ((cuts[0], cuts[1]), (cuts[2], cuts[3])):
@@ -335,10 +348,21 @@ def car(rng: np.random.Generator, paint: int, glass: int, dark: int, lamps: tupl
             hub = np.array([side * (w + 0.012), r, z])
             soup.add(np.stack([np.broadcast_to(hub, rim.shape), rim, np.roll(rim, -1, 0)], 1), dark)
             disc = hub + (rim - hub) * 0.62 + [side * 0.01, 0, 0]
-            soup.add(np.stack([np.broadcast_to(hub + [side * 0.01, 0, 0], disc.shape), disc, np.roll(disc, -1, 0)], 1), lamps[2], tint=0.45)  # noqa: E501  # fmt: skip
+            soup.add(
+                np.stack(
+                    [np.broadcast_to(np.add(hub, [side * 0.01, 0, 0]), disc.shape), disc, np.roll(disc, -1, 0)], 1
+                ),
+                lamps[2],
+                tint=0.45,
+            )
         y = belt * rng.uniform(0.72, 0.95)
-        soup.add(box([side * w * 0.93 - 0.13, y - 0.16, -h - 0.02], [side * w * 0.93 + 0.04, y + 0.05, -h + 0.14]), lamps[0])
-        soup.add(box([side * w * 0.84 - 0.16, hood * 0.7, h - 0.12], [side * w * 0.84 + 0.1, hood * 0.85, h + 0.01]), lamps[1])
+        soup.add(
+            box([side * w * 0.93 - 0.13, y - 0.16, -h - 0.02], [side * w * 0.93 + 0.04, y + 0.05, -h + 0.14]), lamps[0]
+        )
+        soup.add(
+            box([side * w * 0.84 - 0.16, hood * 0.7, h - 0.12], [side * w * 0.84 + 0.1, hood * 0.85, h + 0.01]),
+            lamps[1],
+        )
     y = low + rng.uniform(0.15, 0.4)
     soup.add(box([-0.26, y, -h - 0.03], [0.26, y + 0.11, -h + 0.05]), lamps[2])
     soup.add(box([-0.26, low + 0.12, h - 0.05], [0.26, low + 0.23, h + 0.03]), lamps[2])
@@ -391,7 +415,18 @@ def truck(rng: np.random.Generator, paint: int, cargo: int, glass: int, dark: in
             hub = np.array([side * (w + 0.01), r, z])
             soup.add(quads(rim, np.roll(rim, -1, 0), np.roll(inner, -1, 0), inner), dark)
             soup.add(np.stack([np.broadcast_to(hub, rim.shape), rim, np.roll(rim, -1, 0)], 1), dark)
-            soup.add(np.stack([np.broadcast_to(hub + [side * 0.01, 0, 0], rim.shape), hub + (rim - hub) * 0.5 + [side * 0.01, 0, 0], np.roll(hub + (rim - hub) * 0.5 + [side * 0.01, 0, 0], -1, 0)], 1), cargo, tint=0.6)  # noqa: E501  # fmt: skip
+            soup.add(
+                np.stack(
+                    [
+                        np.broadcast_to(np.add(hub, [side * 0.01, 0, 0]), rim.shape),
+                        hub + (rim - hub) * 0.5 + [side * 0.01, 0, 0],
+                        np.roll(hub + (rim - hub) * 0.5 + [side * 0.01, 0, 0], -1, 0),
+                    ],
+                    1,
+                ),
+                cargo,
+                tint=0.6,
+            )
     for side in (-1, 1):
         soup.add(box([side * w * 0.8 - 0.2, 0.7, -h - 0.04], [side * w * 0.8 + 0.2, 0.86, -h]), lamps[0])
         soup.add(box([side * w * 0.8 - 0.2, 0.6, h], [side * w * 0.8 + 0.2, 0.85, h + 0.03]), lamps[1])
@@ -408,10 +443,17 @@ def person(rng: np.random.Generator, cloth: tuple[int, int], skin: int, bicycle:
     lift = 0.25 if bicycle is not None else 0.0
     step = rng.uniform(0.05, 0.3)
     soup.add(tube([[0.09, lift, step], [0.09, 0.5 + lift, 0.05], [0.08, 0.9 + lift, 0]], [0.06, 0.07, 0.09]), cloth[0])
-    soup.add(tube([[-0.09, lift, -step], [-0.09, 0.5 + lift, 0.0], [-0.08, 0.9 + lift, 0]], [0.06, 0.07, 0.09]), cloth[0])
+    soup.add(
+        tube([[-0.09, lift, -step], [-0.09, 0.5 + lift, 0.0], [-0.08, 0.9 + lift, 0]], [0.06, 0.07, 0.09]), cloth[0]
+    )
     soup.add(ellipsoid([0, 1.15 + lift, 0], [0.21, 0.34, 0.14]), cloth[1])
     for side in (-1, 1):
-        soup.add(tube([[side * 0.22, 1.4 + lift, 0], [side * 0.27, 1.1 + lift, 0.05], [side * 0.25, 0.85 + lift, 0.15]], 0.045), cloth[1])
+        soup.add(
+            tube(
+                [[side * 0.22, 1.4 + lift, 0], [side * 0.27, 1.1 + lift, 0.05], [side * 0.25, 0.85 + lift, 0.15]], 0.045
+            ),
+            cloth[1],
+        )
     soup.add(ellipsoid([0, 1.63 + lift, 0], [0.1, 0.13, 0.11]), skin)
     if bicycle is not None:
         a = np.linspace(0, 2 * np.pi, 15)

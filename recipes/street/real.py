@@ -43,7 +43,9 @@ def real_frames(root: Path) -> dict[str, list[Frame]]:
 
 
 @torch.inference_mode()
-def score(network: nn.Module, clips: dict[str, list[Frame]], size: tuple[int, int], flip: bool = False, finest: int = 0) -> dict[str, tuple[float, float, float]]:
+def score(
+    network: nn.Module, clips: dict[str, list[Frame]], size: tuple[int, int], flip: bool = False, finest: int = 0
+) -> dict[str, tuple[float, float, float]]:
     """Return the mean Abs Rel, mean δ1 and median scale ratio of each clip.
 
     Args:

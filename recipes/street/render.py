@@ -36,18 +36,20 @@ class Assets:
         rng = np.random.default_rng(seed)
         self.pyramids: list[list[Array]] = []
         self.names: dict[str, list[int]] = {name: [] for name in SURFACES}
+        places = {"m": "miniworld/textures", "d": "metadrive/assets/textures", "s": "skimage/data"}
         files = {
-            "asphalt": ["miniworld/textures/asphalt_1.png", "metadrive/assets/textures/sci/color.jpg"],
-            "grass": ["skimage/data/grass.png", "miniworld/textures/grass_1.png", "miniworld/textures/grass_2.png", "metadrive/assets/textures/grass2/color.jpg", "metadrive/assets/textures/grass2/color_old.jpg"],  # noqa: E501  # fmt: skip
-            "gravel": ["skimage/data/gravel.png", "miniworld/textures/rock_1.png"],
-            "brick": ["skimage/data/brick.png", "miniworld/textures/brick_wall_1.png", "miniworld/textures/cinder_blocks_1.png"],
-            "concrete": [f"miniworld/textures/concrete_{i}.png" for i in range(1, 5)] + ["metadrive/assets/textures/ground.png"],
-            "stucco": ["miniworld/textures/stucco_1.png", "miniworld/textures/drywall_1.png", "miniworld/textures/marble_2.png"],
-            "wood": ["miniworld/textures/wood_1.png", "miniworld/textures/wood_2.png", "miniworld/textures/wood_planks_1.png"],
-            "tiles": ["miniworld/textures/concrete_tiles_1.png", "metadrive/assets/textures/sidewalk/color.png", "metadrive/assets/textures/sidewalk/color_old.png"],
-        }  # fmt: skip
+            "asphalt": ["m/asphalt_1.png", "d/sci/color.jpg"],
+            "grass": ["s/grass.png", "m/grass_1.png", "m/grass_2.png", "d/grass2/color.jpg", "d/grass2/color_old.jpg"],
+            "gravel": ["s/gravel.png", "m/rock_1.png"],
+            "brick": ["s/brick.png", "m/brick_wall_1.png", "m/cinder_blocks_1.png"],
+            "concrete": [f"m/concrete_{i}.png" for i in range(1, 5)] + ["d/ground.png"],
+            "stucco": ["m/stucco_1.png", "m/drywall_1.png", "m/marble_2.png"],
+            "wood": ["m/wood_1.png", "m/wood_2.png", "m/wood_planks_1.png"],
+            "tiles": ["m/concrete_tiles_1.png", "d/sidewalk/color.png", "d/sidewalk/color_old.png"],
+        }
         for name, paths in files.items():
             for path in paths:
+                path = path.replace(path[0], places[path[0]], 1)
                 image = cv2.imread(str(root / path), cv2.IMREAD_COLOR)
                 if image is None:
                     raise FileNotFoundError(f"{root / path} cannot be read; unpack the wheels as README.md says")
@@ -60,7 +62,9 @@ class Assets:
         self.names["noise_streak"].append(self._texture(noise(rng, 1.3, (1, 8))))
         self.names["noise_streak"].append(self._texture(noise(rng, 1.3, (8, 1))))
         self.clouds = noise(rng, 1.9)[..., 0]
-        self.cars = [car_mesh(root / f"metadrive/assets/models/vehicle/{n}") for n in ("beetle", "ferra", "lada", "130", "truck")]
+        self.cars = [
+            car_mesh(root / f"metadrive/assets/models/vehicle/{n}") for n in ("beetle", "ferra", "lada", "130", "truck")
+        ]
 
     def _texture(self, image: Array) -> int:
         image = (image + 0.02) / (image.mean((0, 1)) + 0.02)
@@ -100,7 +104,7 @@ def car_mesh(folder: Path) -> tuple[Array, Array, np.ndarray, np.ndarray]:
             continue
         for part in trimesh.load(folder / file, force="scene").dump():
             color = face_colors(part)
-            v, faces, color = cluster(np.asarray(part.vertices), np.asarray(part.faces), color ** 2.2, 0.08)
+            v, faces, color = cluster(np.asarray(part.vertices), np.asarray(part.faces), color**2.2, 0.08)
             name = str(getattr(part.visual.material, "name", "")).lower()
             if file == "vehicle.gltf":
                 parts.append((v[faces], color, name))
@@ -167,10 +171,13 @@ class Renderer:
         self.still = _Solid(street.soup)
         self.street, self.assets, self.light = street, assets, street.light
         self.table = {
-            "kind": np.array(street.materials.kind), "color": np.array(street.materials.color, np.float32),
-            "texture": np.array(street.materials.texture), "scale": np.array(street.materials.scale, np.float32),
-            "contrast": np.array(street.materials.contrast, np.float32), "params": np.stack(street.materials.params),
-        }  # fmt: skip
+            "kind": np.array(street.materials.kind),
+            "color": np.array(street.materials.color, np.float32),
+            "texture": np.array(street.materials.texture),
+            "scale": np.array(street.materials.scale, np.float32),
+            "contrast": np.array(street.materials.contrast, np.float32),
+            "params": np.stack(street.materials.params),
+        }
         self.move(0.0)
 
     def move(self, time_s: float) -> None:
@@ -178,7 +185,9 @@ class Renderer:
         moving = _Solid(self.street.traffic(time_s)) if self.street.vehicles else None
         self.solids = [self.still] if moving is None else [self.still, moving]
         self.offset = [0, len(self.still.normal)]
-        join = [np.concatenate([getattr(s, name) for s in self.solids]) for name in ("normal", "material", "uv", "tint")]
+        join = [
+            np.concatenate([getattr(s, name) for s in self.solids]) for name in ("normal", "material", "uv", "tint")
+        ]
         self.normal, self.material, self.uv, self.tint = join
 
     def cast(self, origin: Array, direction: Array) -> tuple[np.ndarray, Array, Array, Array]:
@@ -187,8 +196,17 @@ class Renderer:
         best: list[np.ndarray] | None = None
         for solid, offset in zip(self.solids, self.offset, strict=False):
             hit = solid.scene.run(origin, direction, query="INTERSECT", output=True)
-            found = [np.where(hit["primID"] >= 0, hit["primID"] + offset, -1), np.where(hit["primID"] >= 0, hit["tfar"], np.inf), hit["u"], hit["v"]]
-            best = found if best is None else [np.where(found[1] < best[1], f, b) for f, b in zip(found, best, strict=True)]
+            found = [
+                np.where(hit["primID"] >= 0, hit["primID"] + offset, -1),
+                np.where(hit["primID"] >= 0, hit["tfar"], np.inf),
+                hit["u"],
+                hit["v"],
+            ]
+            best = (
+                found
+                if best is None
+                else [np.where(found[1] < best[1], f, b) for f, b in zip(found, best, strict=True)]
+            )
         assert best is not None
         return best[0], best[1], best[2], best[3]
 
@@ -201,7 +219,9 @@ class Renderer:
             out |= np.asarray(solid.scene.run(origin, direction, dists=dists, query="OCCLUDED")) != -1
         return out
 
-    def render(self, rng: np.random.Generator, T_world_cam: Array, K: Array, height: int, width: int) -> tuple[Array, Array]:
+    def render(
+        self, rng: np.random.Generator, T_world_cam: Array, K: Array, height: int, width: int
+    ) -> tuple[Array, Array]:
         """Render one frame.
 
         Args:
@@ -225,7 +245,19 @@ class Renderer:
         depth = np.zeros(height * width, np.float32)
         depth[hit] = t[hit]  # the ray's z is 1, so its parameter is the depth
         if len(hit):
-            color[hit] = self._shade(rng, hit, primitive[hit], t[hit], bu[hit], bv[hit], direction[hit], unit[hit], origin[hit], K, (height, width))
+            color[hit] = self._shade(
+                rng,
+                hit,
+                primitive[hit],
+                t[hit],
+                bu[hit],
+                bv[hit],
+                direction[hit],
+                unit[hit],
+                origin[hit],
+                K,
+                (height, width),
+            )
         return color.reshape(height, width, 3), depth.reshape(height, width)
 
     def _sky(self, unit: Array) -> Array:
@@ -234,8 +266,8 @@ class Renderer:
         color = light.horizon_color + (light.sky_color - light.horizon_color) * (1 - (1 - up[:, None]) ** 3)
         if self.assets is not None:
             scale = 1 / (up + 0.15)
-            a = ((unit[:, 0] * scale * 40 + light.cloud_offset[0] * 9) % 256).astype(int)
-            b = ((unit[:, 2] * scale * 40 + light.cloud_offset[1] * 9) % 256).astype(int)
+            a = (unit[:, 0] * scale * 40 + light.cloud_offset[0] * 9).astype(int) & 255
+            b = (unit[:, 2] * scale * 40 + light.cloud_offset[1] * 9).astype(int) & 255
             cover = np.clip((self.assets.clouds[a, b] - 1.35 + light.clouds) * 2, 0, 1)[:, None]
             color = color * (1 - cover) + cover * (0.9 + 0.6 * light.sun_color.mean() / 3)
         glow = np.clip(unit @ light.sun, 0, 1)[:, None]
@@ -254,7 +286,12 @@ class Renderer:
         facing = np.abs((normal * unit).sum(1)).clip(0.03, 1)
         footprint = t / K[0, 0] / np.sqrt(facing)
         albedo = table["color"][material] * self.tint[primitive]
-        albedo = albedo * self._texture(table["texture"][material], uv / table["scale"][material][:, None], footprint / table["scale"][material], table["contrast"][material])
+        albedo = albedo * self._texture(
+            table["texture"][material],
+            uv / table["scale"][material][:, None],
+            footprint / table["scale"][material],
+            table["contrast"][material],
+        )
         gloss = np.zeros(n, np.float32)
         emission = np.zeros((n, 3), np.float32)
         self._road(kind, uv, table["params"][material], albedo, footprint)
@@ -336,7 +373,9 @@ class Renderer:
             near = np.abs(d - p[:, i]) < reach
             drawn = (p[:, 5 + i] == 1) | ((p[:, 5 + i] == 2) & (s % (p[:, 10] + p[:, 11]) < p[:, 10]))
             paint = take[near & drawn]
-            cover = (0.07 / reach[near & drawn])[:, None] * (0.6 + 0.4 * (np.sin(s[near & drawn] * 9.1) > -0.6))[:, None]
+            cover = (0.07 / reach[near & drawn])[:, None] * (0.6 + 0.4 * (np.sin(s[near & drawn] * 9.1) > -0.6))[
+                :, None
+            ]
             albedo[paint] = albedo[paint] * (1 - cover) + 0.55 * cover
 
     @staticmethod
@@ -374,9 +413,23 @@ def camera(rng: np.random.Generator, width: int, height: int) -> tuple[Array, Ar
     """Return intrinsics 3 3 and the mounting: height, pitch, roll, lateral offset and yaw to the road."""
     fov = np.deg2rad(rng.uniform(70, 95) if rng.uniform() < 0.7 else rng.uniform(50, 110))
     f = width / 2 / np.tan(fov / 2)
-    K = np.array([[f, 0, (width - 1) / 2 + rng.normal(0, 0.01) * width], [0, f, (height - 1) / 2 + rng.normal(0, 0.08) * height], [0, 0, 1]])
+    K = np.array(
+        [
+            [f, 0, (width - 1) / 2 + rng.normal(0, 0.01) * width],
+            [0, f, (height - 1) / 2 + rng.normal(0, 0.08) * height],
+            [0, 0, 1],
+        ]
+    )
     yaw = rng.normal(0, 0.05) if rng.uniform() < 0.75 else rng.normal(0, 0.4)
-    mount = np.array([rng.normal(1.6, 0.12) if rng.uniform() < 0.6 else rng.uniform(1.2, 2.2), rng.normal(0, 0.025), rng.normal(0, 0.012), rng.normal(0, 0.35), yaw])
+    mount = np.array(
+        [
+            rng.normal(1.6, 0.12) if rng.uniform() < 0.6 else rng.uniform(1.2, 2.2),
+            rng.normal(0, 0.025),
+            rng.normal(0, 0.012),
+            rng.normal(0, 0.35),
+            yaw,
+        ]
+    )
     return K, mount.clip([1.1, -0.1, -0.05, -1.2, -1.2], [2.3, 0.1, 0.05, 1.2, 1.2])
 
 
@@ -430,7 +483,9 @@ def _free_place(rng: np.random.Generator, renderer: Renderer, K: Array, mount: A
     return s, trial
 
 
-def scene(seed: int, assets: Assets | None, views: int, pairs: int, height: int = HEIGHT, width: int = WIDTH) -> dict[str, Any]:
+def scene(
+    seed: int, assets: Assets | None, views: int, pairs: int, height: int = HEIGHT, width: int = WIDTH
+) -> dict[str, Any]:
     """Render one scene from ``views`` places; at the first ``pairs`` of them, a second frame a moment later.
 
     Returns:

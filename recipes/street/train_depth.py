@@ -87,8 +87,24 @@ def forward(network: nn.Module, image: Tensor, finest: int) -> tuple[Tensor, ...
         x = F.interpolate(before(x), scale_factor=2, mode="nearest")
         x = after(torch.cat([x, skips[level]], 1) if level in skips else x)
         if level < len(decoder.heads):
-            depths.append(sigmoid_to_disparity(decoder.heads[level](x), network.min_depth, network.max_depth).reciprocal())
+            depths.append(
+                sigmoid_to_disparity(decoder.heads[level](x), network.min_depth, network.max_depth).reciprocal()
+            )
     return tuple(reversed(depths))
+
+
+def rate_factor(step: int, steps: int, elapsed: float, minutes: float, hold: float) -> float:
+    """Return the factor on the rate: a short rise, then 1, and after the fraction ``hold`` a straight fall to 0.
+
+    Args:
+        step: Steps done.
+        steps: Steps in all.
+        elapsed: Minutes since the start.
+        minutes: Minutes in all; whichever of steps and minutes is further along counts.
+        hold: Fraction of the training before the fall.
+    """
+    progress = max(step / steps, elapsed / minutes)
+    return max(0.0, min(1.0, (step + 1) / 30, (1 - progress) / max(1e-6, 1 - hold)))
 
 
 def gradients(error: Tensor, valid: Tensor) -> Tensor:
@@ -111,13 +127,18 @@ def main() -> None:
     parser.add_argument("scenes", type=Path, help="folder written by render.py")
     parser.add_argument("out", type=Path)
     parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument(
+        "--minutes", type=float, default=1e9, help="end after so many minutes, if the steps take longer"
+    )
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--size", type=int, nargs=2, default=(128, 416))
     parser.add_argument("--rate", type=float, default=8e-4)
     parser.add_argument("--hold", type=float, default=0.6, help="fraction of the steps before the rate falls to 0")
     parser.add_argument("--encoder-rate", type=float, default=0.25, help="fraction of the rate for the encoder")
     parser.add_argument("--frozen", type=int, default=3, help="first blocks of the encoder that stay as they are")
-    parser.add_argument("--finest", type=int, default=0, help="finest scale to train; 1 skips the costly full size at first")
+    parser.add_argument(
+        "--finest", type=int, default=0, help="finest scale to train; 1 skips the costly full size at first"
+    )
     parser.add_argument("--start", type=Path, help="depth weights to start from (a .pt of this script)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--real", type=Path, help="kitti_mini, to print scores on real frames; never trained on")
@@ -135,18 +156,18 @@ def main() -> None:
     average = copy.deepcopy(network)
     freeze(network, options.frozen)
     encoder = [p for p in network.encoder.parameters() if p.requires_grad]
+    slow = {"params": encoder, "lr": options.rate * options.encoder_rate}
     optimizer = torch.optim.AdamW(
-        [{"params": encoder, "lr": options.rate * options.encoder_rate}, {"params": network.decoder.parameters(), "lr": options.rate}],
+        [slow, {"params": network.decoder.parameters(), "lr": options.rate}],
         weight_decay=1e-2,
-    )  # fmt: skip
-    hold = options.hold * options.steps
+    )
+    begin, running = time.time(), 0.0
 
     def factor(step: int) -> float:
-        return min(1.0, (step + 1) / 30, (options.steps - step) / max(1.0, options.steps - hold))
+        return rate_factor(step, options.steps, (time.time() - begin) / 60, options.minutes, options.hold)
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
     size = tuple(options.size)
-    begin, running = time.time(), 0.0
     for step in range(1, options.steps + 1):
         network.train()
         network.encoder.eval()
@@ -165,14 +186,26 @@ def main() -> None:
                 a.lerp_(b, 1 - decay)
         running = value.item() if step == 1 else 0.97 * running + 0.03 * value.item()
         if step % 20 == 0:
-            print(f"{step} loss {running:.4f} {step / (time.time() - begin):.3f} steps/s {len(frames.images)} frames", flush=True)
-        if step % options.every == 0 or step == options.steps:
+            print(
+                f"{step} loss {running:.4f} {step / (time.time() - begin):.3f} steps/s {len(frames.images)} frames",
+                flush=True,
+            )
+        over = time.time() - begin > 60 * options.minutes
+        if step % options.every == 0 or step == options.steps or over:
             torch.save(average.state_dict(), options.out / "depth.part")
             (options.out / "depth.part").replace(options.out / "depth.pt")
-            report = {k: " ".join(f"{x:.3f}" for x in v) for k, v in score(average, clips, size, finest=options.finest).items()}
-            print(f"step {step} real {report} held out {held_out(average, held, size, finest=options.finest):.4f}", flush=True)
+            report = {
+                k: " ".join(f"{x:.3f}" for x in v)
+                for k, v in score(average, clips, size, finest=options.finest).items()
+            }
+            print(
+                f"step {step} real {report} held out {held_out(average, held, size, finest=options.finest):.4f}",
+                flush=True,
+            )
             frames.refresh()
             held.refresh()
+        if over:
+            break
 
 
 @torch.inference_mode()

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from frames import Frames
 from torch import Tensor, nn
+from train_depth import rate_factor
 
 import saunet
 
@@ -36,7 +37,11 @@ def motion(network: nn.Module, earlier: Tensor, later: Tensor) -> Tensor:
 def axis_angle(R: Tensor) -> Tensor:
     """Return the axis-angle vectors, b 3, of small rotations, b 3 3."""
     skew = torch.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1) / 2
-    return skew / (skew.norm(dim=1, keepdim=True).clamp(min=1e-6)) * skew.norm(dim=1, keepdim=True).clamp(1e-6, 0.99).asin()
+    return (
+        skew
+        / (skew.norm(dim=1, keepdim=True).clamp(min=1e-6))
+        * skew.norm(dim=1, keepdim=True).clamp(1e-6, 0.99).asin()
+    )
 
 
 def loss(predicted: Tensor, true: Tensor) -> Tensor:
@@ -56,15 +61,26 @@ def score(network: nn.Module, root: Path, size: tuple[int, int]) -> str:
     T = np.tile(np.eye(4), (len(poses), 1, 1))
     T[:, :3] = poses
     paths = sorted((root / "odometry/sequences/06/image_0").iterdir())[: len(T)]
-    frames = [cv2.resize(cv2.imread(str(p)), size[::-1], interpolation=cv2.INTER_AREA)[..., ::-1].astype(np.float32) / 255 for p in paths]
+    frames = [
+        cv2.resize(cv2.imread(str(p)), size[::-1], interpolation=cv2.INTER_AREA)[..., ::-1].astype(np.float32) / 255
+        for p in paths
+    ]
     batch = torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2)
     got = motion(network, batch[:-1], batch[1:]).double().numpy()
     want = np.linalg.inv(T[1:]) @ T[:-1]
-    turn = np.rad2deg((axis_angle(torch.from_numpy(got[:, :3, :3])) - axis_angle(torch.from_numpy(want[:, :3, :3]))).numpy())
+    turn = np.rad2deg(
+        (axis_angle(torch.from_numpy(got[:, :3, :3])) - axis_angle(torch.from_numpy(want[:, :3, :3]))).numpy()
+    )
     a, b = got[:, :3, 3], want[:, :3, 3]
     cosine = (a * b).sum(1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1) + 1e-9)
     ratio = np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
-    return f"yaw {np.abs(turn[:, 1]).mean():.3f} pitch {np.abs(turn[:, 0]).mean():.3f} deg/frame, direction {np.rad2deg(np.arccos(cosine.clip(-1, 1))).mean():.2f} deg, scale {np.median(ratio):.3f} spread {ratio.std() / ratio.mean():.3f}"
+    yaw, pitch = np.abs(turn[:, 1]).mean(), np.abs(turn[:, 0]).mean()
+    direction = np.rad2deg(np.arccos(cosine.clip(-1, 1))).mean()
+    spread = ratio.std() / ratio.mean()
+    return (
+        f"yaw {yaw:.3f} pitch {pitch:.3f} deg/frame, direction {direction:.2f} deg, "
+        f"scale {np.median(ratio):.3f} spread {spread:.3f}"
+    )
 
 
 @torch.inference_mode()
@@ -89,6 +105,9 @@ def main() -> None:
     parser.add_argument("scenes", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument(
+        "--minutes", type=float, default=1e9, help="end after so many minutes, if the steps take longer"
+    )
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--size", type=int, nargs=2, default=(96, 320))
     parser.add_argument("--rate", type=float, default=5e-4)
@@ -108,10 +127,13 @@ def main() -> None:
         network.load_state_dict(torch.load(options.start, weights_only=True))
     average = copy.deepcopy(network)
     optimizer = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=1e-2)
-    hold = options.hold * options.steps
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: min(1.0, (step + 1) / 30, (options.steps - step) / max(1.0, options.steps - hold)))
-    size = tuple(options.size)
     begin, running = time.time(), 0.0
+
+    def factor(step: int) -> float:
+        return rate_factor(step, options.steps, (time.time() - begin) / 60, options.minutes, options.hold)
+
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+    size = tuple(options.size)
     for step in range(1, options.steps + 1):
         network.eval()  # batch statistics stay those of ImageNet
         samples = [frames.pair_sample(rng, int(i), size) for i in rng.integers(len(frames.pairs), size=options.batch)]
@@ -129,14 +151,20 @@ def main() -> None:
                 p.lerp_(q, 1 - decay)
         running = value.item() if step == 1 else 0.97 * running + 0.03 * value.item()
         if step % 20 == 0:
-            print(f"{step} loss {running:.4f} {step / (time.time() - begin):.3f} steps/s {len(frames.pairs)} pairs", flush=True)
-        if step % options.every == 0 or step == options.steps:
+            print(
+                f"{step} loss {running:.4f} {step / (time.time() - begin):.3f} steps/s {len(frames.pairs)} pairs",
+                flush=True,
+            )
+        over = time.time() - begin > 60 * options.minutes
+        if step % options.every == 0 or step == options.steps or over:
             torch.save(average.state_dict(), options.out / "pose.part")
             (options.out / "pose.part").replace(options.out / "pose.pt")
             real = score(average, options.real, size) if options.real else ""
             print(f"step {step} real: {real}; held out: {held_out(average, held, size)}", flush=True)
             frames.refresh()
             held.refresh()
+        if over:
+            break
 
 
 if __name__ == "__main__":
