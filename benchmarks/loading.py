@@ -25,7 +25,7 @@ import torch
 from PIL import Image, ImageEnhance
 
 import saunet
-from saunet.data.windows import Item, WindowDataset, collate
+from saunet.data.loading.windows import Item, WindowDataset, collate
 
 SIZE = (192, 640)
 SCALES = 4

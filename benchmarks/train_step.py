@@ -23,7 +23,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from saunet import config
-from saunet.data.windows import DRAWS
+from saunet.data.loading.windows import DRAWS
 from saunet.registry import instantiate
 from saunet.training.speed import Speed
 from saunet.training.tool import TrainOptions, assemble

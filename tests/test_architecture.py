@@ -24,7 +24,7 @@ ALLOWED: dict[str, set[str]] = {
     "models": {"errors", "registry", "types", "io", "geometry"},
     "losses": {"errors", "registry", "types", "geometry"},
     "metrics": {"errors", "types", "geometry"},
-    "data": {"errors", "registry", "types", "io", "fingerprint", "geometry", "synthetic"},
+    "data": {"errors", "registry", "schema", "types", "io", "fingerprint", "geometry", "synthetic"},
     "synthetic": {"errors", "io", "data"},
     "runs": {"errors", "io", "registry", "metrics", "models", "__version__"},
     "weights": {"errors", "runs"},

@@ -25,7 +25,9 @@ def test_the_first_losses_of_a_seeded_training(objective: str) -> None:
     config.register_configs()
     config.register_training_configs()
     with initialize_config_dir(str(config.config_dir()), version_base="1.3"):
-        cfg = compose("train", ["experiment=smoke", f"objective={objective}", "output_dir=unused", "data.color=0"])
+        cfg = compose(
+            "train", ["experiment=smoke", f"objective={objective}", "output_dir=unused", "data.color_jitter_prob=0"]
+        )
     torch.manual_seed(cfg.seed)
     data = instantiate(config.plain(cfg.data))
     model = assemble(TrainOptions.from_plain(config.plain(cfg)), data)

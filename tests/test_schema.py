@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import pytest
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from typing_extensions import TypedDict, Unpack
 
 from saunet import schema
 from saunet.cli.compose import structured
@@ -88,3 +90,48 @@ def test_nodes_do_not_share_mutable_defaults() -> None:
     first, second = made(), made()
     first.depths.append(9)
     assert second.depths == [2, 2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Settings of several components.
+
+    Args:
+        size: How large.
+    """
+
+    size: int = 8
+    name: Literal["a", "b"] = "a"
+
+
+class Keywords(TypedDict, total=False):
+    """The fields of `Options`."""
+
+    size: int
+    name: Literal["a", "b"]
+
+
+class Component:
+    """Takes the settings beside its own.
+
+    Args:
+        root: Where.
+        **more: As in `Options`.
+    """
+
+    def __init__(self, *, root: str = "x", **more: Unpack[Keywords]) -> None:
+        self.root, self.options = root, Options(**more)
+
+
+def test_keywords_of_an_options_class_are_flat_keys() -> None:
+    schema.unpacked(Keywords, Options)
+    described = schema.node(Component, {"size": 4})
+    assert [(key.name, key.help) for key in described.keys] == [
+        ("root", "Where."),
+        ("size", "How large."),
+        ("name", ""),
+    ]
+    node = OmegaConf.structured(structured(described))
+    assert {key: node[key] for key in ("root", "size", "name")} == {"root": "x", "size": 4, "name": "a"}
+    with pytest.raises(OmegaConfBaseException):
+        node["size"] = "many"

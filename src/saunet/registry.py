@@ -136,7 +136,7 @@ class Registry:
 
     def _modules(self) -> list[str]:
         package = importlib.import_module(self.home)
-        return [module.name for module in pkgutil.iter_modules(package.__path__, f"{self.home}.")]
+        return [module.name for module in pkgutil.walk_packages(package.__path__, f"{self.home}.")]
 
     def _import_home(self) -> None:
         if self._imported:
@@ -153,7 +153,7 @@ attentions = Registry("attention", None, "saunet.models.attention", late=("chann
 poses = Registry("pose", "model/pose", "saunet.models.poses")
 terms = Registry("term", "term", "saunet.losses.terms")
 objectives = Registry("objective", "objective", "saunet.losses.objectives")
-datamodules = Registry("data", "data", "saunet.data.modules")
+datamodules = Registry("data", "data", "saunet.data")
 
 REGISTRIES: dict[str, Registry] = {
     registry.kind: registry for registry in (encoders, decoders, attentions, poses, terms, objectives, datamodules)

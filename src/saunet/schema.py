@@ -19,6 +19,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Union
 
+from typing_extensions import Unpack
+
 REQUIRED = "???"
 """Default of a key that must be given; OmegaConf's own mark."""
 _PRIMITIVES = {bool: "bool", int: "int", float: "float", str: "str", Path: "str"}
@@ -84,23 +86,48 @@ class Node:
         return cls(**{**plain, "keys": tuple(keys)})
 
 
+_UNPACKED: dict[Any, type] = {}
+
+
+def unpacked(keywords: Any, options: type) -> None:
+    """Let components take ``**kwargs: Unpack[keywords]``: parameters with the types and defaults of a dataclass.
+
+    Args:
+        keywords: A ``TypedDict`` with the names of the fields.
+        options: The dataclass.
+    """
+    _UNPACKED[keywords] = options
+
+
 def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     """Return the named parameters of a class or function, in order, with annotations resolved.
 
     Raises:
-        TypeError: if it takes ``*args``, ``**kwargs`` or an unannotated parameter: a config key has a name and a type.
+        TypeError: if it takes ``*args``, an unannotated parameter, or ``**kwargs`` that no ``Unpack`` of keywords made
+            known by `unpacked` describes: a config key has a name and a type.
     """
     owner = target.__qualname__
     function: Any = target.__init__ if inspect.isclass(target) else target
     hints = typing.get_type_hints(function)
-    found = {}
+    found: dict[str, inspect.Parameter] = {}
     for name, parameter in inspect.signature(target).parameters.items():
+        options = _options(parameter, hints.get(name))
+        if options is not None:
+            found |= parameters(options)
+            continue
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             raise TypeError(f"{owner} takes '{parameter}'; a component names every parameter, each is a config key")
         if name not in hints:
             raise TypeError(f"{owner}: parameter '{name}' has no annotation; its type is needed for the config schema")
         found[name] = parameter.replace(annotation=hints[name])
     return found
+
+
+def _options(parameter: inspect.Parameter, annotation: Any) -> type | None:
+    """Return the options class behind ``**kwargs: Unpack[Keywords]``, None for any other parameter."""
+    if parameter.kind is not parameter.VAR_KEYWORD or typing.get_origin(annotation) is not Unpack:
+        return None
+    return _UNPACKED.get(typing.get_args(annotation)[0])
 
 
 def summary(target: Callable[..., Any]) -> str:
@@ -209,8 +236,12 @@ def _sentences(target: Callable[..., Any]) -> dict[str, str]:
     """Return what is said of each parameter, in one line each: in ``Args:``, or in the string below a field."""
     text = inspect.getdoc(target) or ""
     section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.DOTALL | re.MULTILINE)
-    pieces = re.split(r"^    (\w+): ", section[1], flags=re.MULTILINE)[1:] if section else []
+    pieces = re.split(r"^    \**(\w+): ", section[1], flags=re.MULTILINE)[1:] if section else []
     said = dict(zip(pieces[::2], pieces[1::2], strict=True))
+    function: Any = target.__init__ if inspect.isclass(target) else target
+    for name, parameter in inspect.signature(function).parameters.items():
+        if (options := _options(parameter, typing.get_type_hints(function).get(name))) is not None:
+            said = {**_sentences(options), **said}
     if dataclasses.is_dataclass(target):
         body = ast.parse(textwrap.dedent(inspect.getsource(target))).body[0].body  # type: ignore[attr-defined]
         for field, below in itertools.pairwise(body):

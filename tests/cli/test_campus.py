@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import saunet
-from saunet.data.camera_file import CameraFile, write_camera
-from saunet.data.kitti import KittiRaw
-from saunet.data.lens import Lens
+from saunet.data.kitti.raw import KittiRaw
+from saunet.data.video.camera_file import CameraFile, write_camera
+from saunet.data.video.lens import Lens
 from saunet.io.images import read_image
 from saunet.tools.calibrate.boards import Board
 
@@ -24,7 +24,7 @@ TINY = (
     "model=sau_net_nano",
     "trainer=smoke",
     "logger=none",
-    "data=campus",
+    "data=video",
     "data.frames_cache=cache",
     "data.workers=0",
     "data.batch_size=2",
@@ -69,7 +69,7 @@ def test_a_video_of_a_real_drive_goes_all_the_way(tool: Tool, kitti_mini: Path, 
     K = drive.intrinsics(0)  # of the original size: the video is the same picture, smaller
     write_camera(tmp_path / "campus" / "camera.yaml", CameraFile(Path(), K, (375, 1242), camera_height=1.65))
 
-    looked = tool("doctor", "data=campus", "data.root=campus", "data.frames_cache=cache", "output_dir=doctor")
+    looked = tool("doctor", "data=video", "data.root=campus", "data.frames_cache=cache", "output_dir=doctor")
     assert looked.code == 0, looked.err + looked.out
     for words in ("horizontal field of view 81 degrees", "camera height 1.65 m", "motion between frames 1 apart"):
         assert words in looked.out
@@ -102,7 +102,7 @@ def test_a_video_of_a_real_drive_goes_all_the_way(tool: Tool, kitti_mini: Path, 
 
 def test_the_doctor_ends_with_an_error_where_training_would(tool: Tool, tmp_path: Path) -> None:
     _video(tmp_path / "clips" / "a.avi", _sliding(14))
-    arguments = ("data=campus", "data.root=clips", "data.frames_cache=cache", "output_dir=doctor")
+    arguments = ("data=video", "data.root=clips", "data.frames_cache=cache", "output_dir=doctor")
     outcome = tool("doctor", *arguments)
     assert outcome.code == 1
     assert "error: the train, val and test splits cannot be used: no camera.yaml" in outcome.out
@@ -154,7 +154,7 @@ def test_data_sets_are_mixed_by_config(tool: Tool, raw_root: Path, tmp_path: Pat
     mixture = (
         "data=mixed",
         "+data@data.sources.town=kitti",
-        "+data@data.sources.campus=campus",
+        "+data@data.sources.campus=video",
         f"data.sources.town.root={raw_root}",
         "data.sources.town.split=all",
         "data.sources.town.cameras=[left]",

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from saunet.data.kitti import KittiRaw
+from saunet.data.kitti.raw import KittiRaw
 from saunet.io.trajectories import read_kitti
 from saunet.metrics.functional import ERROR_NAMES
 

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 
 import saunet
 from saunet.cli._scale import scale_predictor
-from saunet.data.camera_file import CameraFile, write_camera
+from saunet.data.video.camera_file import CameraFile, write_camera
 from saunet.errors import CheckpointError, ConfigError
 from saunet.evaluation.tool import EvaluateOptions, _scaled
 from saunet.geometry.pose import pose_matrix
@@ -222,7 +222,7 @@ def test_speeds_of_a_clip_of_which_every_third_frame_is_used(given: float | None
     K = np.array([[200.0, 0, 120], [0, 200, 60], [0, 0, 1]])
     write_camera(tmp_path / "campus" / "camera.yaml", CameraFile(tmp_path, K, (120, 240), fps=30.0))
     data = saunet.build(
-        "data", "campus", root=str(tmp_path / "campus"), fps=10.0, height=32, width=64, workers=0, val_share=0.4
+        "data", "video", root=str(tmp_path / "campus"), fps=10.0, height=32, width=64, workers=0, val_share=0.4
     )
     data.setup("test")
     (tmp_path / "speeds.csv").write_text("frame,speed\n0,0\n44,44\n")  # a meter a second more with each frame

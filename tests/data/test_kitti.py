@@ -8,7 +8,7 @@ import pytest
 from kitti_tree import DATE, make_drive, name
 
 from saunet.data.drive import Drive
-from saunet.data.kitti import KittiRaw
+from saunet.data.kitti.raw import KittiRaw
 from saunet.errors import ConfigError, DataError
 
 

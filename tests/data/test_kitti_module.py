@@ -5,7 +5,7 @@ import torch
 from jaxtyping import TypeCheckError
 from kitti_tree import make_drive, name
 
-from saunet.data.windows import fingerprint
+from saunet.data.loading.windows import fingerprint
 from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 

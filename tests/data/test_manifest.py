@@ -7,8 +7,8 @@ import pytest
 from drives import NumberDrive
 from kitti_tree import make_drive, name
 
-from saunet.data.manifest import Manifest, read_manifest, write_manifest
-from saunet.data.windows import Selection
+from saunet.data.loading.manifest import Manifest, read_manifest, write_manifest
+from saunet.data.loading.windows import Selection
 from saunet.errors import DataError
 from saunet.registry import datamodules
 

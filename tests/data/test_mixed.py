@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 import torch
-from campus_tree import CAMERA, frames, make_clip
+from clip_tree import CAMERA, frames, make_clip
 from kitti_tree import make_drive, name
 
 from saunet.errors import ConfigError, DataError
@@ -20,7 +20,7 @@ def sources(tmp_path, **options):
         "kitti", root=str(tmp_path / "raw"), split="all", cameras=["left"], val_share=0.2, **options
     )
     campus = datamodules.build(
-        "campus", root=str(tmp_path / "clips"), frames_cache=str(tmp_path / "cache"), static="keep", val_share=0.2
+        "video", root=str(tmp_path / "clips"), frames_cache=str(tmp_path / "cache"), static="keep", val_share=0.2
     )
     return {"town": kitti, "campus": campus}
 
@@ -101,7 +101,7 @@ def test_what_does_not_go_together_is_refused(tmp_path):
     ("key", "value", "ours"),
     [
         *(("height", 96, "20"), ("offsets", [-2, 2], r"\(-1, 1\)"), ("batch_size", 99, "4"), ("workers", 2, "0")),
-        *(("translate", 0.2, "0.05"), ("flip", 0.0, "0.5"), ("color", 0.0, "0.5"), ("seed", 3, "0")),
+        *(("crop_margin", 0.2, "0.05"), ("flip_prob", 0.0, "0.5"), ("color_jitter_prob", 0.0, "0.5"), ("seed", 3, "0")),
         *(("target_depth", True, "False"), ("on_error", "skip", "raise")),
     ],
 )

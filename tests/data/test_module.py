@@ -4,9 +4,9 @@ import pytest
 import torch
 from drives import NumberDrive
 
-from saunet.data.module import DepthDataModule
-from saunet.data.windows import Selection
-from saunet.data.workers import available_cores
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.windows import Selection
+from saunet.data.loading.workers import available_cores
 from saunet.errors import ConfigError, DataError
 
 
@@ -27,7 +27,7 @@ def batches(data, loader):
 
 
 def test_training_batches():
-    data = module(translate=0.2, target_depth=True, with_pose=True)
+    data = module(crop_margin=0.2, target_depth=True, with_pose=True)
     data.setup("fit")
     assert set(data.datasets) == {"train", "val"}
     (first, *rest) = batches(data, data.train_dataloader())
@@ -102,7 +102,7 @@ def test_a_loader_before_setup_is_an_error():
 
 @pytest.mark.parametrize(
     "option",
-    [{"height": 0}, {"batch_size": -1}, {"workers": -1}, {"translate": 2.0}, {"flip": 2.0}, {"offsets": (0,)}],
+    [{"height": 0}, {"batch_size": -1}, {"workers": -1}, {"crop_margin": 2.0}, {"flip_prob": 2.0}, {"offsets": (0,)}],
 )
 def test_impossible_settings_are_refused(option):
     with pytest.raises(ConfigError, match=next(iter(option))):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from saunet.data.drive import Drive
-from saunet.data.odometry import OdometrySequence, find_root
+from saunet.data.kitti.odometry import OdometrySequence, find_root
 from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 

@@ -9,9 +9,9 @@ from drives import NumberDrive
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from saunet.data.calibration import read_calibration
-from saunet.data.transforms import Augment, Prepare
-from saunet.data.windows import Item, WindowDataset, collate
+from saunet.data.kitti.calibration import read_calibration
+from saunet.data.loading.transforms import Augment, Prepare
+from saunet.data.loading.windows import Item, WindowDataset, collate
 
 unit = st.floats(0, 0.999)
 
@@ -50,7 +50,7 @@ def check(point, K, size, height, width, translate, draws, flip):
     batch = collate([data[Item(0, 0)]])
     batch["draws"] = torch.tensor([[*draws, 0, 0.5, 0.5, 0.5, 0.5, 0.5]])
     batch["draws"][0, 2] = 0.0 if flip else 0.9
-    out = Augment(height, width, flip=0.5, color=0.0)(batch)
+    out = Augment(height, width, flip_prob=0.5, color_jitter_prob=0.0)(batch)
     moved = np.array([-point[0], point[1], point[2]]) if flip else point
     expected = (out["K"][0].double().numpy() @ moved)[:2] / moved[2]
     # the whole blob must be in the window, else its center of mass is not its center

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from saunet.data.kitti import KittiRaw
-from saunet.data.odometry import OdometrySequence
+from saunet.data.kitti.odometry import OdometrySequence
+from saunet.data.kitti.raw import KittiRaw
 from saunet.registry import datamodules
 from saunet.synthetic import SyntheticDrive, write_odometry, write_raw
 

@@ -8,8 +8,8 @@ from drives import NumberDrive
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from saunet.data.module import DepthDataModule
-from saunet.data.windows import Selection
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.windows import Selection
 
 
 class Drives(DepthDataModule):

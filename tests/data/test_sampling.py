@@ -5,8 +5,8 @@ import pytest
 import torch
 from drives import NumberDrive
 
-from saunet.data.sampling import EvalBatches, ResumableLoader, TrainBatches, evenly
-from saunet.data.windows import WindowDataset, collate
+from saunet.data.loading.sampling import EvalBatches, ResumableLoader, TrainBatches, evenly
+from saunet.data.loading.windows import WindowDataset, collate
 from saunet.errors import ConfigError
 
 

@@ -8,8 +8,8 @@ import pytest
 from kitti_tree import CALIBRATION, SCANNER
 from published_splits import PUBLISHED
 
-from saunet.data import kitti, splits
-from saunet.data.windows import fingerprint
+from saunet.data.kitti import raw, splits
+from saunet.data.loading.windows import fingerprint
 from saunet.registry import datamodules
 
 
@@ -33,7 +33,7 @@ def full_tree(tmp_path, monkeypatch):
         drive = folder.parents[1]
         return {number: f"{number:010d}.png" for number in range(frames[f"{drive.parent.name}/{drive.name}"])}
 
-    monkeypatch.setattr(kitti, "frame_files", listed)
+    monkeypatch.setattr(raw, "frame_files", listed)
     return tmp_path
 
 
@@ -82,8 +82,8 @@ def test_frames_without_improved_truth_are_left_out_and_counted(full_tree):
 
 
 def test_a_missing_side_and_missing_drives_are_counted(full_tree, monkeypatch):
-    whole = kitti.frame_files
-    monkeypatch.setattr(kitti, "frame_files", lambda folder: {} if "image_03" in str(folder) else whole(folder))
+    whole = raw.frame_files
+    monkeypatch.setattr(raw, "frame_files", lambda folder: {} if "image_03" in str(folder) else whole(folder))
     gone = "2011_09_26/2011_09_26_drive_0001_sync"
     (full_tree / gone).rmdir()
     data = module(full_tree)

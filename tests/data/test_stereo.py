@@ -12,13 +12,13 @@ import pytest
 import torch
 from drives import NumberDrive
 
-from saunet.data.kitti import KittiRaw
-from saunet.data.modules.kitti import KittiDataModule
-from saunet.data.modules.kitti_odometry import KittiOdometryDataModule
-from saunet.data.modules.synthetic import SyntheticDataModule
-from saunet.data.odometry import OdometrySequence
-from saunet.data.stereo import measured_distance, other_view
-from saunet.data.windows import Selection, WindowDataset, collate, find_windows
+from saunet.data.kitti.module import KittiDataModule
+from saunet.data.kitti.odometry import OdometrySequence
+from saunet.data.kitti.odometry_module import KittiOdometryDataModule
+from saunet.data.kitti.raw import KittiRaw
+from saunet.data.loading.stereo import measured_distance, other_view
+from saunet.data.loading.windows import Selection, WindowDataset, collate, find_windows
+from saunet.data.synthetic import SyntheticDataModule
 from saunet.errors import ConfigError, DataError
 from saunet.geometry.warp import synthesize
 from saunet.synthetic import SyntheticDrive

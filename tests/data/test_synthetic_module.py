@@ -10,14 +10,14 @@ import pytest
 import torch
 
 import saunet
-from saunet.data.modules.synthetic import SyntheticDataModule
+from saunet.data.synthetic import SyntheticDataModule
 from saunet.errors import ConfigError
 from saunet.geometry.warp import synthesize
 from saunet.metrics.protocols import protocol
 from saunet.registry import datamodules
 
 TINY: dict[str, Any] = {
-    "height": 32, "width": 96, "batch_size": 2, "train_drives": 2, "val_drives": 1, "test_drives": 1,
+    "height": 32, "width": 96, "batch_size": 2, "workers": 0, "train_drives": 2, "val_drives": 1, "test_drives": 1,
     "frames_per_drive": 4,
 }  # fmt: skip
 
@@ -30,7 +30,7 @@ def module() -> SyntheticDataModule:
 
 
 def test_defaults_are_the_demos() -> None:
-    data = SyntheticDataModule()
+    data: SyntheticDataModule = saunet.build("data", "synthetic")
     assert (data.height, data.width, data.batch_size, data.counts["train"]) == (64, 192, 8, 8)
     assert not data.datasets
     assert protocol(data.protocol).name == "synthetic"
@@ -60,8 +60,8 @@ def test_training_batch_carries_motion_and_depth(module: SyntheticDataModule) ->
 
 def test_truth_survives_augmentation() -> None:
     """Crop and flip keep depth, intrinsics, motion and pictures consistent: warping with them explains the target."""
-    data = SyntheticDataModule(**{**TINY, "height": 64, "width": 192, "train_drives": 1, "flip": 0.5, "translate": 0.2},
-                               target_depth=True, with_pose=True)  # fmt: skip
+    changes = {"height": 64, "width": 192, "train_drives": 1, "flip_prob": 0.5, "crop_margin": 0.2}
+    data = SyntheticDataModule(**{**TINY, **changes}, target_depth=True, with_pose=True)
     data.setup("fit")
     for raw in data.train_dataloader():
         batch = data.on_after_batch_transfer(raw, 0)
@@ -97,9 +97,8 @@ def test_drives_come_from_the_cache(tmp_path: Path) -> None:
 
 def test_it_is_registered_and_has_a_schema() -> None:
     assert "synthetic" in saunet.available("data")
-    node = datamodules.node("synthetic")()
-    assert node.frames_per_drive == 60
-    assert node.offsets == [-1, 1]
+    keys = {key.name: key.default for key in datamodules.node("synthetic").keys}
+    assert (keys["frames_per_drive"], keys["offsets"], keys["height"]) == (60, [-1, 1], 64)
 
 
 def test_it_pickles(module: SyntheticDataModule) -> None:

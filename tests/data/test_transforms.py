@@ -5,7 +5,7 @@ import pickle
 import pytest
 import torch
 
-from saunet.data.transforms import Augment, Prepare, flip_motion, jitter_color
+from saunet.data.loading.transforms import Augment, Prepare, flip_motion, jitter_color
 from saunet.errors import ConfigError, DataError
 
 H, W = 8, 12
@@ -22,7 +22,7 @@ def frame_batch(b=3, s=2, margin=(0, 0), **draws):
 
 def test_nothing_drawn_changes_nothing_but_the_type():
     batch = frame_batch()
-    out = Augment(H, W, flip=0.0, color=0.0)(batch)
+    out = Augment(H, W, flip_prob=0.0, color_jitter_prob=0.0)(batch)
     assert torch.equal(out["target"], batch["frames"][:, 0].float() / 255)
     assert torch.equal(out["sources"], batch["frames"][:, 1:].float() / 255)
     assert torch.equal(out["loss_target"], out["target"])
@@ -34,7 +34,7 @@ def test_nothing_drawn_changes_nothing_but_the_type():
 def test_window_and_principal_point_move_together():
     batch = frame_batch(margin=(4, 6), top=[0.0, 0.5, 0.999], left=[0.999, 0.0, 0.3])
     batch["target_depth"] = torch.rand(3, 1, H + 4, W + 6)
-    out = Augment(H, W, flip=0.0, color=0.0)(batch)
+    out = Augment(H, W, flip_prob=0.0, color_jitter_prob=0.0)(batch)
     for i, (top, left) in enumerate([(0, 6), (2, 0), (4, 2)]):
         window = (..., slice(top, top + H), slice(left, left + W))
         assert torch.equal(out["target"][i], batch["frames"][i, 0][window].float() / 255)
@@ -49,7 +49,7 @@ def test_flip_mirrors_images_depth_intrinsics_and_motion_of_its_samples_only():
     batch = frame_batch(flip=[0.1, 0.9, 0.4])
     batch["target_depth"] = torch.rand(3, 1, H, W)
     batch["T_src_tgt"] = torch.rand(3, 2, 4, 4)
-    out = Augment(H, W, flip=0.5, color=0.0)(batch)
+    out = Augment(H, W, flip_prob=0.5, color_jitter_prob=0.0)(batch)
     original = batch["frames"].float() / 255
     assert torch.equal(out["target"][0], original[0, 0].flip(-1))
     assert torch.equal(out["loss_sources"][2], original[2, 1:].flip(-1))
@@ -76,7 +76,7 @@ def test_colors_change_alike_in_all_frames_and_not_in_the_loss_images():
     batch = frame_batch(color=[0.1, 0.9, 0.1])
     batch["frames"] = batch["frames"][:, :1].expand(-1, 3, -1, -1, -1).contiguous()  # three equal frames stay equal
     batch["draws"][:, 4:] = torch.rand(3, 4)
-    out = Augment(H, W, flip=0.0, color=0.5)(batch)
+    out = Augment(H, W, flip_prob=0.0, color_jitter_prob=0.5)(batch)
     original = batch["frames"].float() / 255
     assert torch.allclose(out["sources"], out["target"][:, None].expand(-1, 2, -1, -1, -1), atol=1e-6)
     assert not torch.allclose(out["target"][0], original[0, 0], atol=1e-2)
@@ -125,7 +125,7 @@ def test_too_small_frames_are_refused(transform):
         transform(frame_batch())
 
 
-@pytest.mark.parametrize("option", [{"flip": 1.5}, {"color": -0.1}, {"hue": 0.6}, {"contrast": 2.0}])
+@pytest.mark.parametrize("option", [{"flip_prob": 1.5}, {"color_jitter_prob": -0.1}, {"hue": 0.6}, {"contrast": 2.0}])
 def test_impossible_ranges_are_refused(option):
     with pytest.raises(ConfigError, match=next(iter(option))):
         Augment(H, W, **option)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from saunet.data.drive import Drive
-from saunet.data.kitti import KittiRaw
-from saunet.data.truth_cache import CachedTruth, cache_truths
+from saunet.data.kitti.raw import KittiRaw
+from saunet.data.loading.truth_cache import CachedTruth, cache_truths
 from saunet.errors import DataError
 from saunet.synthetic import SyntheticDrive
 from saunet.synthetic.kitti_writer import write_raw

@@ -5,7 +5,7 @@ import pytest
 import torch
 from drives import NumberDrive
 
-from saunet.data.windows import (
+from saunet.data.loading.windows import (
     DRAWS,
     Item,
     Selection,

@@ -123,7 +123,7 @@ def test_the_mistakes_that_the_readme_shows_end_as_it_says(command: str, answer:
     assert done.stderr.strip().splitlines()[-1].startswith(answer.removesuffix("..."))
 
 
-OWN_DATA = re.compile(r"/data/|\$[A-Z]|\.\.\.|RUN|=campus|hydra/launcher")
+OWN_DATA = re.compile(r"/data/|\$[A-Z]|\.\.\.|RUN|=(video|clips)|hydra/launcher")
 """What plain blocks say of data, runs and clusters that only a reader has."""
 QUICKLY = "model=sau_net_nano data=synthetic_tiny data.workers=0 logger=none trainer=smoke trainer.max_epochs=1"
 TRAININGS = [

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from saunet.data.drive import Drive
-from saunet.data.module import DepthDataModule
-from saunet.data.windows import Selection
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.windows import Selection
 from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
 from saunet.geometry.pose import pose_matrix
 from saunet.registry import objectives

@@ -14,7 +14,7 @@ from drives import NumberDrive
 from numpy.typing import NDArray
 from PIL import Image
 
-from saunet.data.windows import WindowDataset
+from saunet.data.loading.windows import WindowDataset
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import (
     as_rgb_bytes,

@@ -88,7 +88,7 @@ def test_variable_rate_is_chosen_by_time(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize("wanted", [3.0, 7.0, 9.9, 10.0, 12.5, 15.0, 20.0])
 def test_equal_steps_of_an_even_video_are_as_by_number(wanted: float) -> None:
     """For evenly spaced frames it is the rule that training on clips has always had."""
-    from saunet.data.clips import every
+    from saunet.data.video.clips import every
 
     frames = [(i, i / 20, None) for i in range(53)]
     by_number = [n for n, _ in zip(every(20.0, wanted), range(99), strict=False) if n < 53]

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
 from saunet.cli.compose import structured
-from saunet.data.module import DepthDataModule
-from saunet.data.windows import Selection
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.windows import Selection
 from saunet.registry import REGISTRIES
 from saunet.training.module import SelfSupervisedDepth
 from saunet.training.tool import TrainOptions, assemble

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from saunet.data.module import DepthDataModule
+from saunet.data.loading.module import DepthDataModule
 from saunet.errors import CheckpointError, ConfigError
 from saunet.models.encoders.resnet import ResNet
 from saunet.training.tool import TrainOptions, assemble

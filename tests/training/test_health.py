@@ -118,7 +118,7 @@ def test_a_slow_loader_is_named_with_its_figures_and_a_fast_one_is_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = [0.0]  # a clock of our own: a busy machine must not decide this test
-    monkeypatch.setattr("saunet.data.sampling.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("saunet.data.loading.sampling.time.perf_counter", lambda: clock[0])
     monkeypatch.setattr("saunet.training.loading.time.monotonic", lambda: clock[0])
     image = tiny.Wall.image
 

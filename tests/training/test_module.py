@@ -17,8 +17,8 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor, nn
 
 import saunet
-from saunet.data.module import DepthDataModule
-from saunet.data.windows import Selection
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.windows import Selection
 from saunet.errors import ConfigError
 from saunet.io.images import read_image
 from saunet.runs.checkpoint import read_checkpoint

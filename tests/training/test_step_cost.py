@@ -11,7 +11,7 @@ import tiny
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from saunet.data.module import DepthDataModule
+from saunet.data.loading.module import DepthDataModule
 from saunet.losses import functional
 from saunet.losses.terms import photometric
 from saunet.registry import objectives

@@ -13,7 +13,7 @@ import torch
 from lightning import Trainer
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from saunet.data.module import DepthDataModule
+from saunet.data.loading.module import DepthDataModule
 from saunet.errors import CheckpointError, ConfigError
 from saunet.runs.checkpoint import read_checkpoint
 from saunet.training.callbacks import AtomicCheckpointIO

@@ -23,15 +23,15 @@ def rectify(cfg: DictConfig, predictor: Any) -> Any:
     """
     if not cfg.rectify:
         return None
-    from saunet.data.camera_file import read_camera
-    from saunet.data.lens import Straightener
+    from saunet.data.video.camera_file import read_camera
+    from saunet.data.video.lens import Straightener
     from saunet.prediction.pointcloud import Camera
     from saunet.scale import METHODS
 
     if cfg.scale.method in METHODS:
         raise ConfigError(
             f"scale.method={cfg.scale.method} measures on the images as they are, so it does not go with rectify; "
-            "measure with saunet-evaluate data=campus scale.store=true first"
+            "measure with saunet-evaluate data=video scale.store=true first"
         )
     if cfg.camera is not None:
         raise ConfigError("camera and rectify are both set; the camera file has the intrinsics, leave camera out")

@@ -14,7 +14,7 @@ from lightning import Callback, Trainer, seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.loggers import Logger
 
-from saunet.data.module import DepthDataModule
+from saunet.data.loading.module import DepthDataModule
 from saunet.errors import ConfigError, SaunetError, divisible, in_range, one_of, positive, suggest
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.functional import ERROR_NAMES

@@ -6,15 +6,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from campus_tree import CAMERA, frames, make_clip, make_video
+from clip_tree import CAMERA, frames, make_clip, make_video
 from kitti_tree import make_drive, name
 from tiny import Wall
 
-from saunet.data import splits
-from saunet.data.image_cache import CacheSettings
-from saunet.data.manifest import read_manifest, write_manifest
-from saunet.data.module import DepthDataModule
-from saunet.data.windows import Selection
+from saunet.data.kitti import splits
+from saunet.data.loading.image_cache import CacheSettings
+from saunet.data.loading.manifest import read_manifest, write_manifest
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.windows import Selection
 from saunet.io.video import VideoReader
 from saunet.registry import datamodules
 from saunet.tools.doctor.findings import diagnose, manifest_of
@@ -31,7 +31,7 @@ def kitti(root, **options):
 
 def campus(root, **options):
     cache = str(root.parent / "cache")
-    return datamodules.build("campus", root=str(root), workers=0, frames_cache=cache, val_share=0.3, **options)
+    return datamodules.build("video", root=str(root), workers=0, frames_cache=cache, val_share=0.3, **options)
 
 
 def look(data, **options):

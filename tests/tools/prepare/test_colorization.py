@@ -98,7 +98,7 @@ def test_what_cannot_work_is_one_sentence():
 
 @pytest.mark.slow
 def test_a_real_scan_equals_a_sparse_solver(kitti_mini):
-    from saunet.data.kitti import KittiRaw
+    from saunet.data.kitti.raw import KittiRaw
     from saunet.tools.prepare.colorization import NEIGHBORS
 
     drive = KittiRaw(kitti_mini / "raw").drive("2011_09_26/2011_09_26_drive_9015_sync")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from saunet.cli import app
-from saunet.data.image_cache import CacheSettings, ImageCache
+from saunet.data.loading.image_cache import CacheSettings, ImageCache
 from saunet.errors import DataError
 from saunet.registry import datamodules
 from saunet.tools.prepare.cache import build_cache
@@ -54,11 +54,11 @@ def sequences(tmp_path):
 def campus(clips, **options):
     small = {"height": 32, "width": 64, "batch_size": 2, "workers": 0, "val_share": 0.2}
     small |= {"frames_cache": str(clips.parent / "cache")}
-    return datamodules.build("campus", root=str(clips), **{**small, **options})
+    return datamodules.build("video", root=str(clips), **{**small, **options})
 
 
 def odometry(root, **options):
-    small = {"height": 10, "width": 30, "batch_size": 2, "workers": 0, "train_sequences": ["00"], "translate": 0.0}
+    small = {"height": 10, "width": 30, "batch_size": 2, "workers": 0, "train_sequences": ["00"], "crop_margin": 0.0}
     small |= {"val_share": 0.3}
     return datamodules.build("kitti_odometry", root=str(root), **{**small, **options})
 
@@ -73,7 +73,7 @@ def same_samples(plain, cached, split):
 
 
 def test_campus_clips_through_the_command_line(clips, tmp_path, monkeypatch, capsys):
-    words = ["cache", "data=campus", f"data.root={clips}", f"data.frames_cache={tmp_path / 'cache'}", "data.fps=5"]
+    words = ["cache", "data=video", f"data.root={clips}", f"data.frames_cache={tmp_path / 'cache'}", "data.fps=5"]
     words += [f"folder={tmp_path / 'small'}", "height=40", "width=80", "workers=0"]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["saunet"])

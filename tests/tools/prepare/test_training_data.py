@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from prepare_tree import name
 
-from saunet.data.depth_maps import DepthMaps
-from saunet.data.image_cache import CacheSettings
-from saunet.data.resize import resize_depth
+from saunet.data.loading.depth_maps import DepthMaps
+from saunet.data.loading.image_cache import CacheSettings
+from saunet.data.loading.resize import resize_depth
 from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 from saunet.tools.prepare.cache import build_cache
@@ -29,7 +29,7 @@ def module(root, **options):
 def test_dense_depth_is_the_target_in_training_and_validation(tree, tmp_path, kind):
     recordings = kitti_recordings(tree, ["left"])
     densify(recordings, [kind], str(tmp_path / "maps"))
-    data = module(tree, dense=kind, maps=str(tmp_path / "maps"), translate=0.0, depth="lidar_x")
+    data = module(tree, dense=kind, maps=str(tmp_path / "maps"), crop_margin=0.0, depth="lidar_x")
     data.setup("fit")
     sample = data.datasets["train"][0]
     expected = resize_depth(DepthMaps(kind, tmp_path / "maps").read(recordings[0][0], 1), 10, 30)
@@ -49,7 +49,7 @@ def test_a_teachers_depth_follows_crops_and_flips_beside_the_scan(tree, tmp_path
             target.parent.mkdir(parents=True, exist_ok=True)
             np.save(target, ramp)
     teach(kitti_recordings(tree, ["left"]), FileTeacher(tmp_path / "files"))
-    data = module(tree, teacher=True, target_depth=True, flip=1.0)
+    data = module(tree, teacher=True, target_depth=True, flip_prob=1.0)
     data.setup("fit")
     batch = data.on_after_batch_transfer(next(iter(data.train_dataloader())), 0)
     assert batch["target_teacher"].shape == batch["target_depth"].shape == (2, 1, 10, 30)
@@ -77,7 +77,7 @@ def test_missing_maps_name_the_command(tree, tmp_path):
 def test_the_cache_is_read_in_training_and_intrinsics_follow(tree, tmp_path):
     recordings = kitti_recordings(tree, ["left"])
     build_cache(recordings, tmp_path / "cache", CacheSettings(10, 36, quality=100))
-    plain, cached = module(tree, translate=0.0), module(tree, translate=0.0, cache=str(tmp_path / "cache"))
+    plain, cached = module(tree, crop_margin=0.0), module(tree, crop_margin=0.0, cache=str(tmp_path / "cache"))
     for data in (plain, cached):
         data.setup()
     for split in ("train", "val"):
@@ -123,10 +123,10 @@ def test_a_cache_smaller_than_the_training_size_is_refused_or_told(tree, tmp_pat
             ConfigError, match=r"holds images of 10x30 .* loads .* though the originals are larger; make"
         ):
             module(tree, cache=cache, **size).setup("fit")
-    module(tree, cache=cache, translate=0.0).setup("fit")
+    module(tree, cache=cache, crop_margin=0.0).setup("fit")
     assert not recwarn.list
     with pytest.warns(UserWarning, match=r"holds images of 10x30 .* training loads 12x36, .* height=12 width=36"):
-        module(tree, cache=cache, translate=0.2).setup("fit")
+        module(tree, cache=cache, crop_margin=0.2).setup("fit")
     build_cache(recordings, str(tmp_path / "full"), CacheSettings(20, 60))  # originals that are small themselves
     module(tree, cache=str(tmp_path / "full"), height=40, width=120).setup("fit")
     assert not recwarn.list

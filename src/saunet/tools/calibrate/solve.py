@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from saunet.data.camera_file import CameraFile
-from saunet.data.clips import frame_paths
-from saunet.data.lens import Lens
-from saunet.data.sampling import evenly
+from saunet.data.loading.sampling import evenly
+from saunet.data.video.camera_file import CameraFile
+from saunet.data.video.clips import frame_paths
+from saunet.data.video.lens import Lens
 from saunet.errors import DataError
 from saunet.io.images import read_image
 from saunet.io.video import VideoReader

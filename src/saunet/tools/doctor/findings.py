@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from saunet.data.manifest import UNREADABLE, Manifest
-from saunet.data.motion import SAME_PICTURE
-from saunet.data.static import MIN_FLOW
+from saunet.data.loading.manifest import UNREADABLE, Manifest
+from saunet.data.loading.static import MIN_FLOW
+from saunet.data.video.motion import SAME_PICTURE
 from saunet.errors import UnreadableError
 from saunet.tools.doctor.survey import ABSENT, BANDS, FrameFacts, Survey
 
@@ -213,7 +213,7 @@ def _doubled(survey: Survey) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"{doubled} of {len(survey.compared())} frames are the same picture as their neighbor",
-            "the video's frame rate was raised: use the original, or data=campus, which drops doubled frames",
+            "the video's frame rate was raised: use the original, or data=video, which drops doubled frames",
         )
 
 
@@ -224,7 +224,7 @@ def _static(survey: Survey) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"{still} of {len(compared)} frames show no motion; they teach nothing",
-            "train with data.manifest=<this manifest>, or data.static=flow (kitti) or drop (campus)",
+            "train with data.manifest=<this manifest>, or data.static=flow (kitti) or drop (video)",
         )
 
 
@@ -245,7 +245,7 @@ def _bonnet(survey: Survey) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"the lowest {share:.0%} of the picture do not move: the car's bonnet, a dashboard or an imprint",
-            f"cut it off with data.crop=[0,{share:.2f},0,0] (campus), or crop in camera.yaml",
+            f"cut it off with data.crop=[0,{share:.2f},0,0] (video), or crop in camera.yaml",
         )
 
 

@@ -16,9 +16,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from saunet.data.checks import check_frame
 from saunet.data.drive import Drive
-from saunet.data.frame_size import check_frame
-from saunet.data.image_cache import FRAMES, SETTINGS, CacheSettings, ImageCache
+from saunet.data.loading.image_cache import FRAMES, SETTINGS, CacheSettings, ImageCache
 from saunet.errors import DataError
 from saunet.io.atomic import write_bytes, write_json
 from saunet.io.images import resize

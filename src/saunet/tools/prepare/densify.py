@@ -12,8 +12,8 @@ from numpy import ndarray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
 
-from saunet.data.depth_maps import DepthMaps
-from saunet.data.kitti import KittiDrive
+from saunet.data.kitti.raw import KittiDrive
+from saunet.data.loading.depth_maps import DepthMaps
 from saunet.errors import DataError
 from saunet.io.colormaps import depth_to_png16
 from saunet.io.images import resize, write_image

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from saunet.data import splits
 from saunet.data.drive import Drive
-from saunet.data.kitti import CAMERAS, DepthKind, KittiDrive, KittiRaw
-from saunet.data.module import DepthDataModule
-from saunet.data.stereo import other_view
+from saunet.data.kitti import splits
+from saunet.data.kitti.raw import CAMERAS, DepthKind, KittiDrive, KittiRaw
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.stereo import other_view
 from saunet.errors import ConfigError, DataError, suggest
 
 Recording = tuple[KittiDrive, list[int]]
@@ -57,7 +57,7 @@ def module_recordings(data: DepthDataModule) -> list[tuple[Drive, Sequence[int]]
     """
     if not data.cacheable:
         raise ConfigError(
-            f"{type(data).__name__} reads no copies made by saunet-prepare; use data=kitti, kitti_odometry or campus"
+            f"{type(data).__name__} reads no copies made by saunet-prepare; use data=kitti, kitti_odometry or video"
         )
     data.prepare_data()
     drives: dict[str, Drive] = {}

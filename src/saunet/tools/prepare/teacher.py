@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from saunet.data.depth_maps import DepthMaps
-from saunet.data.kitti import KittiDrive
-from saunet.data.windows import sample_name
+from saunet.data.kitti.raw import KittiDrive
+from saunet.data.loading.depth_maps import DepthMaps
+from saunet.data.loading.windows import sample_name
 from saunet.errors import DataError
 from saunet.io.colormaps import depth_to_png16
 from saunet.io.images import read_depth, write_image

@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args
 
-from saunet.data.depth_maps import DENSE_KINDS
-from saunet.data.image_cache import CacheSettings
-from saunet.data.kitti import CAMERAS
-from saunet.data.workers import available_cores
+from saunet.data.kitti.raw import CAMERAS
+from saunet.data.loading.depth_maps import DENSE_KINDS
+from saunet.data.loading.image_cache import CacheSettings
+from saunet.data.loading.workers import available_cores
 from saunet.errors import ConfigError, one_of, positive, usable_device
 from saunet.registry import Spec
 from saunet.tools.prepare.cache import CacheReport, build_cache

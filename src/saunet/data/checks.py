@@ -1,0 +1,107 @@
+"""Checks of a recording before anything is computed from it: can K belong to its images, do these share one size?"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from saunet.data.drive import Drive
+from saunet.errors import DataError
+from saunet.io.images import image_size
+
+FOCAL = (0.15, 10.0)
+"""Focal lengths in image widths (or heights) that a camera may have: a fisheye lens, a long telephoto lens."""
+CENTRE = (0.15, 0.85)
+"""Shares of the width between which the center lies, also where a side was cut off."""
+SHRUNK = 0.3
+"""A center nearer than this share to a corner, both ways, is that of K of another image size; crops move it one way."""
+
+
+def check_intrinsics(
+    K: NDArray[np.float64],
+    height: int | None,
+    width: int | None,
+    where: str,
+    fix: str = "is the calibration that of images of this size?",
+) -> None:
+    """Check that K can belong to an image: upper triangular, a possible field of view, the center where one can be.
+
+    Args:
+        K: 3 x 3, pixels.
+        height: Of the image in pixels; None where nobody says, and then only what needs no size is checked.
+        width: Of the image in pixels; None likewise.
+        where: File and key that K comes from, for the message.
+        fix: What to look at, for the message.
+
+    Raises:
+        DataError: naming what cannot be.
+    """
+    if not np.isfinite(K).all() or not np.allclose(K[2], [0, 0, 1]) or K[1, 0] != 0:
+        raise DataError(f"{where} has K {K.tolist()}; expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    size = f" for an image of {height}x{width} (height x width)" if height and width else ""
+    told = f"{where} has focal lengths {fx:g}, {fy:g} and center {cx:g}, {cy:g}{size}"
+    if not (fx > 0 and fy > 0):
+        raise DataError(f"{told}; the lengths must be positive: {fix}")
+    if not height or not width:
+        return
+    low, high = FOCAL
+    if not (low * width < fx < high * width and low * height < fy < high * max(height, width)):
+        raise DataError(f"{told}; a focal length is some 0.3 to 3 image widths: {fix}")
+    right, down = (cx + 0.5) / width, (cy + 0.5) / height
+    if not (0 < down < 1 and CENTRE[0] < right < CENTRE[1]):
+        raise DataError(f"{told}; the center must lie inside, not near the left or right edge: {fix}")
+    if max(right, down) < SHRUNK or min(right, down) > 1 - SHRUNK:
+        raise DataError(
+            f"{told}; the center must lie inside, and near a corner it is that of images of another size: {fix}"
+        )
+
+
+LOOKED_AT = 5
+"""Frames whose size is looked at: a broken or odd one among them decides nothing."""
+
+
+def common_size(paths: Sequence[Path]) -> tuple[Path, tuple[int, int]]:
+    """Return the (height, width) that most of a recording's readable frames have, and a frame that has it.
+
+    Args:
+        paths: Its frames in order; a few of them, the first included, are looked at.
+
+    Raises:
+        DataError: naming the first, if none of those looked at can be read.
+    """
+    sizes: dict[Path, tuple[int, int]] = {}
+    problem: DataError | None = None
+    for place in np.linspace(0, len(paths) - 1, min(LOOKED_AT, len(paths))).round().astype(int):
+        try:
+            sizes[paths[place]] = image_size(paths[place])
+        except DataError as error:
+            problem = problem or error
+    if not sizes:
+        raise problem or DataError("a recording without frames has no size")
+    (size, _), *_ = Counter(sizes.values()).most_common()
+    return next(path for path, each in sizes.items() if each == size), size
+
+
+def check_frame(drive: Drive, frame: int, image: NDArray[np.uint8]) -> None:
+    """Check that a frame has the size that its recording's K belongs to.
+
+    Args:
+        drive: The recording; one that does not know its ``frame_size`` passes.
+        frame: Number of the frame.
+        image: The frame, h x w x 3.
+
+    Raises:
+        DataError: naming the frame's file, if it has another size.
+    """
+    size = drive.frame_size
+    if size is not None and image.shape[:2] != size:
+        what = drive.path(frame) or f"frame {frame}"
+        raise DataError(
+            f"{what} is {image.shape[1]}x{image.shape[0]} (width x height) where the frames of '{drive.name}' are "
+            f"{size[1]}x{size[0]}; frames of a recording share one size"
+        )

@@ -1,0 +1,251 @@
+"""KITTI raw recordings as a data module."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+from typing_extensions import Unpack
+
+from saunet.data.kitti import splits
+from saunet.data.kitti.raw import CAMERA_HEIGHT, CAMERAS, DEPTH_KINDS, DepthKind, KittiRaw
+from saunet.data.loading.depth_maps import DENSE_KINDS, DepthMaps
+from saunet.data.loading.holdout import Frame, Parts, hold_out, hold_out_drives
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.options import Loading
+from saunet.data.loading.static import has_speed, moving
+from saunet.data.loading.stereo import measured_distance
+from saunet.data.loading.windows import Selection, reach
+from saunet.errors import ConfigError, DataError, in_range, one_of, suggest
+from saunet.registry import datamodules
+
+_PROTOCOLS = {"camera_z": "eigen_camera_z", "lidar_x": "eigen_lidar_x", "improved": "eigen_improved"}
+
+
+@datamodules.register("kitti")
+@datamodules.register("kitti_dense", dense="linear")
+class KittiDataModule(DepthDataModule):
+    """KITTI raw recordings: real street video with the true intrinsics of each camera and date, and LiDAR depth.
+
+    What the root lacks (drives, frames, sides, scans) is left out and reported; nothing left is an error.
+
+    Args:
+        root: Folder of the recordings: holding the date folders, above or below them.
+        split: Training and validation frames: ``eigen_zhou_by_drive``, ``eigen_zhou_random``, ``eigen_full``; ``all``
+            for every frame found; a file in Monodepth2's format, or a folder with train_files.txt and val_files.txt.
+        test_split: Test frames: ``eigen_test``, ``eigen_benchmark_test``, ``all``, or a file. By default ``eigen_test``
+            with a named split, test_files.txt of a folder, and else the held-out frames. Frames need ground truth.
+        val_drives: Drives to hold out, in place of what the split would; ``2011_09_26_drive_0001_sync`` names one.
+        val_share: Share to hold out of ``all`` or of a file: whole drives where there are ten, else the drives' tails.
+        cameras: ``left``, ``right`` or both.
+        static: Frames of a standing car in training and validation: ``keep`` them; drop those whose OXTS ``speed`` is
+            under 0.5 m/s (without OXTS, by flow); or drop those whose median optical ``flow`` to the frame before is
+            under half a pixel at 320 pixels width. Flow reads every frame once at set-up.
+        depth: Ground truth: LiDAR depth as ``camera_z`` or ``lidar_x`` (evaluation only), or ``improved``.
+        target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
+        dense: Dense depth maps as that target in place of the sparse scan: ``linear`` or ``colorization``, made
+            beforehand by ``saunet-prepare densify``; ``none`` uses the scan.
+        teacher: Batches carry another model's depth, made beforehand by ``saunet-prepare teacher``.
+        maps: Folder of these maps; None: beside the recordings.
+        cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
+        stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
+            ``offsets: []`` it is the only one.
+        with_speed: Batches carry the way traveled, from OXTS, for the velocity term; unknown where a record lacks.
+        **loading: Loader settings, as in `LoadOptions`.
+
+    Raises:
+        ConfigError: if a parameter is out of range or a word unknown.
+    """
+
+    camera_height = CAMERA_HEIGHT
+
+    root: str
+
+    def __init__(
+        self,
+        *,
+        root: str = "data/kitti",
+        split: str = "eigen_zhou_by_drive",
+        test_split: str | None = None,
+        val_drives: Sequence[str] = (),
+        val_share: float = 0.1,
+        cameras: Sequence[str] = ("left", "right"),
+        static: Literal["keep", "speed", "flow"] = "keep",
+        depth: Literal["camera_z", "lidar_x", "improved"] = "camera_z",
+        target_depth: bool = False,
+        dense: Literal["none", "linear", "colorization"] = "none",
+        teacher: bool = False,
+        maps: str | None = None,
+        cache: str | None = None,
+        stereo: bool = False,
+        with_speed: bool = False,
+        **loading: Unpack[Loading],
+    ) -> None:
+        super().__init__(
+            target_depth=target_depth or dense != "none",
+            stereo=stereo,
+            cache=cache,
+            **loading,
+        )
+        self.root = root
+        self.split = _known(split, "split", (*splits.TRAINING, "all"))
+        self.test_split = test_split and _known(test_split, "test_split", (*splits.TEST, "all"))
+        self.val_drives = tuple(val_drives)
+        self.val_share = in_range("val_share", val_share, 0.0, 0.9)
+        self.cameras = tuple(one_of("cameras", camera, CAMERAS) for camera in cameras)
+        if not self.cameras:
+            raise ConfigError(f"cameras is empty; name at least one of {', '.join(CAMERAS)}")
+        self.static = one_of("static", static, ("keep", "speed", "flow"))
+        self.ground_truth = one_of("depth", depth, DEPTH_KINDS)
+        self.protocol = _PROTOCOLS[depth]
+        self._depth: DepthKind = depth
+        self._raw: KittiRaw | None = None
+        one_of("dense", dense, ("none", *DENSE_KINDS))
+        if dense != "none":
+            self.maps["target_depth"] = DepthMaps(dense, maps)
+        if teacher:
+            self.maps["target_teacher"] = DepthMaps("teacher", maps)
+        self.odometer = measured_distance if with_speed else None
+
+    def select(self, split: str) -> Sequence[Selection]:
+        """Return the frames of a split, grouped by drive and camera.
+
+        Raises:
+            DataError: if there is no data root, or none of the split's drives is there.
+        """
+        raw = self._raw = self._raw or KittiRaw(self.root)
+        skip = self.on_error == "skip"
+        if split in ("train", "val"):
+            sides = {CAMERAS[camera][1] for camera in self.cameras}
+            frames = [frame for frame in self._training(raw)[split == "val"] if frame.side in sides]
+            between = self._between(raw) if split == "train" else {}
+        else:
+            frames, between = self._test(raw), {}
+        self._check_drives(raw, split, frames)
+        # Losses compare with the camera's depth, whatever the evaluation reads.
+        kind: DepthKind = "camera_z" if split == "train" and self._depth == "lidar_x" else self._depth
+        selections = _group(raw, frames, kind, between)
+        if self.static != "keep" and split in ("train", "val"):
+            selections = [moving(each, by_speed=self.static == "speed", skip_unreadable=skip) for each in selections]
+        if split == "test":
+            selections = [_with_truth(selection) for selection in selections]
+        if split == "train" and self.target_depth and not any(map(_has_truth, selections)):
+            raise DataError(
+                f"target_depth is true but no training frame below {raw.root} has {kind} depth; "
+                "add the velodyne_points, or set data.target_depth=false"
+            )
+        if split == "train" and self.odometer and not any(has_speed(each, skip) for each in selections):
+            raise DataError(
+                f"with_speed is true but no training frame below {raw.root} has an OXTS record; "
+                "add the oxts folders, or set data.with_speed=false"
+            )
+        if split in ("train", "val"):
+            self._check_maps(selections)
+        return selections
+
+    def _check_maps(self, selections: Sequence[Selection]) -> None:
+        """Check that the frames of a split have the depth maps asked for; a frame without a scan needs no dense one."""
+        for maps in self.maps.values():
+            wanted = []
+            for drive, frames, _ in selections:
+                existing = set(drive.indices)
+                dense = maps.kind != "teacher"
+                wanted.append((drive, [f for f in frames if f in existing and (not dense or drive.has_depth(f))]))
+            what = "teacher checkpoint=..." if maps.kind == "teacher" else f"densify kinds=[{maps.kind}]"
+            folder = f" folder={maps.folder}" if maps.folder else ""
+            maps.check(wanted, f"saunet-prepare {what} root={self.root}{folder}")
+
+    def listed(self, split: str) -> list[str]:
+        """Return the names of all images that a split lists, in its order, also of those that the root lacks."""
+        if split != "test":
+            return super().listed(split)
+        return [str(frame) for frame in self._test(self._raw or KittiRaw(self.root))]
+
+    def _training(self, raw: KittiRaw) -> Parts:
+        if self.split in splits.TRAINING:
+            parts = splits.training_split(self.split, self.seed)
+        elif self.split != "all" and Path(self.split).is_dir():
+            folder = Path(self.split)
+            parts = splits.read_split(folder / "train_files.txt"), splits.read_split(folder / "val_files.txt")
+        else:
+            frames, gap = self._pool(raw), reach(self.offsets)
+            parts = (frames, []) if self.val_drives else hold_out(frames, self.val_share, gap, self.seed)
+        return hold_out_drives([*parts[0], *parts[1]], self.val_drives) if self.val_drives else parts
+
+    def _pool(self, raw: KittiRaw) -> list[Frame]:
+        return _everything(raw, self.cameras) if self.split == "all" else splits.read_split(Path(self.split))
+
+    def _between(self, raw: KittiRaw) -> Mapping[tuple[str, str], int]:
+        """Count the frames of each drive and side that lie between training and held-out tail, and in neither."""
+        if self.split in splits.TRAINING or (self.split != "all" and Path(self.split).is_dir()):
+            return {}
+        train, val = self._training(raw)
+        unused = set(self._pool(raw)) - set(train) - set(val)
+        return Counter((frame.drive, frame.side) for frame in unused)
+
+    def _test(self, raw: KittiRaw) -> list[Frame]:
+        split = self.test_split
+        if split is None and self.split in splits.TRAINING:
+            split = "eigen_test"
+        if split is None and (Path(self.split) / "test_files.txt").is_file():
+            split = str(Path(self.split) / "test_files.txt")
+        if split is None:
+            return self._training(raw)[1]
+        if split == "all":
+            return _everything(raw, self.cameras)
+        return splits.test_split(split) if split in splits.TEST else splits.read_split(Path(split))
+
+    def _check_drives(self, raw: KittiRaw, split: str, frames: Sequence[Frame]) -> None:
+        wanted = {frame.drive for frame in frames}
+        if wanted and not wanted & raw.drives.keys():
+            found = ", ".join(list(raw.drives)[:4])
+            raise DataError(
+                f"none of the {len(wanted)} drives of the {split} split is below {raw.root} (found: {found}...); "
+                "use data.split=all, or add the drives"
+            )
+        if not wanted and not any(raw.drive(drive).indices for drive in raw.drives):
+            raise DataError(f"the drives below {raw.root} hold no images, such as {next(iter(raw.drives.values()))}")
+
+
+def _known(value: str, name: str, words: Sequence[str]) -> str:
+    if value in words or Path(value).exists():
+        return value
+    hint = suggest(value, words)
+    raise ConfigError(f"{name} is '{value}'{hint or ','} allowed: {', '.join(words)}, or the path of an existing file")
+
+
+def _everything(raw: KittiRaw, cameras: Sequence[str]) -> list[Frame]:
+    found = []
+    for name in raw.drives:
+        for camera in cameras:
+            found += [Frame(name, number, CAMERAS[camera][1]) for number in raw.drive(name, camera).indices]
+    return found
+
+
+def _group(
+    raw: KittiRaw, frames: Sequence[Frame], kind: DepthKind, between: Mapping[tuple[str, str], int]
+) -> list[Selection]:
+    numbers: dict[tuple[str, str], list[int]] = {}
+    for frame in frames:
+        numbers.setdefault((frame.drive, frame.side), []).append(frame.number)
+    cameras = {side: camera for camera, (_, side) in CAMERAS.items()}
+    return [
+        Selection(
+            raw.drive(drive, cameras[side], kind),
+            wanted,
+            {"between training and validation": between.get((drive, side), 0)},
+        )
+        for (drive, side), wanted in numbers.items()
+    ]
+
+
+def _has_truth(selection: Selection) -> bool:
+    return any(selection.drive.has_depth(frame) for frame in selection.frames)
+
+
+def _with_truth(selection: Selection) -> Selection:
+    existing = set(selection.drive.indices)
+    have = [f for f in selection.frames if f not in existing or selection.drive.has_depth(f)]
+    return Selection(selection.drive, have, {"without ground truth": len(selection.frames) - len(have)})

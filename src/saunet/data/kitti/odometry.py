@@ -1,0 +1,154 @@
+"""Sequences of the KITTI odometry benchmark, with calibration and true poses."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from saunet.data.checks import check_intrinsics, common_size
+from saunet.data.drive import Drive
+from saunet.data.kitti.calibration import read_matrices, zero_based
+from saunet.data.kitti.raw import CAMERA_HEIGHT, frame_files
+from saunet.errors import DataError, one_of
+from saunet.io.images import read_image
+from saunet.io.trajectories import read_kitti
+
+CAMERAS = {"gray_left": (0, "l"), "gray_right": (1, "r"), "color_left": (2, "l"), "color_right": (3, "r")}
+"""Camera name -> its number on disk and its letter in names."""
+
+
+class OdometrySequence(Drive):
+    """One camera of one sequence.
+
+    Args:
+        root: Folder that holds ``sequences`` and, where poses are known, ``poses``.
+        sequence: Its name, such as ``09``.
+        camera: One of `CAMERAS`.
+
+    Raises:
+        ConfigError: for an unknown camera.
+        DataError: if the sequence or its calibration is missing or broken or does not belong to the images, or its
+            file of poses is broken or empty.
+    """
+
+    camera_height = CAMERA_HEIGHT
+    """Meters from the road to the camera."""
+
+    def __init__(self, root: Path, sequence: str, camera: str = "color_left") -> None:
+        number, side = CAMERAS[one_of("camera", camera, CAMERAS)]
+        self._given = (root, sequence, camera)
+        folder = root / "sequences" / sequence
+        if not folder.is_dir():
+            there = ", ".join(sequences(root)) or "none"
+            raise DataError(f"no sequence '{sequence}' at {folder.parent.absolute()}; sequences there: {there}")
+        self._name = f"odometry/{sequence} {side}"
+        self._images = folder / f"image_{number}"
+        self._files = frame_files(self._images)
+        if not self._files:
+            cameras = ", ".join(name for name, (n, _) in CAMERAS.items() if (folder / f"image_{n}").is_dir()) or "none"
+            raise DataError(f"{self._images} holds no images; cameras of sequence '{sequence}' there: {cameras}")
+        self._indices = sorted(self._files)
+        key = f"P{number}"
+        matrices = read_matrices(folder / "calib.txt", {key: (3, 4)})
+        if key not in matrices:
+            raise DataError(f"{folder / 'calib.txt'} lacks {key}; expected a line '{key}: ' with 12 numbers")
+        self._K = matrices[key][:, :3]
+        _, self._size = common_size([self.path(index) for index in self._indices])
+        check_intrinsics(self._K, *self._size, f"{folder / 'calib.txt'}: {key}")
+        # P = K [I | t] maps points of camera 0, so t is where camera 0 lies seen from this camera
+        self._T_cam_cam0 = np.eye(4)
+        self._T_cam_cam0[:3, 3] = np.linalg.solve(self._K, matrices[key][:, 3])
+        poses = root / "poses" / f"{sequence}.txt"
+        self._poses = read_kitti(poses) if poses.is_file() else None
+        self._times = _read_times(folder / "times.txt")
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def origin(self) -> str:
+        return self._given[2]  # of which the name says only left or right
+
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        return self._size
+
+    @property
+    def indices(self) -> Sequence[int]:
+        return self._indices
+
+    def path(self, index: int) -> Path:
+        """Return the file of a frame."""
+        return self._images / self._files[index]
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """Return the frame, h x w x 3, RGB; gray cameras give three equal channels."""
+        return read_image(self.path(index))
+
+    def intrinsics(self, index: int) -> NDArray[np.float64]:
+        """Return K of this camera, 3 x 3, in pixels counted from zero."""
+        return zero_based(self._K)
+
+    def time(self, index: int) -> float | None:
+        """Return the seconds at which a frame was taken, by ``times.txt``; None where that is missing or shorter."""
+        return float(self._times[index]) if 0 <= index < len(self._times) else None
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        """Return T_world_cam of this camera, 4 x 4, meters; None where the file of poses is missing or shorter."""
+        if self._poses is None or not 0 <= index < len(self._poses):
+            return None
+        pose: NDArray[np.float64] = self._poses[index] @ np.linalg.inv(self._T_cam_cam0)
+        return pose
+
+    def stereo(self) -> OdometrySequence:
+        """Return the other camera's recording of this sequence, of the same color.
+
+        Raises:
+            DataError: if its images or its calibration are missing.
+        """
+        return self._stereo
+
+    @functools.cached_property
+    def _stereo(self) -> OdometrySequence:
+        root, sequence, camera = self._given
+        other = camera.replace("left", "right") if "left" in camera else camera.replace("right", "left")
+        return OdometrySequence(root, sequence, other)
+
+    @functools.cached_property
+    def T_stereo_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
+        """By the sequence's calibration."""
+        T: NDArray[np.float64] = self._stereo._T_cam_cam0 @ np.linalg.inv(self._T_cam_cam0)
+        return T
+
+
+def find_root(root: str | Path) -> Path:
+    """Return the folder that holds ``sequences``: the one given, or ``dataset`` or ``odometry`` in it.
+
+    Raises:
+        DataError: if there is none.
+    """
+    folder = Path(root).expanduser()
+    for candidate in (folder, folder / "dataset", folder / "odometry", folder.parent):
+        if (candidate / "sequences").is_dir():
+            return candidate
+    raise DataError(f"no folder 'sequences' at {folder.absolute()}; set data.root to the KITTI odometry data")
+
+
+def sequences(root: Path) -> list[str]:
+    """Return the names of the sequences on disk, sorted."""
+    folder = root / "sequences"
+    return sorted(entry.name for entry in folder.iterdir() if entry.is_dir()) if folder.is_dir() else []
+
+
+def _read_times(path: Path) -> NDArray[np.float64]:
+    if not path.is_file():
+        return np.empty(0)
+    try:
+        return np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
+    except ValueError as reason:
+        raise DataError(f"{path} holds what is no number ({reason}); expected seconds, one a frame") from reason

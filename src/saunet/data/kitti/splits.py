@@ -1,0 +1,148 @@
+"""Which KITTI frames belong to which split: the published tables, a user's files, or a share held out.
+
+The published division of the Eigen-Zhou frames into training and validation is a random draw per frame that follows no
+rule, and most of its validation frames have a training neighbor. So the built-in default holds out whole drives
+(`eigen_zhou_by_drive`); `eigen_zhou_random` draws a seeded tenth of the frames; and the published lists themselves are
+read from files in Monodepth2's ``folder index side`` format.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+from saunet.data.loading.holdout import Frame, Parts, hold_out_drives, hold_out_random
+from saunet.errors import DataError, one_of
+
+VAL_DRIVES = (
+    "2011_09_26/2011_09_26_drive_0005_sync",
+    "2011_09_26/2011_09_26_drive_0014_sync",
+    "2011_09_26/2011_09_26_drive_0019_sync",
+    "2011_09_26/2011_09_26_drive_0032_sync",
+    "2011_09_26/2011_09_26_drive_0061_sync",
+    "2011_09_29/2011_09_29_drive_0004_sync",
+)
+"""Eigen training drives held out by drive: city, residential and road, about a tenth of the frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One drive of the Eigen table."""
+
+    drive: str
+    frames: int
+    """Number of frames in the drive."""
+    listed: tuple[int, ...]
+    """Test frames of a test drive, static frames of a training drive."""
+
+
+@functools.cache
+def eigen_table() -> Mapping[str, tuple[Row, ...]]:
+    """Return the rows of the Eigen split by kind: ``eigen_test`` and ``eigen_train_drive``."""
+    text = files("saunet.data").joinpath("tables", "kitti_eigen.tsv").read_text(encoding="utf-8")
+    rows: dict[str, list[Row]] = {}
+    for line in text.splitlines():
+        if line and not line.startswith("#"):
+            kind, drive, count, ranges = [*line.split("\t"), ""][:4]
+            rows.setdefault(kind, []).append(Row(f"{drive[:10]}/{drive}", int(count), tuple(parse_ranges(ranges))))
+    return {kind: tuple(drives) for kind, drives in rows.items()}
+
+
+def parse_ranges(text: str) -> list[int]:
+    """Return the numbers of ``"0-6/3,9"``: 0, 3, 6, 9 (a-b/s is a, a+s, ... up to and with b)."""
+    numbers: list[int] = []
+    for part in filter(None, text.strip().split(",")):
+        first, dash, rest = part.partition("-")
+        last, _, step = rest.partition("/")
+        numbers += range(int(first), int(last) + 1, int(step or 1)) if dash else [int(first)]
+    return numbers
+
+
+def eigen_test() -> list[Frame]:
+    """Return the 697 test frames of Eigen, left camera."""
+    return [Frame(row.drive, number, "l") for row in eigen_table()["eigen_test"] for number in row.listed]
+
+
+def eigen_benchmark_test() -> list[Frame]:
+    """Return the 652 test frames of Eigen with improved ground truth: five frames or more from the ends of a drive."""
+    return [
+        Frame(row.drive, number, "l")
+        for row in eigen_table()["eigen_test"]
+        for number in row.listed
+        if 5 <= number <= row.frames - 6
+    ]
+
+
+def eigen_full() -> list[Frame]:
+    """Return all 46 976 frames of the 33 training drives, both cameras."""
+    rows = eigen_table()["eigen_train_drive"]
+    return [Frame(row.drive, number, side) for row in rows for number in range(row.frames) for side in "lr"]
+
+
+def eigen_zhou() -> list[Frame]:
+    """Return the 44 234 frames of the training drives that have both neighbors and are not static, both cameras."""
+    frames = []
+    for row in eigen_table()["eigen_train_drive"]:
+        static = set(row.listed)
+        moving = (number for number in range(1, row.frames - 1) if number not in static)
+        frames += [Frame(row.drive, number, side) for number in moving for side in "lr"]
+    return frames
+
+
+TRAINING: Mapping[str, Callable[[int], Parts]] = {
+    "eigen_full": lambda seed: hold_out_drives(eigen_full(), VAL_DRIVES),
+    "eigen_zhou_by_drive": lambda seed: hold_out_drives(eigen_zhou(), VAL_DRIVES),
+    "eigen_zhou_random": lambda seed: hold_out_random(eigen_zhou(), 0.1, seed),
+}
+"""Name of a training split -> its training and validation frames for a seed."""
+TEST: Mapping[str, Callable[[], list[Frame]]] = {
+    "eigen_test": eigen_test,
+    "eigen_benchmark_test": eigen_benchmark_test,
+}
+"""Name of a test split -> its frames."""
+
+
+def training_split(name: str, seed: int = 0) -> Parts:
+    """Return training and validation frames of a named split.
+
+    Raises:
+        ConfigError: for an unknown name.
+    """
+    return TRAINING[one_of("split", name, TRAINING)](seed)
+
+
+def test_split(name: str) -> list[Frame]:
+    """Return the frames of a named test split.
+
+    Raises:
+        ConfigError: for an unknown name.
+    """
+    return TEST[one_of("test_split", name, TEST)]()
+
+
+def read_split(path: Path) -> list[Frame]:
+    """Read a list in Monodepth2's format: a line ``<date>/<drive> <frame> <l or r>`` each.
+
+    Raises:
+        DataError: if the file is missing, empty, or a line is malformed.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as reason:
+        raise DataError(f"cannot read split file {path}: {reason}") from reason
+    frames = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        words = line.split()
+        if len(words) != 3 or not words[1].isdecimal() or words[2] not in ("l", "r") or words[0].count("/") != 1:
+            raise DataError(
+                f"{path}, line {number}: expected '<date>/<drive> <frame number> <l or r>', got '{line.strip()[:80]}'"
+            )
+        frames.append(Frame(words[0], int(words[1]), words[2]))
+    if not frames:
+        raise DataError(f"{path} lists no frames; expected lines '<date>/<drive> <frame number> <l or r>'")
+    return frames

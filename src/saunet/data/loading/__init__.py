@@ -1,0 +1,1 @@
+"""From recordings to batches: what every data set shares."""

@@ -1,0 +1,280 @@
+"""The base of all data modules: selections of frames in, batches on the device out.
+
+A data set subclasses `DepthDataModule`, names its own parameters beside the shared ones, and implements `select`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence, Set
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from lightning.pytorch import LightningDataModule
+from lightning.pytorch.utilities import move_data_to_device, rank_zero_info
+from torch.utils.data import DataLoader
+from typing_extensions import Unpack
+
+from saunet.data.drive import Drive
+from saunet.data.loading.depth_maps import DepthMaps
+from saunet.data.loading.image_cache import ImageCache, check_enlarged
+from saunet.data.loading.manifest import read_manifest
+from saunet.data.loading.options import Loading, LoadOptions
+from saunet.data.loading.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, evenly, share
+from saunet.data.loading.stereo import Odometer
+from saunet.data.loading.transforms import Augment, Prepare
+from saunet.data.loading.unreadable import SkippingWindows, readable
+from saunet.data.loading.windows import Selection, Usage, WindowDataset, collate, find_windows
+from saunet.data.loading.workers import processes
+from saunet.errors import ConfigError, DataError
+from saunet.types import EvalBatch, FrameBatch, TrainBatch
+
+STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("predict",)}
+
+
+class DepthDataModule(LightningDataModule):
+    """Loaders of frame windows, and the transforms that run on the device.
+
+    Args:
+        target_depth: Training batches carry the depth of the target, for losses that use it.
+        with_pose: Batches carry the true motion.
+        stereo: Training and validation batches carry the stereo view as one more source, which makes depth metric.
+        cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
+        **loading: Fields of `LoadOptions`.
+
+    Raises:
+        ConfigError: if a parameter is out of range.
+        DataError: if the manifest or the cache cannot be read.
+    """
+
+    neighbors: Sequence[str] = ("train", "val")
+    """Splits whose samples carry source frames."""
+    protocol: str = "eigen_camera_z"
+    """Name of the evaluation protocol that fits this data set's ground truth."""
+    ground_truth: str = "camera_z"
+    """What kind of depth evaluation batches carry, as the protocols call it."""
+    cacheable: bool = True
+    """Whether ``saunet-prepare cache`` can make copies for it."""
+    root: str | None = None
+    """Where its files are; None if it reads none."""
+
+    @property
+    def camera_height(self) -> float | None:
+        """Meters from the road to the camera, the same for all recordings; None if unknown."""
+        return None
+
+    def __init__(
+        self,
+        *,
+        target_depth: bool = False,
+        with_pose: bool = False,
+        stereo: bool = False,
+        cache: str | None = None,
+        **loading: Unpack[Loading],
+    ) -> None:
+        super().__init__()
+        options = LoadOptions(**loading)
+        self.height, self.width = options.height, options.width
+        self.offsets, self.seed = tuple(options.offsets), options.seed
+        self.batch_size, self.workers = options.batch_size, options.workers
+        self.crop_margin, self.on_error = options.crop_margin, options.on_error
+        self.target_depth, self.with_pose, self.stereo = target_depth, with_pose, stereo
+        self.manifest = read_manifest(options.manifest) if options.manifest else None
+        self.augment = Augment(self.height, self.width, options.flip_prob, options.color_jitter_prob)
+        self.prepare = Prepare(self.height, self.width)
+        self.maps: dict[str, DepthMaps] = {}
+        self.copies = ImageCache(cache) if cache else None
+        self.odometer: Odometer | None = None
+        self.usage: dict[str, list[Usage]] = {}
+        self.datasets: dict[str, WindowDataset] = {}
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """Names of the protocols that fit its parts, its own first."""
+        return (self.protocol,)
+
+    def select(self, split: str) -> Sequence[Selection]:
+        """Return the frames of ``train``, ``val``, ``test`` or ``predict``; the one thing a data set must say.
+
+        Nothing at all for ``val`` means training without validation.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not say which frames belong to '{split}'")
+
+    def setup(self, stage: str | None = None) -> None:
+        """Find the windows of the splits that a stage needs, and report what is used and what is left out.
+
+        Raises:
+            DataError: if a split has no usable frame, or the manifest is of other recordings.
+        """
+        fresh = "train" not in self.datasets
+        for split in STAGES[str(getattr(stage, "value", stage))] if stage else ("train", "val", "test", "predict"):
+            self.setup_split(split)
+        if fresh and "train" in self.datasets:
+            read = [self.datasets[split] for split in STAGES["fit"] if split in self.datasets]
+            self._check_manifests({drive.name for dataset in read for drive in dataset.drives})
+
+    def setup_split(self, split: str) -> None:
+        """Find the windows of one split, unless that is done.
+
+        Raises:
+            DataError: if it has no usable frame.
+        """
+        selections = [] if split in self.datasets else [Selection(*each) for each in self.select(split)]
+        if selections or (split != "val" and split not in self.datasets):
+            self.datasets[split] = self._dataset(split, [self._usable(split, each) for each in selections])
+            rank_zero_info(self.summary(split))
+
+    def teardown(self, stage: str | None = None) -> None:
+        """Say what ``on_error=skip`` passed over."""
+        skipped = self.skipped()
+        if skipped:
+            more = ", ..." if len(skipped) > 5 else ""
+            rank_zero_info(f"{len(skipped)} training samples could not be read: {', '.join(skipped[:5])}{more}")
+
+    def skipped(self) -> list[str]:
+        """Return the names of the training samples that could not be read so far, with ``on_error=skip``."""
+        dataset = self.datasets.get("train")
+        return dataset.skipped() if isinstance(dataset, SkippingWindows) else []
+
+    def summary(self, split: str) -> str:
+        """Return what a split uses and leaves out, readable, with the fingerprint of its frames."""
+        dataset, usage = self.datasets[split], self.usage[split]
+        reasons: dict[str, int] = {}
+        for drive in usage:
+            for reason, count in drive.left_out.items():
+                reasons[reason] = reasons.get(reason, 0) + count
+        sources = sum(1 for drive in usage if drive.used)
+        total = Usage(f"{split} ({sources} of {len(usage)} drives)", len(dataset), reasons)
+        lines = [str(drive) for drive in usage if len(usage) <= 8 or not drive.used]
+        more = [f"... and {len(lines) - 12} drives more"] if len(lines) > 12 else []
+        return "\n  ".join([f"{total}; sha256 {dataset.fingerprint()[:16]}", *lines[:12], *more])
+
+    def fingerprints(self) -> dict[str, str]:
+        """Return the SHA-256 of the sample names of each split that is set up."""
+        return {split: dataset.fingerprint() for split, dataset in self.datasets.items()}
+
+    def _check_manifests(self, names: Set[str]) -> None:
+        if self.manifest is not None:
+            self.manifest.check(names)
+
+    def _usable(self, split: str, selection: Selection) -> Selection:
+        """Leave out what the manifest names, and what cannot be read where that is to be skipped."""
+        offsets = self.offsets if split in self.neighbors else ()
+        if self.manifest is not None and split in ("train", "val"):
+            selection = self.manifest.apply(selection, offsets)
+        if self.on_error == "skip" and split != "train":
+            selection = readable(selection, offsets, with_depth=split in ("val", "test"))
+        return selection
+
+    def _dataset(self, split: str, selections: Sequence[Selection]) -> WindowDataset:
+        offsets = self.offsets if split in self.neighbors else ()
+        stereo = self.stereo and split in self.neighbors
+        windows, usage = find_windows(selections, offsets, stereo)
+        if not windows:
+            found = "; ".join(str(drive) for drive in usage[:3]) or "no drives"
+            needed = [f"neighbors at {list(offsets)}"] * bool(offsets) + ["a stereo view"] * stereo
+            if needed:
+                advice = f"frames need {' and '.join(needed)}: check the data root, the split and the offsets"
+            else:
+                advice = "check the data root and the split"
+            raise DataError(f"split '{split}' has no usable frame ({found}); {advice}")
+        self.usage[split] = usage
+        kind = SkippingWindows if self.on_error == "skip" and split == "train" else WindowDataset
+        return kind(
+            self._recordings(split, selections, windows),
+            windows,
+            offsets=offsets,
+            height=self.height,
+            width=self.width,
+            margin=self._margin(split),
+            with_depth=split in ("val", "test"),
+            with_target_depth=self.target_depth and split in self.neighbors and "target_depth" not in self.maps,
+            with_pose=self.with_pose and split in self.neighbors,
+            stereo=stereo,
+            odometer=self.odometer if split in self.neighbors else None,
+            maps=self.maps if split in self.neighbors else {},
+        )
+
+    def _margin(self, split: str) -> tuple[int, int]:
+        share = self.crop_margin if split == "train" else 0.0
+        return round(self.height * share), round(self.width * share)
+
+    def _recordings(
+        self, split: str, selections: Sequence[Selection], windows: Sequence[tuple[int, int]]
+    ) -> list[Drive]:
+        """Return the recordings; training and validation read the cache, so that tests do not depend on it."""
+        if self.copies is None or split not in ("train", "val"):
+            return [selection.drive for selection in selections]
+        needed: dict[int, set[int]] = {position: set() for position, _ in windows}
+        if self.on_error == "raise":  # else a copy that is missing is a sample to skip
+            for position, frame in windows:
+                needed[position].update(frame + offset for offset in (0, *self.offsets))
+        cached = {
+            position: self.copies.drive(selections[position].drive, frames) for position, frames in needed.items()
+        }
+        check_enlarged(self.copies, cached.values(), (self.height, self.width), self._margin(split))
+        return [cached.get(place, selection.drive) for place, selection in enumerate(selections)]
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Return shuffled training batches, the same for any number of devices."""
+        sampler = TrainBatches(self._set_up("train"), self.batch_size, self.seed, *self._place())
+        return ResumableLoader(self.datasets["train"], sampler=sampler, **self._loading())
+
+    def val_dataloader(self) -> DataLoader[Any] | list[Any]:
+        """Return validation batches, each sample once; an empty list where the data set holds nothing out."""
+        return self._eval_loader("val") if "val" in self.datasets or "train" not in self.datasets else []
+
+    def test_dataloader(self) -> DataLoader[Any]:
+        """Return test batches, each sample once."""
+        return self._eval_loader("test")
+
+    def predict_dataloader(self) -> DataLoader[Any]:
+        """Return the frames to predict, each once."""
+        return self._eval_loader("predict")
+
+    def batches(self, split: str, device: str | torch.device) -> Iterator[EvalBatch]:
+        """Yield a split's batches as the networks want them, on a device: evaluation without a trainer."""
+        for batch in self._eval_loader(split):
+            yield self.prepare(move_data_to_device(batch, torch.device(device)))
+
+    def ground_truths(self, split: str, most: int = 500) -> Iterator[Float[torch.Tensor, "1 h w"]]:
+        """Yield the true depth of a split's frames at native size, meters, 0 where unknown; skips those without any.
+
+        Args:
+            split: ``train``, ``val`` or ``test``, set up.
+            most: Of more frames, only so many are read, evenly spread.
+        """
+        dataset = self._set_up(split)
+        for position, frame in (dataset.windows[place] for place in evenly(len(dataset), most)):
+            depth = dataset.drives[position].depth(frame)
+            if depth is not None:
+                yield torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32))[None]
+
+    def listed(self, split: str) -> list[str]:
+        """Return the names of all images that a split lists, in its order, with or without ground truth.
+
+        Arrays of predictions made elsewhere follow this order.
+        """
+        dataset = self._set_up(split)
+        return [dataset.name(index) for index in range(len(dataset))]
+
+    def on_after_batch_transfer(self, batch: FrameBatch, dataloader_idx: int) -> TrainBatch | EvalBatch:
+        """Turn bytes into images on the device; samples that carry random numbers are augmented."""
+        return self.augment(batch) if "draws" in batch else self.prepare(batch)  # type: ignore[no-any-return]
+
+    def _eval_loader(self, split: str) -> DataLoader[Any]:
+        rank, world_size = self._place()
+        sampler = EvalBatches(self._set_up(split), share(self.batch_size, world_size), rank, world_size)
+        return Loader(self.datasets[split], sampler=sampler, **self._loading())
+
+    def _set_up(self, split: str) -> WindowDataset:
+        if split not in self.datasets:
+            raise ConfigError(f"the '{split}' split is not set up; call setup() first")
+        return self.datasets[split]
+
+    def _place(self) -> tuple[int, int]:
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    def _loading(self) -> Mapping[str, Any]:
+        return {**processes(self.workers), "batch_size": None, "collate_fn": collate}  # samplers yield whole batches

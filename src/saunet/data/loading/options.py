@@ -1,0 +1,86 @@
+"""Loader settings, which are the same for every data set: names, defaults and checks in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from typing_extensions import TypedDict
+
+from saunet import schema
+from saunet.errors import ConfigError, in_range, one_of, positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadOptions:
+    """How frames become batches; every data module takes these as keywords.
+
+    Args:
+        height: Image height in pixels.
+        width: Image width in pixels.
+        offsets: Time offsets of the source frames.
+        batch_size: Samples per step over all devices together.
+        workers: Loader processes per device, at most one per core.
+        crop_margin: Training frames are loaded this much larger (0.1 = 10 %) and a random window is cut; K follows.
+        flip_prob: Probability of mirroring in training.
+        color_jitter_prob: Probability of color jitter in training.
+        seed: Decides order, augmentation, and what is held out at random.
+        manifest: File of frames to leave out of training and validation, as the doctor writes it.
+        on_error: A file that cannot be read: ``raise`` stops and names it; ``skip`` names and counts it and carries
+            on: in training with another sample, while the frames of other splits are all read beforehand.
+
+    Raises:
+        ConfigError: if a value is out of range.
+    """
+
+    height: int = 192
+    width: int = 640
+    offsets: Sequence[int] = (-1, 1)
+    batch_size: int = 12
+    workers: int = 4
+    crop_margin: float = 0.05
+    flip_prob: float = 0.5
+    color_jitter_prob: float = 0.5
+    seed: int = 0
+    manifest: str | None = None
+    on_error: Literal["raise", "skip"] = "raise"
+
+    def __post_init__(self) -> None:
+        for name in ("height", "width", "batch_size"):
+            positive(name, getattr(self, name))
+        for name in ("workers", "seed"):
+            positive(name, getattr(self, name), allow_zero=True)
+        for name in ("crop_margin", "flip_prob", "color_jitter_prob"):
+            in_range(name, getattr(self, name), 0, 1)
+        one_of("on_error", self.on_error, ("raise", "skip"))
+        check_offsets(self.offsets)
+
+
+class Loading(TypedDict, total=False):
+    """The fields of `LoadOptions`, for signatures: ``**loading: Unpack[Loading]``."""
+
+    height: int
+    width: int
+    offsets: Sequence[int]
+    batch_size: int
+    workers: int
+    crop_margin: float
+    flip_prob: float
+    color_jitter_prob: float
+    seed: int
+    manifest: str | None
+    on_error: Literal["raise", "skip"]
+
+
+schema.unpacked(Loading, LoadOptions)
+
+
+def check_offsets(offsets: Sequence[int]) -> None:
+    """Check that the time offsets of the sources are distinct and none is the target itself.
+
+    Raises:
+        ConfigError: otherwise.
+    """
+    if 0 in offsets or len(set(offsets)) != len(offsets):
+        raise ConfigError(f"offsets are {list(offsets)}; they must be distinct and not 0, such as [-1, 1]")

@@ -1,0 +1,157 @@
+"""Which sample goes where: samplers of whole batches, the same for any number of devices, and a loader that resumes.
+
+A sampler here yields lists of items, one list a batch, to a loader with ``batch_size=None``. So training draws one
+global permutation and cuts each global batch into equal parts, and evaluation gives every device the same number of
+batches without repeating or dropping a sample.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
+
+from saunet.data.loading.windows import Item
+from saunet.errors import ConfigError, SaunetError
+
+
+class TrainBatches(DistributedSampler[Any]):
+    """Shuffled batches of `Item`; step k sees the same samples and random numbers on any number of devices.
+
+    Args:
+        dataset: What is sampled.
+        batch_size: Global batch size: the sum over devices.
+        seed: With the epoch, all that order and augmentation depend on.
+        rank: This device.
+        world_size: Number of devices.
+
+    Raises:
+        ConfigError: if the devices do not divide the batch, or there are fewer samples than one batch.
+    """
+
+    def __init__(
+        self, dataset: Dataset[Any], batch_size: int, seed: int = 0, rank: int = 0, world_size: int = 1
+    ) -> None:
+        super().__init__(dataset, num_replicas=world_size, rank=rank, shuffle=True, seed=seed, drop_last=True)
+        self.batch_size = batch_size
+        self.share = share(batch_size, world_size)
+        self.count = len(dataset)  # type: ignore[arg-type]
+        self.start = 0
+        if self.count < batch_size:
+            raise ConfigError(
+                f"batch_size is {batch_size} but there are only {self.count} training samples; "
+                f"use data.batch_size={max(world_size, self.count // world_size * world_size)} or less, or more data"
+            )
+
+    def __len__(self) -> int:
+        return self.count // self.batch_size
+
+    def __iter__(self) -> Iterator[list[Item]]:
+        random = np.random.default_rng([self.seed, self.epoch])
+        order = random.permutation(self.count)
+        seeds = random.integers(2**63, size=self.count)
+        first = self.rank * self.share
+        start, self.start = self.start, 0
+        for step in range(start, len(self)):
+            places = range(step * self.batch_size + first, step * self.batch_size + first + self.share)
+            yield [Item(int(order[place]), int(seeds[place])) for place in places]
+
+
+class EvalBatches(DistributedSampler[Any]):
+    """Every sample exactly once over all devices, in order, and the same number of batches on each.
+
+    Equal numbers of batches keep collective operations of a step (buffer broadcast) in time with each other; the sizes
+    of batches differ by one where they must.
+
+    Args:
+        dataset: What is evaluated.
+        batch_size: Samples a batch on one device; a batch may hold one more where devices and samples do not divide.
+        rank: This device.
+        world_size: Number of devices.
+
+    Raises:
+        ConfigError: if there are fewer samples than devices.
+    """
+
+    def __init__(self, dataset: Dataset[Any], batch_size: int, rank: int = 0, world_size: int = 1) -> None:
+        super().__init__(dataset, num_replicas=world_size, rank=rank, shuffle=False)
+        count = len(dataset)  # type: ignore[arg-type]
+        if count < world_size:
+            raise ConfigError(
+                f"{count} samples cannot be evaluated on {world_size} devices; use trainer.devices={count}"
+            )
+        self.indices = np.arange(rank, count, world_size)
+        self.batches = min(math.ceil(math.ceil(count / world_size) / batch_size), count // world_size)
+
+    def __len__(self) -> int:
+        return self.batches
+
+    def __iter__(self) -> Iterator[list[int]]:
+        for part in np.array_split(self.indices, self.batches):
+            yield [int(index) for index in part]
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """Return the places of at most ``most`` of ``count`` things, spread evenly from the first to the last."""
+    return [int(place) for place in np.linspace(0, count - 1, min(most, count)).round()]
+
+
+def share(batch_size: int, world_size: int) -> int:
+    """Return one device's part of the global batch.
+
+    Raises:
+        ConfigError: if the number of devices does not divide it.
+    """
+    if batch_size < 1 or batch_size % world_size:
+        nearest = max(1, round(batch_size / world_size)) * world_size
+        raise ConfigError(
+            f"batch_size is {batch_size}; it is the sum over all {world_size} devices "
+            f"and must be a positive multiple of their number, such as {nearest}"
+        )
+    return batch_size // world_size
+
+
+class Loader(DataLoader[Any]):
+    """A loader whose processes report a bad file in one sentence, and that knows how long it was waited for."""
+
+    waited = 0.0
+    """Seconds that its user has waited for batches so far."""
+
+    def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
+        try:
+            batches = iter(super().__iter__())
+            while True:
+                began = time.perf_counter()
+                batch = next(batches, None)
+                self.waited += time.perf_counter() - began
+                if batch is None:
+                    return
+                yield batch
+        except SaunetError as error:
+            # torch prefixes what a loader process raised with its traceback, of which the last line is the error
+            name = f"{type(error).__module__}.{type(error).__qualname__}: "
+            raise type(error)(str(error).rpartition(name)[2].strip()) from error
+
+
+class ResumableLoader(Loader):
+    """A loader over `TrainBatches` that can be saved in the middle of an epoch and go on with the next batch."""
+
+    _done = 0
+
+    def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
+        self._done = self.sampler.start  # type: ignore[attr-defined]
+        for batch in super().__iter__():
+            self._done += 1
+            yield batch
+
+    def state_dict(self) -> dict[str, int]:
+        """Return how many batches of this epoch were handed out; 0 after the last."""
+        return {"batches": self._done % max(1, len(self))}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Start the next epoch after that many batches."""
+        self.sampler.start = state["batches"]  # type: ignore[attr-defined]

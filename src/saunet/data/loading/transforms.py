@@ -1,0 +1,217 @@
+"""From decoded bytes to network input, on the device: crop, flip and color, with intrinsics and truth that follow.
+
+The random numbers come with the batch (``draws``), not from the device: the same sample is augmented the same way
+whatever the number of devices or workers, and nothing here waits for the device.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from kornia.enhance import adjust_hue
+from kornia.enhance.adjust import (
+    adjust_brightness_accumulative,
+    adjust_contrast_with_mean_subtraction,
+    adjust_saturation_with_gray_subtraction,
+)
+from torch import Tensor, nn
+
+from saunet.errors import DataError, in_range
+from saunet.geometry.camera import crop_intrinsics, flip_intrinsics
+from saunet.types import EvalBatch, FrameBatch, TrainBatch
+
+TARGETS: tuple[Literal["target_depth", "target_teacher"], ...] = ("target_depth", "target_teacher")
+"""Depth maps at the size of the frames, which follow crops and flips."""
+
+
+def crop(
+    maps: Shaped[Tensor, "b n c h w"], left: Int[Tensor, " b"], top: Int[Tensor, " b"], height: int, width: int
+) -> Shaped[Tensor, "b n c {height} {width}"]:
+    """Cut one window a sample out of its maps.
+
+    Args:
+        maps: Frames or maps of each sample.
+        left: First column of each sample's window.
+        top: First row of each sample's window.
+        height: Height of the window.
+        width: Width of the window.
+    """
+    rows = top[:, None] + torch.arange(height, device=maps.device)
+    columns = left[:, None] + torch.arange(width, device=maps.device)
+    batch = torch.arange(len(maps), device=maps.device)
+    picked = maps[batch[:, None, None], :, :, rows[:, :, None], columns[:, None, :]]  # b h w n c
+    return picked.permute(0, 3, 4, 1, 2).contiguous()
+
+
+def flip_some(maps: Shaped[Tensor, "b n c h w"], which: Bool[Tensor, " b"]) -> Shaped[Tensor, "b n c h w"]:
+    """Mirror the chosen samples left to right."""
+    return torch.where(which[:, None, None, None, None], maps.flip(-1), maps)
+
+
+def flip_motion(T: Float[Tensor, "b s 4 4"], which: Bool[Tensor, " b"]) -> Float[Tensor, "b s 4 4"]:
+    """Motion of the mirrored world, M T M with M = diag(-1, 1, 1, 1), for the chosen samples."""
+    mirror = torch.ones(4, device=T.device, dtype=T.dtype)
+    mirror[0] = -1
+    return torch.where(which[:, None, None, None], T * mirror[:, None] * mirror, T)
+
+
+def jitter_color(
+    frames: Float[Tensor, "b n 3 h w"],
+    which: Bool[Tensor, " b"],
+    brightness: Float[Tensor, " b"],
+    contrast: Float[Tensor, " b"],
+    saturation: Float[Tensor, " b"],
+    hue: Float[Tensor, " b"],
+) -> Float[Tensor, "b n 3 h w"]:
+    """Change the colors of the chosen samples; all frames of a sample change in the same way.
+
+    The frames of a sample are treated as one tall picture, so that they share even the mean gray that contrast turns
+    around.
+
+    Args:
+        frames: RGB in [0, 1].
+        which: Samples to change.
+        brightness: Factor, 1 changes nothing.
+        contrast: Factor, 1 changes nothing.
+        saturation: Factor, 1 changes nothing.
+        hue: Turn of the color circle in radians, 0 changes nothing.
+    """
+    b, n, c, h, w = frames.shape
+    tall = frames.transpose(1, 2).reshape(b, c, n * h, w)
+    tall = adjust_brightness_accumulative(tall, brightness)
+    tall = adjust_contrast_with_mean_subtraction(tall, contrast)
+    tall = adjust_saturation_with_gray_subtraction(tall, saturation)
+    tall = adjust_hue(tall, hue).clamp(0, 1)
+    jittered = tall.reshape(b, c, n, h, w).transpose(1, 2)
+    return torch.where(which[:, None, None, None, None], jittered, frames).contiguous()
+
+
+class Augment(nn.Module):
+    """`FrameBatch` with ``draws`` -> `TrainBatch`: random window, flip, colors; one draw for all frames of a sample.
+
+    Args:
+        height: Height of the images made; the frames may be larger, a random window is cut.
+        width: Width of the images made.
+        flip_prob: Probability of mirroring.
+        color_jitter_prob: Probability of changing colors; the loss images keep theirs.
+        brightness: Factors are drawn from 1 ± this.
+        contrast: Factors are drawn from 1 ± this.
+        saturation: Factors are drawn from 1 ± this.
+        hue: Part of the color circle by which hue turns at most.
+
+    Raises:
+        ConfigError: if a probability or range is outside [0, 1].
+    """
+
+    def __init__(
+        self,
+        height: int,
+        width: int,
+        flip_prob: float = 0.5,
+        color_jitter_prob: float = 0.5,
+        brightness: float = 0.2,
+        contrast: float = 0.2,
+        saturation: float = 0.2,
+        hue: float = 0.1,
+    ) -> None:
+        super().__init__()
+        self.height, self.width = height, width
+        self.flip_prob = in_range("flip_prob", flip_prob, 0, 1)
+        self.color_jitter_prob = in_range("color_jitter_prob", color_jitter_prob, 0, 1)
+        self.brightness = in_range("brightness", brightness, 0, 1)
+        self.contrast = in_range("contrast", contrast, 0, 1)
+        self.saturation = in_range("saturation", saturation, 0, 1)
+        self.hue = in_range("hue", hue, 0, 0.5)
+
+    @torch.no_grad()
+    def forward(self, batch: FrameBatch) -> TrainBatch:
+        """Return the augmented batch.
+
+        Raises:
+            DataError: if the frames are smaller than the images wanted.
+        """
+        draws = batch["draws"]
+        margin_y, margin_x = _margin(batch["frames"], self.height, self.width)
+        top = (draws[:, 0] * (margin_y + 1)).long().clamp(max=margin_y)
+        left = (draws[:, 1] * (margin_x + 1)).long().clamp(max=margin_x)
+        mirrored = draws[:, 2] < self.flip_prob
+        frames = flip_some(crop(batch["frames"], left, top, self.height, self.width), mirrored).float() / 255
+        K = crop_intrinsics(batch["K"], left.float(), top.float())
+        K = torch.where(mirrored[:, None, None], flip_intrinsics(K, self.width), K)
+        signed = 2 * draws[:, 4:8] - 1
+        seen = jitter_color(
+            frames,
+            draws[:, 3] < self.color_jitter_prob,
+            1 + self.brightness * signed[:, 0],
+            1 + self.contrast * signed[:, 1],
+            1 + self.saturation * signed[:, 2],
+            2 * torch.pi * self.hue * signed[:, 3],
+        )
+        out = _split(seen, frames, K, batch["name"])
+        for key in TARGETS:
+            if key in batch:
+                depth = crop(batch[key][:, None], left, top, self.height, self.width)
+                out[key] = flip_some(depth, mirrored)[:, 0]
+        if "T_src_tgt" in batch:
+            out["T_src_tgt"] = flip_motion(batch["T_src_tgt"], mirrored)
+        if "T_stereo_tgt" in batch:  # the partner of a mirrored image is on the other side
+            out["T_stereo_tgt"] = flip_motion(batch["T_stereo_tgt"][:, None], mirrored)[:, 0]
+        if "distance" in batch:
+            out["distance"] = batch["distance"]
+        return out  # type: ignore[return-value]
+
+
+class Prepare(nn.Module):
+    """`FrameBatch` -> `EvalBatch`: the window in the middle, nothing random; ground truth stays at its native size.
+
+    Args:
+        height: Height of the images made.
+        width: Width of the images made.
+    """
+
+    def __init__(self, height: int, width: int) -> None:
+        super().__init__()
+        self.height, self.width = height, width
+
+    @torch.no_grad()
+    def forward(self, batch: FrameBatch) -> EvalBatch:
+        """Return the batch as the networks want it.
+
+        Raises:
+            DataError: if the frames are smaller than the images wanted.
+        """
+        margin_y, margin_x = _margin(batch["frames"], self.height, self.width)
+        top, left = margin_y // 2, margin_x // 2
+        window = (..., slice(top, top + self.height), slice(left, left + self.width))
+        frames = batch["frames"][window].float() / 255
+        out = _split(frames, frames, crop_intrinsics(batch["K"], left, top), batch["name"])
+        for target in TARGETS:
+            if target in batch:
+                out[target] = batch[target][window].contiguous()
+        for key in ("T_src_tgt", "T_stereo_tgt", "distance", "depth", "depth_size"):
+            if key in batch:
+                out[key] = batch[key]
+        return out  # type: ignore[return-value]
+
+
+def _margin(frames: Tensor, height: int, width: int) -> tuple[int, int]:
+    margin = (frames.shape[-2] - height, frames.shape[-1] - width)
+    if min(margin) < 0:
+        raise DataError(
+            f"frames of {frames.shape[-2]}x{frames.shape[-1]} are smaller than the {height}x{width} images "
+            "to be cut from them; load them larger"
+        )
+    return margin
+
+
+def _split(seen: Tensor, compared: Tensor, K: Tensor, name: list[str]) -> dict[str, Any]:
+    return {
+        "target": seen[:, 0],
+        "sources": seen[:, 1:],
+        "loss_target": compared[:, 0],
+        "loss_sources": compared[:, 1:],
+        "K": K,
+        "name": name,
+    }

@@ -1,0 +1,193 @@
+"""Several data sets as one: trained on together, evaluated together and each by itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence, Set
+from functools import partial
+from typing import Any
+
+from typing_extensions import Unpack
+
+from saunet import schema
+from saunet.data.drive import Drive, DriveProxy
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.options import Loading
+from saunet.data.loading.stereo import measured_distance
+from saunet.data.loading.windows import Selection
+from saunet.errors import ConfigError
+from saunet.registry import datamodules
+
+SHARED = (
+    "height",
+    "width",
+    "offsets",
+    "batch_size",
+    "workers",
+    "crop_margin",
+    "seed",
+    "target_depth",
+    "with_pose",
+    "stereo",
+    "on_error",
+)
+"""Settings that belong to the mixture; its sources take them over."""
+AUGMENTATION = ("flip_prob", "color_jitter_prob")
+"""Settings that only the mixture's own augmentation reads."""
+
+
+@datamodules.register("mixed")
+class MixedDataModule(DepthDataModule):
+    """Several named data sets as one, such as KITTI and your own clips; all images get one size, each keeps its own K.
+
+    On the command line: ``data=mixed +data@data.sources.town=kitti +data@data.sources.clips=video`` and then
+    ``data.sources.town.root=...``. What every data set has (size, offsets, batch, augmentation) is set for the mixture.
+    With a source's ``with_speed`` its batches carry the way traveled, and those of other sources say it is unknown.
+
+    Args:
+        sources: Name -> data module; names start the names of samples.
+        train: Names of the sources to train and validate on; all if empty.
+        test: Names of the sources to test and predict; all if empty.
+        target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
+        **loading: Loader settings, as in `LoadOptions`.
+
+    Raises:
+        ConfigError: if there is no source, a name is unknown, a source contradicts the mixture, or their ground truths
+            are of different kinds.
+    """
+
+    cacheable = False
+
+    def __init__(
+        self,
+        *,
+        sources: Mapping[str, Any] | None = None,
+        train: Sequence[str] = (),
+        test: Sequence[str] = (),
+        target_depth: bool = False,
+        **loading: Unpack[Loading],
+    ) -> None:
+        super().__init__(
+            target_depth=target_depth,
+            **loading,
+        )
+        if not sources:
+            raise ConfigError(
+                "data=mixed has no sources; add them with +data@data.sources.NAME=kitti (or video, ...) and set "
+                "data.sources.NAME.root"
+            )
+        self.sources: dict[str, DepthDataModule] = {}
+        for name, source in sources.items():
+            if not isinstance(source, DepthDataModule) or isinstance(source, MixedDataModule) or "/" in name:
+                raise ConfigError(
+                    f"data.sources.{name} is {type(source).__name__}; it must be a data module that is no mixture, and "
+                    "its name must not contain '/'"
+                )
+            self.sources[name] = self._fitted(name, source)
+        self._names = {"train": _known("train", train, self.sources), "test": _known("test", test, self.sources)}
+        with_speed = frozenset(name for name, source in self.sources.items() if source.odometer)
+        self.odometer = partial(_distance, with_speed) if with_speed else None
+        self.ground_truth, self.protocol = _truth([self.sources[name] for name in self._names["test"]])
+
+    @property
+    def camera_height(self) -> float | None:
+        """Meters from the road to the camera, where all sources in use agree; else None."""
+        names = {*self._names["train"], *self._names["test"]}
+        heights = {self.sources[name].camera_height for name in names}
+        return heights.pop() if len(heights) == 1 else None
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """Names of the protocols of its sources to test: for their ground truth, and for those without any."""
+        tested = [self.sources[name] for name in self._names["test"]]
+        without = [source.protocol for source in tested if source.ground_truth == "none"]
+        return tuple(dict.fromkeys((self.protocol, *without)))
+
+    def prepare_data(self) -> None:
+        """Let every source prepare on one process."""
+        for source in self.sources.values():
+            source.prepare_data()
+
+    def select(self, split: str) -> Sequence[Selection]:
+        """Return the frames of all sources that serve a split; a drive's name starts with its source's."""
+        selections = []
+        for name in self._names["train" if split in ("train", "val") else "test"]:
+            source = self.sources[name]
+            for each in source.select(split):
+                selection = Selection(*each)
+                if source.manifest is not None and split in ("train", "val"):
+                    selection = source.manifest.apply(selection, self.offsets if split in self.neighbors else ())
+                selections.append(selection._replace(drive=_Named(f"{name}/{selection.drive.name}", selection.drive)))
+        return selections
+
+    def _check_manifests(self, names: Set[str]) -> None:
+        super()._check_manifests(names)
+        for name in self._names["train"]:
+            start = f"{name}/"
+            own = {each.removeprefix(start) for each in names if each.startswith(start)}
+            self.sources[name]._check_manifests(own)
+
+    def _fitted(self, name: str, source: DepthDataModule) -> DepthDataModule:
+        """Give a source the mixture's settings; refuse those it was given that contradict."""
+        if source.maps or source.copies:
+            raise ConfigError(
+                f"data.sources.{name} reads stored maps or a cache of small images, which a mixture does not; "
+                "leave dense, teacher and cache out"
+            )
+        parameters = schema.parameters(type(source))
+        presets = [entry.preset for entry in datamodules if entry.target is type(source)]
+        for key in (*SHARED, *AUGMENTATION):
+            defaults = [parameters[key].default] if key in parameters else []
+            defaults += [preset[key] for preset in presets if key in preset]
+            holders = (source.augment, self.augment) if key in AUGMENTATION else (source, self)
+            given, ours = (getattr(holder, key) for holder in holders)
+            if key in parameters and given not in (ours, *(_as_kept(each) for each in defaults)):
+                has = key in schema.parameters(type(self))
+                advice = f"set data.{key} only, which holds for all sources" if has else "leave it out"
+                raise ConfigError(f"data.sources.{name}.{key} is {given} and the mixture's is {ours}; {advice}")
+        for key in SHARED:
+            setattr(source, key, getattr(self, key))
+        return source
+
+
+class _Named(DriveProxy):
+    """A recording under another name."""
+
+    def __init__(self, name: str, drive: Drive) -> None:
+        super().__init__(drive)
+        self._name = name
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+
+def _as_kept(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _distance(with_speed: frozenset[str], drive: Drive, first: int, second: int) -> float:
+    """Return the meters traveled where the drive's source was asked for them, else NaN."""
+    return measured_distance(drive, first, second) if drive.name.partition("/")[0] in with_speed else math.nan
+
+
+def _known(key: str, names: Sequence[str], sources: Mapping[str, Any]) -> tuple[str, ...]:
+    for name in names:
+        if name not in sources:
+            raise ConfigError(f"{key} names the source '{name}'; sources: {', '.join(sources)}")
+    return tuple(names) or tuple(sources)
+
+
+def _truth(sources: Sequence[DepthDataModule]) -> tuple[str, str]:
+    """Return the kind of ground truth of sources that have any, and the protocol for it."""
+    kinds = {source.ground_truth: source.protocol for source in sources if source.ground_truth != "none"}
+    if not kinds:
+        return sources[0].ground_truth, sources[0].protocol
+    if set(kinds) == {"camera_z", "exact"}:  # a renderer's depth is a camera's z
+        return "camera_z", kinds["camera_z"]
+    if len(kinds) > 1:
+        raise ConfigError(
+            f"the sources have ground truth of different kinds ({', '.join(sorted(kinds))}), which no protocol mixes; "
+            "set data.sources.NAME.depth alike, or name the sources to evaluate with data.test"
+        )
+    return next(iter(kinds.items()))

@@ -1,0 +1,257 @@
+"""Clips of any camera on disk: which there are, and their frames in order; a video is decoded once into a cache.
+
+A clip is a folder that holds images or a video file; its camera is the nearest ``camera.yaml`` above it. Reading a
+video out of order is slow (every frame needs those before it), so its frames are kept as JPEGs in a cache folder. The
+originals are only ever read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from saunet.data.video.camera_file import FILE_NAME, CameraFile, read_camera
+from saunet.errors import DataError
+from saunet.io.atomic import write_json
+from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, natural_order, resize
+from saunet.io.video import VIDEO_SUFFIXES, VideoReader
+
+QUALITY = 95
+"""JPEG quality of cached frames."""
+
+
+class FramesCacheError(DataError):
+    """The folder for decoded frames and measurements cannot be written, which is no fault of a clip."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One recording on disk, before it was read."""
+
+    name: str
+    """Path below the root, unique."""
+    path: Path
+    """A folder of images, or a video file."""
+    camera: CameraFile
+
+    @property
+    def is_video(self) -> bool:
+        """Whether frames have to be decoded in order."""
+        return self.path.is_file()
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The frames of a clip that are taken in the first place, in order of time."""
+
+    paths: tuple[Path, ...]
+    numbers: tuple[int, ...]
+    """Number of each in the clip as recorded, from 0."""
+    fps: float | None
+    """Frames a second as recorded; None where nobody says."""
+    missing: int = 0
+    """Frames at the end that a video claims to hold and that cannot be decoded."""
+    passed_over: int = 0
+    """Frames between those taken, which the frame rate asked for does not need."""
+    times: tuple[float, ...] | None = None
+    """Seconds of each since the first frame of a video; None if unknown."""
+
+
+def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]:
+    """Find all clips below a folder; a folder of images or a video file is itself one.
+
+    Args:
+        root: Where to look.
+        camera: Description of the camera of all clips; by default the nearest ``camera.yaml``: beside the images or the
+            video, or in a folder above, up to the root.
+
+    Raises:
+        DataError: if the root is missing, holds no clip, or a clip has no camera.
+    """
+    root = Path(root).expanduser()
+    if not root.exists():
+        raise DataError(f"no data root at {root.absolute()}; set data.root to a folder of clips, or to a video")
+    paths = [root] if root.is_file() else sorted(_clip_paths(root), key=natural_order)
+    if root.is_file() and root.suffix.lower() not in VIDEO_SUFFIXES:
+        raise DataError(f"{root} is neither a folder nor a video; videos end in {' '.join(sorted(VIDEO_SUFFIXES))}")
+    if not paths:
+        raise DataError(f"{root} holds neither folders of images nor videos; put each clip below it")
+    base = root.parent if root.is_file() else root
+    given = read_camera(camera) if camera else None
+    known: dict[Path, CameraFile] = {}
+    return [Clip(_name(path, base), path, given or _camera_of(path, base, known)) for path in paths]
+
+
+def frame_paths(folder: Path) -> list[Path]:
+    """Return the images directly in a folder in natural order: ``frame_2`` before ``frame_10``."""
+    with os.scandir(folder) as entries:
+        names = [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
+    return [folder / name for name in sorted(names, key=natural_order) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
+
+
+def every(recorded: float | None, wanted: float | None) -> Iterator[int]:
+    """Yield the numbers of the frames to take for a frame rate: those nearest to equal steps of time.
+
+    Args:
+        recorded: Frames a second of the recording; None takes every frame.
+        wanted: Frames a second to take; None, or more than there are, takes every frame.
+    """
+    ratio = max(1.0, recorded / wanted) if recorded and wanted else 1.0
+    step = 0
+    while True:
+        yield int(step * ratio + 0.5)
+        step += 1
+
+
+def read_clip(
+    clip: Clip,
+    fps: float | None,
+    cache: Path,
+    max_width: int,
+    advance: Callable[[int, int | None], None] = lambda done, total: None,
+) -> Recording:
+    """Return a clip's frames; those of a video are decoded into the cache the first time.
+
+    Args:
+        clip: What to read.
+        fps: Frames a second to take; None takes all.
+        cache: Folder of the cache.
+        max_width: Frames of a video are kept at most this wide.
+        advance: Called with the frames decoded so far and their expected number, while a video is decoded.
+
+    Raises:
+        DataError: if a video cannot be decoded.
+        FramesCacheError: if the cache cannot be written.
+    """
+    if not clip.is_video:
+        paths = frame_paths(clip.path)
+        numbers = _below(every(clip.camera.fps, fps), len(paths))
+        taken = tuple(paths[number] for number in numbers)
+        return Recording(taken, numbers, clip.camera.fps, passed_over=len(paths) - len(taken))
+    folder = cache / f"{clip.path.stem[:60]}-{_key(clip.path, fps, max_width)}"
+    if not (folder / "clip.json").is_file():
+        _decode(clip.path, clip.camera.fps, fps, folder, max_width, advance)
+    try:
+        facts = json.loads((folder / "clip.json").read_text(encoding="utf-8"))
+        numbers, rate, missing = tuple(facts["numbers"]), facts["fps"], int(facts["missing"])
+        times = None if facts["times"] is None else tuple(map(float, facts["times"]))
+        count = int(facts["count"])
+    except (OSError, ValueError, LookupError, TypeError) as reason:
+        raise DataError(f"{folder / 'clip.json'} is damaged ({reason}); delete the folder {folder}") from reason
+    paths = frame_paths(folder)
+    if len(paths) != len(numbers):
+        raise DataError(f"{folder} holds {len(paths)} of {len(numbers)} frames; delete it, so that it is made again")
+    return Recording(tuple(paths), numbers, rate, missing, count - len(numbers), times)
+
+
+def default_cache() -> Path:
+    """Return where decoded frames and measurements go unless told otherwise: the user's cache folder."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+    return Path(base) / "saunet" / "clips"
+
+
+def _decode(
+    video: Path,
+    rate: float | None,
+    fps: float | None,
+    folder: Path,
+    max_width: int,
+    advance: Callable[[int, int | None], None],
+) -> None:
+    """Write the frames of a video that are wanted, into a folder that gets its name only when it is complete."""
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    numbers: list[int] = []
+    times: list[float | None] = []
+    try:
+        partial.mkdir(parents=True, exist_ok=True)
+        reader = VideoReader(video, rate)
+        for frame in reader.frames(fps):
+            width = min(max_width, frame.image.shape[1])
+            small = resize(frame.image, round(frame.image.shape[0] * width / frame.image.shape[1]), width)
+            (partial / f"{frame.number:06d}.jpg").write_bytes(encode_jpeg(small, QUALITY))
+            numbers.append(frame.number)
+            times.append(frame.time)
+            advance(reader.count, reader.declared)
+        facts = {
+            "video": str(video.absolute()),
+            "fps": reader.fps,
+            "numbers": numbers,
+            "times": None if None in times else times,
+            "count": reader.count,
+            "missing": reader.missing,
+        }
+        write_json(partial / "clip.json", facts, indent=None)
+        try:
+            os.replace(partial, folder)
+        except OSError:
+            if not (folder / "clip.json").is_file():  # or else another process was faster
+                raise
+    except OSError as reason:
+        raise FramesCacheError(
+            f"cannot keep the frames of {video} in {folder.parent}: {reason.strerror or reason}; "
+            "set data.frames_cache to a folder with room that can be written"
+        ) from reason
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _key(path: Path, fps: float | None, max_width: int) -> str:
+    state = path.stat()
+    text = f"{path.resolve()}|{state.st_size}|{state.st_mtime_ns}|{fps}|{max_width}|{QUALITY}|times"
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
+
+
+def _below(numbers: Iterator[int], count: int) -> tuple[int, ...]:
+    return tuple(itertools.takewhile(lambda number: number < count, numbers))
+
+
+def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
+    """Yield the folders that hold images and the video files, at any depth; a folder once, however linked.
+
+    Links are followed last, so that what lies below the folder itself keeps its own name.
+    """
+    seen = set() if seen is None else seen
+    links: list[Path] = []
+    for place, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        if os.path.realpath(place) in seen:
+            folders.clear()
+            continue
+        seen.add(os.path.realpath(place))
+        links += [Path(place) / name for name in folders if os.path.islink(os.path.join(place, name))]
+        suffixes = {Path(name).suffix.lower() for name in files if not name.startswith(".")}
+        if suffixes & IMAGE_SUFFIXES:
+            yield Path(place)
+        yield from (
+            Path(place) / name
+            for name in files
+            if not name.startswith(".") and Path(name).suffix.lower() in VIDEO_SUFFIXES
+        )
+    for link in sorted(links):
+        yield from _clip_paths(link, seen)
+
+
+def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraFile:
+    folders = [path, *path.parents] if path.is_dir() else list(path.parents)
+    for folder in folders[: folders.index(base) + 1]:
+        file = folder / FILE_NAME
+        if file not in known and file.is_file():
+            known[file] = read_camera(file)
+        if file in known:
+            return known[file]
+    raise DataError(
+        f"no {FILE_NAME} for {path}: put one beside it or at {base / FILE_NAME}, or set data.camera; "
+        "saunet-calibrate makes one (see docs/your_camera.md)"
+    )
+
+
+def _name(path: Path, base: Path) -> str:
+    if path == base:
+        return path.absolute().name
+    return path.relative_to(base).as_posix()

@@ -1,0 +1,222 @@
+"""Clips of any camera as a data module: frames or videos and one ``camera.yaml``."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Literal
+
+from rich.progress import Progress
+from typing_extensions import Unpack
+
+from saunet.data.loading.holdout import Frame, hold_out
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.options import Loading
+from saunet.data.loading.windows import Selection, reach
+from saunet.data.video.camera_file import check_crop
+from saunet.data.video.clips import Clip, FramesCacheError, default_cache, find_clips, read_clip
+from saunet.data.video.drive import ClipDrive
+from saunet.data.video.motion import measure
+from saunet.errors import ConfigError, DataError, in_range, one_of, positive
+from saunet.io.progress import bar
+from saunet.registry import datamodules
+
+
+@datamodules.register("video")
+@datamodules.register("campus", root="data/campus", camera_height=1.20)
+class VideoDataModule(DepthDataModule):
+    """Your own camera: each folder of frames and each video below the root is a clip; ``camera.yaml`` describes it.
+
+    Frames are undistorted and cropped as they are read. Videos are decoded once into a cache. How far the picture moves
+    is measured once, so that doubled frames and stops are left out. The originals are never written to.
+
+    Args:
+        root: Folder of clips at any depth, a folder of frames, or a video.
+        camera: Description of the camera of all clips; by default the nearest ``camera.yaml`` of each.
+        conditions: Only clips whose camera file has one of these conditions, such as ``[cloudy, sunny]``; all if empty.
+        val_clips: Clips to hold out, by name below the root or by pattern, such as ``night_*``.
+        test_clips: Clips to test and predict; by default the held-out frames.
+        val_share: Share to hold out where no clips are named: whole clips where there are ten, else the clips' tails.
+        fps: Frames a second to use; None uses all. Folders of frames need ``fps`` in their camera file for that.
+        parallax: Use a frame when the picture has moved this far since the last one used (median flow in pixels at 320
+            width; 3 is moderate): even steps whatever the speed. 0 goes by time alone.
+        static: Frames in which nothing moves: ``drop`` them from training and validation, and doubled frames
+            altogether; or ``keep`` all and measure nothing.
+        crop: Shares to cut off at the [top, bottom, left, right], such as ``[0,0.12,0,0]`` for a bonnet; by default
+            those of the camera file.
+        camera_height: Meters from the road to the camera, for clips whose camera file does not say.
+        frames_cache: Folder for decoded videos and measurements; by default in the user's cache folder.
+        max_width: Frames of videos are kept at most this wide.
+        cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
+        **loading: Loader settings, as in `LoadOptions`.
+
+    Raises:
+        ConfigError: if a parameter is out of range or a word unknown.
+    """
+
+    neighbors = ("train", "val", "test")
+    protocol = "campus"
+    ground_truth = "none"
+
+    root: str
+
+    def __init__(
+        self,
+        *,
+        root: str = "data/video",
+        camera: str | None = None,
+        conditions: Sequence[str] = (),
+        val_clips: Sequence[str] = (),
+        test_clips: Sequence[str] = (),
+        val_share: float = 0.1,
+        fps: float | None = 10.0,
+        parallax: float = 0.0,
+        static: Literal["drop", "keep"] = "drop",
+        crop: Sequence[float] | None = None,
+        camera_height: float | None = None,
+        frames_cache: str | None = None,
+        max_width: int = 1280,
+        cache: str | None = None,
+        **loading: Unpack[Loading],
+    ) -> None:
+        super().__init__(
+            cache=cache,
+            **loading,
+        )
+        self.root, self.camera = root, camera
+        self.conditions = tuple(conditions)
+        self.val_clips, self.test_clips = tuple(val_clips), tuple(test_clips)
+        self.val_share = in_range("val_share", val_share, 0.0, 0.9)
+        self.fps = None if fps is None else float(positive("fps", fps))
+        self.parallax = float(positive("parallax", parallax, allow_zero=True))
+        self.static = one_of("static", static, ("drop", "keep"))
+        if crop is not None:
+            check_crop(crop, "crop", ConfigError)
+        self.crop = None if crop is None else tuple(crop)
+        self._height = None if camera_height is None else float(positive("camera_height", camera_height))
+        self.frames_cache = default_cache() if frames_cache is None else Path(frames_cache).expanduser()
+        self.max_width = int(positive("max_width", max_width))
+        self._drives: list[ClipDrive] | None = None
+        self._broken: list[str] = []
+
+    def prepare_data(self) -> None:
+        """Decode videos and measure motion on one process, before the others look."""
+        self.drives()
+
+    def drives(self) -> list[ClipDrive]:
+        """Return all clips below the root, in order of their names.
+
+        Raises:
+            DataError: if there is none, one has no camera, or a video or image cannot be read.
+            ConfigError: if a condition or a named clip does not exist.
+        """
+        if self._drives is None:
+            clips = find_clips(self.root, self.camera)
+            if self.conditions:
+                found = sorted({clip.camera.condition or "none" for clip in clips})
+                for condition in self.conditions:
+                    one_of("conditions", condition, found)
+                clips = [clip for clip in clips if clip.camera.condition in self.conditions]
+            with bar(self._place()[0] == 0) as shown:
+                self._drives = [drive for drive in (self._usable_drive(clip, shown) for clip in clips) if drive]
+        return self._drives
+
+    @property
+    def camera_height(self) -> float | None:
+        """Meters of the camera above the road, where all clips agree; else None."""
+        heights = {drive.camera_height for drive in self.drives()}
+        return heights.pop() if len(heights) == 1 else None
+
+    def select(self, split: str) -> Sequence[Selection]:
+        """Return the frames of a split, a clip each.
+
+        Raises:
+            DataError: if there is no clip, or no image in any of them.
+            ConfigError: if a named clip does not exist.
+        """
+        drives = {drive.name: drive for drive in self.drives()}
+        if not any(drive.indices for drive in drives.values()):
+            example = next(iter(drives), None) or self._broken[0]
+            raise DataError(f"the clips below {self.root} hold no usable frame, such as {example}")
+        test = _matching(self.test_clips, list(drives), "test_clips")
+        named = _matching(self.val_clips, [name for name in drives if name not in test], "val_clips")
+        rest = {name: drive for name, drive in drives.items() if name not in test and name not in named}
+        frames = [Frame(name, index, "l") for name, drive in rest.items() for index in drive.indices]
+        if named:
+            train, val = frames, [Frame(name, index, "l") for name in named for index in drives[name].indices]
+        else:
+            train, val = hold_out(frames, self.val_share, reach(self.offsets), self.seed)
+        if split in ("train", "val"):
+            chosen = train if split == "train" else val
+        else:
+            chosen = [Frame(name, index, "l") for name in test for index in drives[name].indices] if test else val
+        unused = len(frames) - len(train) - (0 if named else len(val))
+        return self._selections(drives, chosen, split, unused)
+
+    def _selections(
+        self, drives: dict[str, ClipDrive], chosen: Sequence[Frame], split: str, unused: int
+    ) -> list[Selection]:
+        numbers: dict[str, list[int]] = {}
+        for frame in chosen:
+            numbers.setdefault(frame.drive, []).append(frame.number)
+        selections = []
+        for place, (name, wanted) in enumerate(numbers.items()):
+            drive = drives[name]
+            left_out = {} if split == "val" else dict(drive.left_out)
+            if split == "train" and place == 0:
+                left_out["between training and validation"] = unused
+                left_out["clips that cannot be read"] = len(self._broken)
+            if self.static == "drop" and split in ("train", "val"):
+                static = drive.static()
+                left_out["static"] = sum(frame in static for frame in wanted)
+                wanted = [frame for frame in wanted if frame not in static]
+            selections.append(Selection(drive, wanted, left_out))
+        return selections
+
+    def _usable_drive(self, clip: Clip, shown: Progress) -> ClipDrive | None:
+        """Return a clip as a drive; None where it cannot be read and that is to be skipped."""
+        try:
+            return self._drive(clip, shown)
+        except DataError as error:
+            if self.on_error != "skip" or isinstance(error, FramesCacheError):
+                raise
+            warnings.warn(f"clip left out: {error}", stacklevel=2)
+            self._broken.append(str(error))
+            return None
+
+    def _drive(self, clip: Clip, shown: Progress) -> ClipDrive:
+        task = shown.add_task(f"decoding {clip.path.name}", total=None, visible=clip.is_video)
+        recording = read_clip(
+            clip,
+            self.fps,
+            self.frames_cache,
+            self.max_width,
+            lambda done, total: shown.update(task, completed=done, total=total),
+        )
+        shown.update(task, visible=False)
+        crop = clip.camera.crop if self.crop is None else self.crop
+        motion = None
+        if self.static == "drop" or self.parallax > 0:
+            task = shown.add_task(f"measuring motion of {clip.path.name}", total=len(recording.paths))
+            motion = measure(
+                recording.paths,
+                crop,
+                skip_unreadable=self.on_error == "skip",
+                cache=self.frames_cache,
+                advance=lambda: shown.advance(task),
+            )
+            shown.update(task, visible=False)
+        settings = f"fps={self.fps} parallax={self.parallax} static={self.static}"
+        return ClipDrive(clip, recording, self.crop, motion, self.parallax, settings, self._height)
+
+
+def _matching(patterns: Sequence[str], names: Sequence[str], what: str) -> list[str]:
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        fitting = [name for name in names if name == pattern or fnmatchcase(name, pattern)]
+        if not fitting:
+            raise ConfigError(f"{what} names '{pattern}', which fits no clip; clips: {', '.join(names[:20]) or 'none'}")
+        found.update(dict.fromkeys(fitting))
+    return list(found)

@@ -1,0 +1,294 @@
+from __future__ import annotations
+
+import json
+import os
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+from clip_tree import CAMERA, frames, make_clip, make_video
+from jaxtyping import TypeCheckError
+
+from saunet.data.video.clips import every, find_clips, read_clip
+from saunet.errors import ConfigError, DataError
+from saunet.registry import datamodules
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    yield
+    cv2.setNumThreads(before)
+
+
+def module(root, **options):
+    small = {"height": 32, "width": 64, "batch_size": 2, "workers": 0, "frames_cache": str(root.parent / "cache")}
+    return datamodules.build("video", root=str(root), **{**small, **options})
+
+
+def names(data, split):
+    dataset = data.datasets[split]
+    return [dataset.name(index) for index in range(len(dataset))]
+
+
+def test_a_folder_of_frames_trains(tmp_path):
+    make_clip(tmp_path / "öffentlich unterwegs", "a clip", frames(14))
+    data = module(tmp_path / "öffentlich unterwegs", crop=[0.1, 0.2, 0.0, 0.0])
+    data.setup()
+    assert names(data, "train") == [f"a clip {number:010d}" for number in range(1, 10)]  # in natural order
+    assert names(data, "val") == ["a clip 0000000012"]
+    assert names(data, "test") == names(data, "val")
+    batch = data.on_after_batch_transfer(next(iter(data.train_dataloader())), 0)
+    assert batch["target"].shape == (2, 3, 32, 64)
+    drive = data.drives()[0]
+    assert drive.image(3).shape == (140, 320, 3)
+    assert np.array_equal(drive.image(3), frames(14)[3][20:160])
+    np.testing.assert_allclose(drive.intrinsics(3), [[250, 0, 158], [0, 252, 81], [0, 0, 1]])
+    assert data.camera_height == 1.4
+    assert pickle.loads(pickle.dumps(drive)).recorded(5) == 5
+    assert (data.protocol, data.ground_truth) == ("campus", "none")
+    test = data.prepare(next(iter(data.test_dataloader())))
+    assert test["sources"].shape[1] == 2  # evaluation compares views
+
+
+def test_a_video_is_decoded_once_and_like_its_frames(tmp_path):
+    pictures = frames(12)
+    make_video(tmp_path / "raw" / "dr ive.avi", pictures)
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "raw").rglob("*")}
+    data = module(tmp_path / "raw")
+    data.setup("fit")
+    drive = data.drives()[0]
+    assert drive.name == "dr ive.avi"
+    assert list(drive.indices) == list(range(12))
+    assert np.abs(drive.image(7).astype(int) - pictures[7]).mean() < 6  # two lossy encodings
+    kept = sorted((tmp_path / "cache").rglob("*.jpg"))
+    assert len(kept) == 12
+    stamp = kept[3].stat().st_mtime_ns
+    module(tmp_path / "raw").setup("fit")
+    assert kept[3].stat().st_mtime_ns == stamp
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "raw").rglob("*")} == before
+    smaller = module(tmp_path / "raw", max_width=160).drives()[0]
+    assert smaller.image(0).shape == (100, 160, 3)
+    np.testing.assert_allclose(smaller.intrinsics(0)[0], [125, 0, 78.75])
+
+
+def test_frames_are_taken_by_time():
+    taken = lambda recorded, wanted, count: [n for n, _ in zip(every(recorded, wanted), range(count), strict=False)]
+    assert taken(30.0, 10.0, 4) == [0, 3, 6, 9]
+    assert taken(25.0, 10.0, 5) == [0, 3, 5, 8, 10]
+    assert taken(10.0, 30.0, 3) == taken(None, 10.0, 3) == taken(10.0, None, 3) == [0, 1, 2]
+
+
+def test_stride_by_time_in_folders_and_videos(tmp_path):
+    pictures = frames(20, 2)
+    make_clip(tmp_path / "r", "b", pictures)
+    make_video(tmp_path / "r" / "v.avi", pictures, fps=10)
+    data = module(tmp_path / "r", fps=5.0, val_share=0.0)
+    folder, video = data.drives()
+    assert [drive.recorded(3) for drive in (folder, video)] == [6, 6]
+    assert len(folder.indices) == len(video.indices) == 10
+    assert np.array_equal(folder.image(3), pictures[6])
+    data.setup("fit")
+    assert [drive.left_out["passed over by fps"] for drive in (folder, video)] == [10, 10]
+    assert "20 passed over by fps" in data.summary("train")
+    facts = next((tmp_path / "cache").rglob("clip.json"))
+    assert json.loads(facts.read_text())["times"] == pytest.approx([i / 5 for i in range(10)])
+    facts.write_text(facts.read_text().replace('"numbers":', '"numbers": [], "n":'))
+    with pytest.raises(DataError, match=r"clip\.json is damaged"):
+        module(tmp_path / "r", fps=5.0).drives()
+
+
+def test_a_folder_is_one_clip_however_many_links_lead_to_it(tmp_path):
+    make_clip(tmp_path / "r", "a/b", frames(2))
+    (tmp_path / "r" / "loop").symlink_to(".")
+    (tmp_path / "r" / "a" / "0").symlink_to("b")
+    make_clip(tmp_path / "elsewhere", "c", frames(2), camera=None)
+    for link in ("x", "y"):
+        (tmp_path / "r" / link).symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "back").symlink_to(tmp_path / "r")
+    assert [clip.name for clip in find_clips(tmp_path / "r")] == ["a/b", "x/c"]
+
+
+def test_doubled_and_static_frames_are_left_out_and_counted(tmp_path):
+    moving = frames(12, [4] * 12)
+    rng = np.random.default_rng(1)
+    noisy = [np.clip(moving[5] + rng.normal(0, 4, moving[5].shape), 0, 255).astype(np.uint8) for _ in range(3)]
+    make_clip(tmp_path / "r", "a", [*moving[:4], moving[3], moving[4], moving[5], *noisy, *moving[6:]])
+    data = module(tmp_path / "r", val_share=0.0)
+    data.setup("fit")
+    drive = data.drives()[0]
+    assert drive.left_out["doubled"] == 1
+    assert [drive.recorded(index) for index in drive.indices] == [n for n in range(16) if n != 4]
+    assert sorted(drive.static()) == [6, 7, 8]  # numbered without the doubled one
+    assert "1 doubled" in data.summary("train")
+    assert "3 static" in data.summary("train")
+    kept = module(tmp_path / "r", static="keep", val_share=0.0)
+    kept.setup("fit")
+    assert len(names(kept, "train")) == 14
+
+
+def test_even_steps_of_parallax(tmp_path):
+    make_clip(tmp_path / "r", "a", frames(24, [1] * 12 + [6] * 12))
+    drive = module(tmp_path / "r", parallax=5.0).drives()[0]
+    recorded = [drive.recorded(index) for index in drive.indices]
+    steps = np.diff(recorded)
+    assert set(steps[recorded.index(12) if 12 in recorded else -8 :]) == {1}
+    assert steps[0] >= 5
+    assert drive.left_out["closer than the parallax"] == 24 - len(recorded)
+
+
+def test_clips_are_held_out_and_tested_by_name_and_condition(tmp_path):
+    for number in range(3):
+        make_clip(tmp_path / "r", f"day/{number}", frames(6, seed=number))
+    make_clip(tmp_path / "r", "night", frames(6))
+    (tmp_path / "r" / "night" / "camera.yaml").write_text(CAMERA + "condition: night\n")
+    data = module(tmp_path / "r", val_clips=["day/0"], test_clips=["n*"])
+    data.setup()
+    clip = lambda split: {name.rpartition(" ")[0] for name in names(data, split)}
+    assert clip("train") == {"day/1", "day/2"}
+    assert (clip("val"), clip("test"), clip("predict")) == ({"day/0"}, {"night"}, {"night"})
+    assert len(names(data, "predict")) == 6
+    assert [drive.condition for drive in data.drives()] == [None, None, None, "night"]
+    only = module(tmp_path / "r", conditions=["night"])
+    assert [drive.name for drive in only.drives()] == ["night"]
+    with pytest.raises(ConfigError, match=r"conditions is 'nihgt'; did you mean 'night'"):
+        module(tmp_path / "r", conditions=["nihgt"]).drives()
+    with pytest.raises(ConfigError, match=r"val_clips names 'x', which fits no clip; clips: day/0, day/1"):
+        module(tmp_path / "r", val_clips=["x"]).setup("fit")
+
+
+def test_a_folder_of_frames_or_a_video_can_be_the_root(tmp_path):
+    folder = make_clip(tmp_path, "clip", camera=None)
+    (folder / "camera.yaml").write_text(CAMERA)
+    video = make_video(tmp_path / "v" / "x.avi")
+    assert [clip.name for clip in find_clips(folder)] == ["clip"]
+    assert [clip.name for clip in find_clips(video)] == ["x.avi"]
+    assert len(read_clip(find_clips(video)[0], None, tmp_path / "c", 1280).paths) == 10
+
+
+def test_a_broken_frame_is_named_or_skipped_and_counted(tmp_path):
+    folder = make_clip(tmp_path / "r", "a", frames(16))
+    (folder / "frame_6.png").write_bytes(b"")
+    with pytest.raises(DataError, match=r"frame_6.png is empty \(0 bytes\)"):
+        module(tmp_path / "r").setup("fit")
+    data = module(tmp_path / "r", on_error="skip", val_share=0.0)
+    data.setup("fit")
+    assert "1 unreadable" in data.summary("train")
+    drive = data.drives()[0]
+    assert drive.left_out["unreadable"] == 1
+    assert 6 not in drive.indices  # a gap, so that frames 5 and 7 are no neighbors
+    assert len(names(data, "train")) == 16 - 1 - 2 - 2
+
+
+@pytest.mark.parametrize("content", [b"", b"not a video", "half"])
+def test_a_video_that_cannot_be_decoded_is_named(tmp_path, content):
+    video = make_video(tmp_path / "r" / "dréve 1.avi")
+    video.write_bytes(video.read_bytes()[:300] if content == "half" else content)
+    with pytest.raises(DataError, match=r"dréve 1\.avi (is empty|is not a video|holds no frame)"):
+        module(tmp_path / "r").setup("fit")
+    assert not list((tmp_path / "cache").rglob("*"))
+
+
+def test_a_video_that_cannot_be_decoded_is_left_out_and_counted(tmp_path):
+    make_clip(tmp_path / "r", "a", frames(16))
+    (tmp_path / "r" / "b.avi").write_bytes(b"not a video")
+    with pytest.raises(DataError, match=r"b\.avi is not a video"):
+        module(tmp_path / "r").setup("fit")
+    data = module(tmp_path / "r", on_error="skip")
+    with pytest.warns(UserWarning, match=r"clip left out: .*b\.avi is not a video"):
+        data.setup("fit")
+    assert [drive.name for drive in data.drives()] == ["a"]
+    assert "1 clips that cannot be read" in data.summary("train")
+    with pytest.raises(DataError, match=r"hold no usable frame, such as .*b\.avi is not a video"), pytest.warns():
+        module(tmp_path / "r" / "b.avi", on_error="skip", camera=str(tmp_path / "r" / "camera.yaml")).setup("fit")
+
+
+def test_another_size_within_a_clip_and_a_camera_that_does_not_fit(tmp_path):
+    pictures = frames(10)
+    make_clip(tmp_path / "r", "a", [*pictures[:5], pictures[5][:100], *pictures[6:]])
+    data = module(tmp_path / "r", static="keep", val_share=0.0)
+    data.setup("fit")
+    with pytest.raises(DataError, match=r"frame_5.png is 320x100 .* where other frames of its clip are 320x200"):
+        list(data.train_dataloader())
+    (tmp_path / "r" / "camera.yaml").write_text("image_size: [1920, 1080]\nK: [1500, 1512, 960, 540]\n")
+    wrong = module(tmp_path / "r", static="keep", val_share=0.0)
+    wrong.setup("fit")
+    with pytest.raises(DataError, match=r"frames of 'a' \(frame_0.png\) are 320x200 .* is for 1920x1080"):
+        list(wrong.train_dataloader())
+
+
+@pytest.mark.parametrize("first", ["empty", "small"])
+@pytest.mark.parametrize("static", ["keep", "drop"])
+def test_a_bad_first_frame_is_skipped_and_no_other(tmp_path, first, static):
+    pictures = frames(16)
+    folder = make_clip(tmp_path / "r", "a", [pictures[0][:100], *pictures[1:]])
+    if first == "empty":
+        (folder / "frame_0.png").write_bytes(b"")
+    data = module(tmp_path / "r", on_error="skip", static=static, val_share=0.25)
+    data.setup()
+    list(data.train_dataloader())
+    measured = first == "empty" and static == "drop"  # then there is no frame 0, and without it no window
+    assert data.skipped() == ([] if measured else ["a 0000000001"])
+    assert len(names(data, "val")) >= 2
+    assert all(usage.left_out["unreadable"] == 0 for usage in data.usage["val"])
+
+
+def test_what_is_missing_is_one_sentence(tmp_path):
+    with pytest.raises(DataError, match=r"no data root at .*gone; set data.root"):
+        module(tmp_path / "gone").setup("fit")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match=r"empty holds neither folders of images nor videos"):
+        module(tmp_path / "empty").setup("fit")
+    make_clip(tmp_path / "r", "a", camera=None)
+    with pytest.raises(DataError, match=r"no camera.yaml for .*a: put one beside it or at .*r.camera.yaml"):
+        module(tmp_path / "r").setup("fit")
+    (tmp_path / "x.txt").write_text("x")
+    with pytest.raises(DataError, match=r"x.txt is neither a folder nor a video"):
+        find_clips(tmp_path / "x.txt")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"crop": [0.1]}, "crop is"),
+        ({"crop": [0.5, 0.6, 0.0, 0.0]}, "crop is"),
+        ({"fps": 0.0}, "fps is 0"),
+        ({"parallax": -1.0}, "parallax is -1"),
+        ({"static": "flow"}, "static is 'flow'|parameter 'static'"),
+        ({"on_error": "ignore"}, "on_error is 'ignore'|parameter 'on_error'"),
+        ({"val_share": 2.0}, "val_share is 2"),
+    ],
+)
+def test_wrong_settings_are_one_sentence(tmp_path, options, message):
+    with pytest.raises((ConfigError, TypeCheckError), match=message):
+        module(tmp_path, **options)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_a_read_only_root_is_enough(tmp_path):
+    make_video(tmp_path / "r" / "x.avi")
+    (tmp_path / "r").chmod(0o555)
+    try:
+        module(tmp_path / "r").setup("fit")
+    finally:
+        (tmp_path / "r").chmod(0o755)
+
+
+def test_nothing_is_written_below_the_root(tmp_path):
+    make_video(tmp_path / "r" / "x.avi")
+    make_clip(tmp_path / "r", "a")
+    before = sorted((path, path.stat().st_mtime_ns) for path in [tmp_path / "r", *(tmp_path / "r").rglob("*")])
+    data = module(tmp_path / "r", val_share=0.3)
+    data.setup()
+    next(iter(data.train_dataloader()))
+    assert sorted((path, path.stat().st_mtime_ns) for path in [tmp_path / "r", *(tmp_path / "r").rglob("*")]) == before
+
+
+@pytest.mark.parametrize("on_error", ["raise", "skip"])
+def test_a_cache_that_cannot_be_written_is_named(tmp_path, on_error):
+    make_video(tmp_path / "r" / "x.avi")
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(DataError, match=r"cannot keep the frames of .*x.avi in .*file.*set data.frames_cache"):
+        module(tmp_path / "r", frames_cache=str(tmp_path / "file" / "cache"), on_error=on_error).setup("fit")
