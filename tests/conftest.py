@@ -101,9 +101,10 @@ def node() -> Callable[[str, str], dict[str, Any]]:
     """Return a component's settings as a checkpoint records them: ``node("encoder", "resnet18")``."""
 
     def plain(kind: str, name: str) -> dict[str, Any]:
+        from saunet.cli.compose import structured
         from saunet.registry import REGISTRIES
 
-        settings = dataclasses.asdict(REGISTRIES[kind].node(name)())
+        settings = dataclasses.asdict(structured(REGISTRIES[kind].node(name))())
         return {key: value for key, value in settings.items() if value != "???"}
 
     return plain

@@ -27,7 +27,7 @@ ALLOWED: dict[str, set[str]] = {
     "data": {"errors", "registry", "schema", "types", "io", "fingerprint", "geometry", "synthetic"},
     "synthetic": {"errors", "io", "data"},
     "runs": {"errors", "io", "registry", "metrics", "models", "__version__"},
-    "weights": {"errors", "runs"},
+    "weights": {"errors", "io", "runs"},
     "scale": {"errors", "types", "io", "geometry", "runs"},
     "training": {
         "errors",

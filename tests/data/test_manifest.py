@@ -22,19 +22,22 @@ def names(data, split):
     return [data.datasets[split].name(index) for index in range(len(data.datasets[split]))]
 
 
-def test_what_is_written_is_read_and_applied(tmp_path):
+class Numbered(NumberDrive):
+    numbering = "fps=10"
+
+
+def test_what_is_written_is_read_and_applied(tmp_path, monkeypatch):
     leave_out = {"a": {"static": [3, 1], "unreadable": [6]}, "b": {"dark": [2]}}
     write_manifest(tmp_path / "m.json", Manifest(leave_out, {"a": "fps=10"}, {"findings": ["ü"]}))
     manifest = read_manifest(tmp_path / "m.json")
     assert manifest.leave_out == {"a": {"static": [1, 3], "unreadable": [6]}, "b": {"dark": [2]}}
-    drive = NumberDrive("a", range(10))
-    drive.numbering = "fps=10"
+    drive = Numbered("a", range(10))
     applied = manifest.apply(Selection(drive, range(10), {"x": 1}), (-1, 1))
     assert list(applied.frames) == [0, 2, 4, 8, 9]  # 5, 6 and 7 would read the broken frame 6
     assert applied.left_out == {"x": 1, "static (manifest)": 2, "unreadable (manifest)": 3}
     other = NumberDrive("c", range(3))
     assert list(manifest.apply(Selection(other, range(3)), (-1, 1)).frames) == [0, 1, 2]
-    drive.numbering = "fps=5"
+    monkeypatch.setattr(Numbered, "numbering", "fps=5")
     with pytest.raises(DataError, match=r"m.json was made for 'a' with fps=10 and it is now read with fps=5"):
         manifest.apply(Selection(drive, range(10)), (-1, 1))
 

@@ -8,7 +8,6 @@ import pickle
 import torch
 from torch import nn
 
-from saunet.models.encoders.efficientnet_lite import EfficientNetLite, InvertedResidual
 from saunet.models.encoders.resnet import BasicBlock, Bottleneck
 
 
@@ -37,14 +36,7 @@ def settle(encoder: nn.Module, image: torch.Tensor) -> nn.Module:
     """Make an untrained encoder as tame as a trained one, where rounding does not grow from block to block.
 
     Batch normalization gets the statistics of one batch, and a ResNet's residual branches become small.
-    An EfficientNet-Lite keeps its first statistics: noise averages out on the way through its depthwise convolutions,
-    and the statistics of one such batch would magnify what rounding leaves.
     """
-    for module in encoder.modules():
-        if isinstance(module, InvertedResidual) and module.shortcut:
-            nn.init.constant_(module.bn_project.weight, 0.2)
-    if isinstance(encoder, EfficientNetLite):
-        return encoder.eval()
     for module in encoder.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = 1.0

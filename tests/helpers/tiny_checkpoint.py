@@ -8,12 +8,13 @@ from typing import Any
 
 from torch import nn
 
+from saunet.cli.compose import structured
 from saunet.registry import REGISTRIES
 from saunet.runs.checkpoint import ModelRecord, atomic_save, build_networks
 
 
 def _node(kind: str, name: str) -> dict[str, Any]:
-    settings = dataclasses.asdict(REGISTRIES[kind].node(name)())
+    settings = dataclasses.asdict(structured(REGISTRIES[kind].node(name))())
     return {key: value for key, value in settings.items() if value != "???"}
 
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from saunet.errors import DataError, one_of
 from saunet.io.colormaps import depth_to_png16
 from saunet.io.images import natural_order, read_depth, write_image
+from saunet.io.plain import read_array
 from saunet.metrics.depth import native_depths
 from saunet.metrics.functional import flip_blend
 from saunet.metrics.protocols import Protocol, resize_disparity, sample_image
@@ -233,7 +234,7 @@ def file_stem(name: str) -> str:
 
 def _load_array(path: Path) -> ndarray:
     try:
-        array: ndarray = np.load(path, mmap_mode="r", allow_pickle=False)
+        array: ndarray = read_array(path, mapped=True)
     except (OSError, ValueError, EOFError) as error:
         raise DataError(f"cannot read '{path}' as a numpy array ({error}); give a .npy file of numbers") from error
     if not isinstance(array, ndarray) or array.dtype.kind != "f":

@@ -21,6 +21,7 @@ from saunet.exporting.card import model_card
 from saunet.exporting.parity import Parity, Run, compare, timed
 from saunet.io.atomic import replacing, write_bytes, write_json
 from saunet.io.images import network_input, read_image
+from saunet.io.plain import read_json
 from saunet.io.progress import bar
 from saunet.models.depth import DepthNet
 from saunet.prediction.sources import image_paths
@@ -138,7 +139,7 @@ def read_metrics(path: str | Path) -> Mapping[str, Any]:
     path = Path(path)
     path = path / "metrics.json" if path.is_dir() else path
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         if [row for row in content["results"] if not isinstance(row["predictor"], str)]:
             raise ValueError("a row without predictor")
     except OSError as reason:
@@ -154,7 +155,7 @@ def _splits(checkpoint: Path) -> Mapping[str, str]:
     if not path.is_file():
         return {}
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")).get("splits") or {})
+        return dict(read_json(path).get("splits") or {})
     except (OSError, ValueError, AttributeError, TypeError) as reason:
         raise DataError(f"{path} cannot be read ({reason}); it belongs to the run, or move the checkpoint") from reason
 

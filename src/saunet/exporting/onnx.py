@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from saunet.errors import CheckpointError, ConfigError
+from saunet.io.plain import parse_json
 from saunet.prediction.pipeline import ImagePredictor
 from saunet.runs.record import ModelRecord
 
@@ -40,7 +40,7 @@ class OnnxPredictor(ImagePredictor):
         if plain is None:
             raise CheckpointError(f"{path} is an ONNX model, but not one that saunet exported: it has no model record")
         try:
-            self.record = ModelRecord.from_plain(json.loads(plain))
+            self.record = ModelRecord.from_plain(parse_json(plain, "the model record"))
         except ValueError as reason:
             raise CheckpointError(f"{path}: the model record inside cannot be read ({reason})") from reason
         super().__init__(self.record.height, self.record.width, self.record.scale)

@@ -15,6 +15,7 @@ from saunet.errors import ConfigError, DataError, one_of, positive
 from saunet.io.atomic import write_bytes, write_json
 from saunet.io.colormaps import COLORMAPS, depth_to_png16
 from saunet.io.images import image_size, read_image, write_image
+from saunet.io.plain import read_json
 from saunet.io.progress import bar
 from saunet.prediction.pipeline import ImagePredictor
 from saunet.prediction.pointcloud import Camera, point_cloud, write_ply
@@ -216,9 +217,9 @@ def check_claim(folder: Path, settings: Mapping[str, object], overwrite: bool) -
     if overwrite or not path.exists():
         return False
     try:
-        previous = json.loads(path.read_text(encoding="utf-8"))
+        previous = read_json(path)
     except (OSError, ValueError) as reason:
-        raise DataError(f"{path} cannot be read ({reason}); delete it, or choose another output folder") from reason
+        raise DataError(f"{reason}; delete it, or choose another output folder") from reason
     current = json.loads(json.dumps(settings))
     changed = [key for key in current if not isinstance(previous, dict) or previous.get(key) != current[key]]
     if changed:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from saunet.errors import DataError
 from saunet.io.atomic import write_json
 from saunet.io.colormaps import RunningRange
+from saunet.io.plain import read_json
 from saunet.prediction.clips import IMAGE_FPS
 from saunet.prediction.files import (
     MANIFEST,
@@ -141,7 +141,7 @@ def predict_recording(
 
 def _clips(folder: Path) -> dict[str, Any]:
     """Return how the clips' results in a folder were made, by the names of their files."""
-    found = json.loads((folder / MANIFEST).read_text(encoding="utf-8")).get("clips")
+    found = read_json(folder / MANIFEST).get("clips")
     return found if isinstance(found, dict) else {}
 
 

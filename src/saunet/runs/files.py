@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from pathlib import Path
 from typing import Any
 
-import yaml
+from saunet.io import plain
 
 
 def read_json(path: Path) -> Any:
     """Return a JSON file's content; None if it is missing or broken."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        return plain.read_json(path)
+    except (OSError, ValueError):
         return None
 
 
 def read_yaml(path: Path) -> Any:
     """Return a YAML file's content as plain containers; None if it is missing or broken."""
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, yaml.YAMLError):
+        return plain.read_yaml(path)
+    except (OSError, ValueError):
         return None
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from saunet.data.drive import Drive
 from saunet.errors import ConfigError, DataError, one_of, positive
 from saunet.io.atomic import replacing
+from saunet.io.plain import read_arrays
 from saunet.synthetic.render import Camera, cast
 from saunet.synthetic.shade import shade
 from saunet.synthetic.travel import Travel, pose, travel
@@ -227,8 +228,8 @@ class SyntheticDrive(Drive):
     def _load(self) -> None:
         path = self._stored
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                images, depths = stored["image"], stored["depth"]
+            stored = read_arrays(path)
+            images, depths = stored["image"], stored["depth"]
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise DataError(f"{path} is not a rendered drive ({error}); delete it to render it again") from error
         if images.shape[:3] != depths.shape or depths.shape[0] != self.settings.frames:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from saunet.errors import CheckpointError
+from saunet.io.plain import read_json
 from saunet.runs.checkpoint import Checkpoint, read_checkpoint
 from saunet.runs.record import ModelRecord
 from saunet.weights.locate import CONFIG, POSE, WEIGHTS, locate
@@ -75,7 +75,7 @@ def read_config(path: Path) -> ModelRecord:
         CheckpointError: if it is missing or not one.
     """
     try:
-        return ModelRecord.from_plain(json.loads(path.read_text(encoding="utf-8")))
+        return ModelRecord.from_plain(read_json(path))
     except OSError as reason:
         raise CheckpointError(f"cannot read {path}: {reason.strerror or reason}; it belongs to {WEIGHTS}") from reason
     except CheckpointError as error:

@@ -18,6 +18,7 @@ from saunet.data.drive import Drive
 from saunet.errors import DataError, one_of
 from saunet.io.atomic import write_json
 from saunet.io.images import read_depth
+from saunet.io.plain import read_json
 
 MapKind = Literal["linear", "colorization", "teacher"]
 DENSE_KINDS = ("linear", "colorization")
@@ -97,7 +98,7 @@ class DepthMaps:
         """
         path = self.home(drive) / INFO
         try:
-            info = json.loads(path.read_text(encoding="utf-8"))
+            info = read_json(path)
             version, _ = info["version"], float(info["factor"])
         except (OSError, ValueError, KeyError, TypeError) as reason:
             raise DataError(f"{path} is missing or damaged; delete {path.parent} and make its maps again") from reason

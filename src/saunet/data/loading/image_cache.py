@@ -6,7 +6,6 @@ and hashes, and bytes and time of the originals, and is written last, so that a 
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -22,6 +21,7 @@ from saunet.data.loading.depth_maps import place
 from saunet.errors import ConfigError, DataError, in_range, one_of, positive
 from saunet.geometry.camera import scale_intrinsics
 from saunet.io.images import read_image
+from saunet.io.plain import read_json
 
 VERSION = 1
 """Of the layout of the files; others are refused."""
@@ -161,7 +161,7 @@ class ImageCache:
     @staticmethod
     def _json(path: Path) -> dict[str, Any]:
         try:
-            return dict(json.loads(path.read_text(encoding="utf-8")))
+            return dict(read_json(path))
         except (OSError, ValueError, TypeError) as reason:
             raise _damaged(path) from reason
 

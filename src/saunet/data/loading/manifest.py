@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from lightning.pytorch.utilities import rank_zero_warn
 from saunet.data.loading.windows import Selection
 from saunet.errors import DataError
 from saunet.io.atomic import write_json
+from saunet.io.plain import read_json
 
 FORMAT = 1
 """Version of the file's layout."""
@@ -116,11 +116,11 @@ def read_manifest(path: str | Path) -> Manifest:
     """
     path = Path(path).expanduser()
     try:
-        plain = json.loads(path.read_text(encoding="utf-8"))
+        plain = read_json(path)
     except FileNotFoundError as reason:
         raise DataError(f"no manifest at {path}; make one with saunet-doctor, or set data.manifest=null") from reason
     except (OSError, ValueError) as reason:
-        raise DataError(f"{path} cannot be read as JSON ({reason}); make it again with saunet-doctor") from reason
+        raise DataError(f"{reason}; make it again with saunet-doctor") from reason
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         found = plain.get("format") if isinstance(plain, dict) else type(plain).__name__
         raise DataError(f"{path} is not a manifest of format {FORMAT} (found {found}); make it with saunet-doctor")

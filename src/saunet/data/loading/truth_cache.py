@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from saunet.data.drive import Drive, DriveProxy
 from saunet.errors import DataError
 from saunet.io.atomic import replacing
+from saunet.io.plain import read_arrays
 
 
 class CachedTruth(DriveProxy):
@@ -59,9 +60,9 @@ def cache_truths(drives: list[Drive], folder: str | Path) -> None:
 def _read(path: Path) -> NDArray[np.float32] | None:
     """Return a map; None where there is none, or one that a failing disk has damaged and that is made anew."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            depth = np.zeros(tuple(stored["size"]), np.float32)
-            depth[stored["rows"], stored["columns"]] = stored["values"]
+        stored = read_arrays(path)
+        depth = np.zeros(tuple(stored["size"]), np.float32)
+        depth[stored["rows"], stored["columns"]] = stored["values"]
     except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile):
         return None
     return depth

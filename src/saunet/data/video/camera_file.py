@@ -31,6 +31,7 @@ from saunet.data.checks import check_intrinsics
 from saunet.errors import DataError, SaunetError, suggest
 from saunet.geometry.camera import crop_intrinsics, scale_intrinsics
 from saunet.io.atomic import write_bytes
+from saunet.io.plain import read_yaml
 
 FILE_NAME = "camera.yaml"
 MODELS = ("pinhole", "fisheye")
@@ -113,13 +114,13 @@ def read_camera(path: str | Path) -> CameraFile:
     """
     path = Path(path)
     try:
-        plain = yaml.safe_load(path.read_text(encoding="utf-8"))
+        plain = read_yaml(path)
     except FileNotFoundError as reason:
         raise DataError(
             f"no camera file at {path}; make one with saunet-calibrate, or write one (see docs/your_camera.md)"
         ) from reason
-    except (OSError, ValueError, yaml.YAMLError) as reason:  # ValueError: no text, no date, a number without end
-        raise DataError(f"{path} cannot be read as YAML: {' '.join(str(reason).split())}") from reason
+    except OSError as reason:
+        raise DataError(f"cannot read {path}: {reason.strerror or reason}; check its rights") from reason
     if not isinstance(plain, dict):
         raise DataError(f"{path} holds {type(plain).__name__}; expected keys such as 'K: [fx, fy, cx, cy]'")
     for key in plain:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -20,6 +19,7 @@ from saunet.data.video.camera_file import FILE_NAME, CameraFile, read_camera
 from saunet.errors import DataError
 from saunet.io.atomic import write_json
 from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, natural_order, resize
+from saunet.io.plain import read_json
 from saunet.io.video import VIDEO_SUFFIXES, VideoReader
 
 QUALITY = 95
@@ -138,7 +138,7 @@ def read_clip(
     if not (folder / "clip.json").is_file():
         _decode(clip.path, clip.camera.fps, fps, folder, max_width, advance)
     try:
-        facts = json.loads((folder / "clip.json").read_text(encoding="utf-8"))
+        facts = read_json(folder / "clip.json")
         numbers, rate, missing = tuple(facts["numbers"]), facts["fps"], int(facts["missing"])
         times = None if facts["times"] is None else tuple(map(float, facts["times"]))
         count = int(facts["count"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from saunet.data.video.clips import FramesCacheError
 from saunet.errors import DataError
 from saunet.io.atomic import write_json
 from saunet.io.images import read_image, resize
+from saunet.io.plain import read_json
 
 SAME_PICTURE = 0.01
 """Mean difference over the picture's standard deviation under which two frames are the same picture twice."""
@@ -140,7 +140,7 @@ def _key(paths: Sequence[Path], crop: Sequence[float | int]) -> str:
 def _read(file: Path, count: int) -> Motion | None:
     """Return a kept measurement; None where there is none that fits, and then it is made anew."""
     try:
-        plain = json.loads(file.read_text(encoding="utf-8"))
+        plain = read_json(file)
         flow, change = (np.array(plain[key], dtype=np.float64) for key in ("flow", "change"))
         unreadable = tuple(int(place) for place in plain["unreadable"])
     except (OSError, ValueError, KeyError, TypeError):

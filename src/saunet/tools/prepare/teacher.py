@@ -17,6 +17,7 @@ from saunet.data.loading.windows import sample_name
 from saunet.errors import DataError
 from saunet.io.colormaps import depth_to_png16
 from saunet.io.images import read_depth, write_image
+from saunet.io.plain import read_array
 from saunet.tools.prepare.pool import Done, OnError, Work, remove_partial
 from saunet.tools.prepare.recordings import Recording
 
@@ -167,9 +168,9 @@ def _plain(name: str) -> str:
 
 def _read_array(path: Path) -> Float32[ndarray, "_ _"]:
     try:
-        array = np.squeeze(np.load(path, allow_pickle=False))
-    except (OSError, ValueError, EOFError) as reason:
-        raise DataError(f"cannot read {path} as an array ({reason}); it must be a .npy file of numbers") from reason
+        array = np.squeeze(read_array(path))
+    except OSError as reason:
+        raise DataError(f"cannot read {path}: {reason.strerror or reason}; check its rights") from reason
     if array.ndim != 2 or array.dtype.kind not in "fiu":
         raise DataError(f"{path} holds {array.dtype} of shape {array.shape}; depth is height x width numbers")
     return np.asarray(array, dtype=np.float32)

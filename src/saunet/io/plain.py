@@ -1,0 +1,233 @@
+"""Plain data from files that anyone may have written: JSON, YAML and NumPy arrays, with limits set beforehand.
+
+Whatever is wrong with the content ends in one sentence: size, depth, repeated keys, numbers without end, aliases that
+grow exponentially, damaged headers. What the system refuses (no such file, no rights) is an `OSError` as always.
+Nothing in a file is ever run.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+import math
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from saunet.errors import SaunetError, UnreadableError
+
+JSON_BYTES = 256 << 20
+"""Largest JSON file; a manifest of a million frames has 10 MB."""
+YAML_BYTES = 128 << 10
+"""Largest YAML file; reading one of that size takes about two seconds."""
+ARRAY_BYTES = 8 << 30
+"""Largest array."""
+DEPTH = 64
+"""Lists and mappings inside each other."""
+DIGITS = 30
+"""Digits of an integer."""
+ALIASES = 16
+"""References to one place of a YAML file from another; some dozens can stand for more values than fit in memory."""
+_EXCERPT = 160
+
+
+class _LimitError(ValueError):
+    """What a limit was exceeded by."""
+
+
+def read_text(path: str | Path, most: int = JSON_BYTES, error: type[SaunetError] = UnreadableError) -> str:
+    """Return a file's text (UTF-8) if it has at most so many bytes, as a sentence of class ``error`` else."""
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(most + 1)
+        if len(data) > most:
+            raise error(f"{path} has more than {most:,} bytes, the most that are read of such a file; check what it is")
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as reason:
+        raise error(f"{path} is not text in UTF-8 ({_excerpt(reason)}); save it as UTF-8") from reason
+
+
+def read_json(path: str | Path, error: type[SaunetError] = UnreadableError) -> Any:
+    """Return what a JSON file holds, as a sentence of class ``error`` if it cannot be read."""
+    return parse_json(read_text(path, error=error), str(path), error)
+
+
+def parse_json(text: str | bytes, source: str, error: type[SaunetError] = UnreadableError) -> Any:
+    """Return what JSON text holds; ``source`` names it in messages."""
+    try:
+        plain = json.loads(
+            text, object_pairs_hook=_unique, parse_int=_integer, parse_float=_number, parse_constant=_constant
+        )
+        _check_depth(plain)
+    except RecursionError as reason:
+        raise error(f"{source} cannot be read as JSON (more than {DEPTH} levels of nesting)") from reason
+    except ValueError as reason:
+        raise error(f"{source} cannot be read as JSON ({_excerpt(reason)})") from reason
+    return plain
+
+
+def read_yaml(path: str | Path, error: type[SaunetError] = UnreadableError) -> Any:
+    """Return what a YAML file holds, as a sentence of class ``error`` if it cannot be read."""
+    try:
+        return yaml.load(read_text(path, YAML_BYTES, error), _Loader)
+    # A broken tag or date, a key that is a list, and so on reach us as whatever PyYAML meets first.
+    except (yaml.YAMLError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as reason:
+        if isinstance(reason, SaunetError):
+            raise
+        raise error(f"{path} cannot be read as YAML ({_excerpt(reason)})") from reason
+
+
+def read_array(path: str | Path, *, mapped: bool = False, error: type[SaunetError] = UnreadableError) -> NDArray[Any]:
+    """Return the numbers in a ``.npy`` file, of any shape, as a sentence of class ``error`` if it cannot be read.
+
+    With ``mapped`` the array stays in the file until it is looked at.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            _check_header(stream, path.stat().st_size)
+        found: NDArray[Any] = np.load(path, mmap_mode="r" if mapped else None, allow_pickle=False)
+    except _DAMAGED as reason:
+        raise error(f"{path} cannot be read as a .npy file of numbers ({_excerpt(reason)})") from reason
+    return found
+
+
+def read_arrays(
+    path: str | Path | io.BufferedIOBase, error: type[SaunetError] = UnreadableError
+) -> dict[str, NDArray[Any]]:
+    """Return the arrays in a ``.npz`` file by name, as a sentence of class ``error`` if it cannot be read."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(each.file_size for each in archive.infolist()) > ARRAY_BYTES:
+                raise _LimitError(f"more than {ARRAY_BYTES:,} bytes")
+            found = {}
+            for each in archive.infolist():
+                data = archive.read(each)
+                _check_header(io.BytesIO(data), len(data))
+                found[each.filename.removesuffix(".npy")] = np.load(io.BytesIO(data), allow_pickle=False)
+            return found
+    except (*_DAMAGED, zipfile.BadZipFile, zlib.error, RuntimeError) as reason:  # RuntimeError: a password
+        raise error(f"{path} cannot be read as a .npz file of numbers ({_excerpt(reason)})") from reason
+
+
+_DAMAGED = (
+    *(ValueError, TypeError, ArithmeticError, LookupError, AttributeError, MemoryError, RecursionError, EOFError),
+    *(SyntaxError, tokenize.TokenError, struct.error),
+)
+"""What NumPy and Python's parser raise for damaged headers."""
+
+
+def _check_header(stream: io.BufferedIOBase, size: int) -> None:
+    """Check that an array of numbers follows, and that it is as long as the file, before memory is asked for."""
+    major, minor = np.lib.format.read_magic(stream)
+    if major not in (1, 2, 3):
+        raise _LimitError(f"version {major}.{minor} of the format")
+    length = int.from_bytes(stream.read(2 if major == 1 else 4), "little")
+    if length > 10_000:
+        raise _LimitError(f"a header of {length} bytes")
+    header = ast.literal_eval(stream.read(length).decode("latin1").strip())
+    shape, dtype = header["shape"], np.dtype(header["descr"])
+    if dtype.kind not in "fiub":
+        raise _LimitError(f"it holds {dtype}, not numbers")
+    if not all(isinstance(side, int) and side >= 0 for side in shape):
+        raise _LimitError(f"its shape is {_excerpt(shape)}")
+    wanted, found = math.prod(shape) * dtype.itemsize, size - stream.tell()
+    if wanted > ARRAY_BYTES or wanted > found:
+        raise _LimitError(f"its header promises {wanted:,} bytes and {found:,} follow")
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, with limits, that refuses a key given twice."""
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._depth = self._aliases = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            self._aliases += 1
+            if self._aliases > ALIASES:
+                raise _LimitError(f"more than {ALIASES} aliases; write the values out")
+        self._depth += 1
+        if self._depth > DEPTH:
+            raise _LimitError(f"more than {DEPTH} levels of nesting")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[Any] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+                if key.value in seen:
+                    raise _LimitError(
+                        f"'{_excerpt(key.value)}' is given twice, again in line {key.start_mark.line + 1}"
+                    )
+                seen.add(key.value)
+        return dict(super().construct_mapping(node, deep))
+
+    def construct_yaml_int(self, node: Any) -> int:
+        if len(str(node.value)) > DIGITS:
+            raise _LimitError(f"an integer of {len(str(node.value))} digits")
+        return int(super().construct_yaml_int(node))
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for place, key in enumerate(keys) if key in keys[:place])
+        raise _LimitError(f"'{_excerpt(twice)}' is given twice")
+    return found
+
+
+def _integer(text: str) -> int:
+    if len(text) > DIGITS:
+        raise _LimitError(f"an integer of {len(text)} digits")
+    return int(text)
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise _LimitError(f"the number {_excerpt(text)} is out of range")
+    return value
+
+
+def _constant(text: str) -> float:
+    raise _LimitError(f"{text} is no number in JSON")
+
+
+def _check_depth(plain: Any) -> None:
+    """Check the nesting, level by level, without recursion."""
+    level = [plain]
+    for _ in range(DEPTH + 1):
+        level = [
+            child
+            for each in level
+            if isinstance(each, dict | list)
+            for child in (each.values() if isinstance(each, dict) else each)
+            if isinstance(child, dict | list)
+        ]
+        if not level:
+            return
+    raise _LimitError(f"more than {DEPTH} levels of nesting")
+
+
+def _excerpt(reason: object) -> str:
+    """Return the beginning of a reason on one line."""
+    text = " ".join(str(reason)[: 4 * _EXCERPT].split())
+    return text if len(text) <= _EXCERPT else f"{text[:_EXCERPT]}..."
