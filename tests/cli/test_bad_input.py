@@ -104,7 +104,7 @@ def test_what_hydra_builds_speaks_for_itself(
     outcome = tool("train", "experiment=smoke", override)
     outcome.says(words)
     last = outcome.err.strip().splitlines()[-1]
-    assert last.startswith(f"saunet-train: {words}")
+    assert last.startswith(f"saunet train: {words}")
     assert "full_key" not in last
     assert last.count(words) == 1
 

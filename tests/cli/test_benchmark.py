@@ -1,4 +1,4 @@
-"""``saunet-benchmark`` from the command line."""
+"""``saunet benchmark`` from the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``saunet-evaluate`` and ``saunet-odometry``: protocols side by side, predictions of other systems, paths."""
+"""``saunet evaluate`` and ``saunet odometry``: protocols side by side, predictions of other systems, paths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``saunet-export``: files that are the model, a report and a card; and what is refused."""
+"""``saunet export``: files that are the model, a report and a card; and what is refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> Call
     monkeypatch.chdir(tmp_path)
 
     def run(*overrides: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["saunet-export", *overrides])
+        monkeypatch.setattr(sys, "argv", ["saunet export", *overrides])
         code = 0
         try:
             tool_module.main()
@@ -75,4 +75,4 @@ def test_not_a_checkpoint(export: Callable[..., tuple[int, str, str]], tmp_path:
     (tmp_path / "x.ckpt").write_bytes(b"hello")
     code, _, err = export("checkpoint=x.ckpt", "output=model")
     assert code == 1
-    assert err.strip().splitlines()[-1].startswith("saunet-export: x.ckpt")
+    assert err.strip().splitlines()[-1].startswith("saunet export: x.ckpt")

@@ -1,4 +1,4 @@
-"""``saunet-predict``: point clouds, colors, videos, and what does not apply to a video."""
+"""``saunet predict``: point clouds, colors, videos, and what does not apply to a video."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def test_ctrl_c_while_components_are_imported(
 
     monkeypatch.setattr("saunet.cli._app.register_configs", interrupted)
     outcome = tool("predict", f"checkpoint={checkpoint}", "input=a.png", "output=out")
-    assert (outcome.code, outcome.err) == (130, "saunet-predict: interrupted\n")
+    assert (outcome.code, outcome.err) == (130, "saunet predict: interrupted\n")
 
 
 def test_camera_that_is_not_there(tool: Callable[..., Any], checkpoint: Path, tmp_path: Path) -> None:
@@ -309,11 +309,11 @@ class TestBadInput:
             assert "Traceback" not in result.stderr
             if how == "full":
                 assert result.returncode == 1
-                assert "saunet-predict: cannot write" in result.stderr
+                assert "saunet predict: cannot write" in result.stderr
                 assert "File too large" in result.stderr
             else:
                 assert result.returncode == 130
-                assert result.stderr.strip().endswith("saunet-predict: interrupted")
+                assert result.stderr.strip().endswith("saunet predict: interrupted")
             assert not [path for path in out.rglob("*") if "partial" in path.name or path.suffix == ".html"]
             for path in out.rglob("*.npy"):
                 assert np.isfinite(np.load(path)).all()

@@ -1,4 +1,4 @@
-"""``saunet-report`` from the command line, on a run that was really trained."""
+"""``saunet report`` from the command line, on a run that was really trained."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from saunet.reporting import collect
 
 
 def tool(*given: str) -> tuple[int, str, str]:
-    """Run ``saunet-report`` here; return its exit code and what it said."""
+    """Run ``saunet report`` here; return its exit code and what it said."""
     out, err, code, before = io.StringIO(), io.StringIO(), 0, sys.argv
-    sys.argv = ["saunet-report", *arguments(given)]
+    sys.argv = ["saunet report", *arguments(given)]
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             run("report", report)
@@ -42,7 +42,7 @@ def test_a_trained_run_becomes_a_page(smoke_run: Path, tmp_path: Path, monkeypat
     assert "<title>Smoke</title>" in (tmp_path / "page" / "report.html").read_text()
     code, _, err = tool("compare", str(smoke_run))
     assert code == 1
-    assert err.strip().endswith("name two or more: saunet-report compare A B")
+    assert err.strip().endswith("name two or more: saunet report compare A B")
     assert {path.name for path in tmp_path.iterdir()} <= {"page", "outputs"}
 
 

@@ -107,7 +107,7 @@ def test_a_sweep_does_not_write_its_jobs_over_each_other(tool: Tool, tmp_path: P
     outcome = tool(*jobs, "output_dir=runs/all", "hydra.sweep.dir=sweep")
     assert outcome.code == 1
     last = outcome.err.strip().splitlines()[-1]
-    assert last.startswith("saunet-train: output_dir is 'runs/all'")
+    assert last.startswith("saunet train: output_dir is 'runs/all'")
     assert "set hydra.sweep.dir=runs/all, below which each job gets its own" in last
     assert "sweep:" not in outcome.out
     assert not (tmp_path / "runs").exists()
@@ -193,7 +193,7 @@ def test_sigterm_ends_a_run_with_a_message_and_a_record(tmp_path: Path) -> None:
             out, _ = run.communicate()
         err = errors.read_text()
         assert run.returncode == 143
-        assert "saunet-train: stopped by SIGTERM after step" in err
+        assert "saunet train: stopped by SIGTERM after step" in err
         assert f"resume with resume={tmp_path}/r/checkpoints/last.ckpt" in err
         assert record(tmp_path / "r")["status"] == "interrupted"
         assert ("resuming from" in heard + out) == (attempt == 1)

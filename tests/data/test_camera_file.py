@@ -106,7 +106,7 @@ def test_cameras_and_crops_that_can_be_are_accepted(tmp_path, text):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(DataError, match=r"no camera file at .*gone.yaml; make one with saunet-calibrate"):
+    with pytest.raises(DataError, match=r"no camera file at .*gone.yaml; make one with saunet calibrate"):
         read_camera(tmp_path / "gone.yaml")
 
 

@@ -45,7 +45,7 @@ def test_what_is_written_is_read_and_applied(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, r"no manifest at .*m.json; make one with saunet-doctor"),
+        (None, r"no manifest at .*m.json; make one with saunet doctor"),
         ("{", r"m.json cannot be read as JSON"),
         ("[]", r"m.json is not a manifest of format 1 \(found list\)"),
         ('{"format": 2}', r"found 2"),

@@ -38,13 +38,13 @@ def inline() -> list[tuple[str, str]]:
         for page in PAGES
         for code in re.findall(r"`([^`\n]+)`", _FENCE.sub("", page.read_text(encoding="utf-8")))
     )
-    return [(page, code) for page, code in found if re.match(r"(saunet-[a-z]+ (\.\.\. )?)?[+~]?[a-z_@./]+=", code)]
+    return [(page, code) for page, code in found if re.match(r"(saunet [a-z]+ (\.\.\. )?)?[+~]?[a-z_@./]+=", code)]
 
 
 def tools(page: str) -> list[str]:
     """Return the tools that a page names."""
     text = next(path for path in PAGES if path.name == page).read_text(encoding="utf-8")
-    return list(dict.fromkeys(re.findall(r"\bsaunet-([a-z]+)", text)))
+    return list(dict.fromkeys(re.findall(r"\bsaunet ([a-z]+)", text)))
 
 
 def lines(*kinds: str) -> list[tuple[str, str]]:
@@ -61,13 +61,13 @@ def lines(*kinds: str) -> list[tuple[str, str]]:
 def commands(*kinds: str) -> list[tuple[str, str]]:
     """Return each command of the project's tools in such blocks, with its page, whatever starts the tool.
 
-    ``srun saunet-train ...`` and ``torchrun ... -m saunet.cli.train ...`` are ``saunet-train ...``. Lines after a
+    ``srun saunet train ...`` and ``torchrun ... -m saunet.cli.train ...`` are ``saunet train ...``. Lines after a
     prompt show what goes wrong.
     """
     found = []
     for page, line in lines(*kinds):
-        plain = re.sub(r"-m saunet\.cli\.([a-z]+)", r"saunet-\1", line)
-        tool = re.search(r"(?:^|\s)(saunet-[a-z]+(?:\s.*|$))", re.split(r"\s(?:\|\||&&|;|\|)\s", plain)[0])
+        plain = re.sub(r"-m saunet\.cli\.([a-z]+)", r"saunet \1", line)
+        tool = re.search(r"(?:^|\s)(saunet [a-z]+(?:\s.*|$))", re.split(r"\s(?:\|\||&&|;|\|)\s", plain)[0])
         if tool and not line.startswith("$ "):
             found.append((page, tool[1]))
     return found

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("hydra")
 CONFIGURED = [path.stem for path in sorted(config_dir().glob("*.yaml"))]
 WITH_DATA = ("train", "evaluate", "doctor")
 PYTHON = {"align_corners=True", "weights_only=True", "features=", "channels="}
-FORMS = {"key=value", "camera=[fx,fy,cx,cy]", "saunet-predict ... outputs=[ply] camera=[fx,fy,cx,cy]"}
+FORMS = {"key=value", "camera=[fx,fy,cx,cy]", "saunet predict ... outputs=[ply] camera=[fx,fy,cx,cy]"}
 MISTAKES = {"optim.lr=much", "model.encoder.dephts=..."}  # which the page shows as such
 OWN_COMPONENTS = ("model/encoder=plain", "+objective.extra.near_prior")  # registered by the page itself
 SETTINGS = [
@@ -97,7 +97,7 @@ def _first(override: Override) -> Any:
 def test_every_setting_in_the_text_is_one_of_a_tool_that_the_page_names() -> None:
     wrong = []
     for page, code in SETTINGS:
-        command = code.partition(" ")[0].removeprefix("saunet-")
+        command = code.split(" ")[1] if code.startswith("saunet ") else code.partition(" ")[0]
         named = [command] if command in CONFIGURED else [*(tool for tool in tools(page) if tool in CONFIGURED), "train"]
         for overrides in _alternatives(code):
             alone = ((tool, None) for tool in named)

@@ -17,21 +17,23 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from saunet.cli._globs import expand_globs
+from saunet.cli import app, words
 from saunet.config import config_dir, register_configs, register_training_configs
 
 from .pages import PAGES, ROOT, blocks, commands, lines, mistakes
 
-NOT_CONFIGURED = {"saunet-components"}  # takes names, no configuration
+NOT_CONFIGURED = {"components", "resume", "demo"}  # takes names, no configuration
 NOT_INSTALLED = ("hydra/launcher", "hydra/sweeper", "hydra.launcher", "hydra.sweeper")  # plugins of the sweep extra
 
 
 def _overrides(command: str) -> list[str]:
     """Return the overrides of a printed command: no dots for "and so on", one job of a sweep, no job word or file."""
-    _, *words = shlex.split(command)
-    kept = [word for word in words if "=" in word and not word.startswith(NOT_INSTALLED)]
+    _, tool, *given = shlex.split(command)
+    kept = [word for word in given if "=" in word and not word.startswith(NOT_INSTALLED)]
+    if app.TOOLS[tool].options:
+        kept = list(words.overrides(kept, tool, app.table(), None, app.TOOLS[tool].aliases, config_dir()).overrides)
     single = []
-    for override in OverridesParser.create().parse_overrides(expand_globs(kept, config_dir())):
+    for override in OverridesParser.create().parse_overrides(kept):
         if override.is_sweep_override():
             if override.is_choice_sweep():  # a glob or an interval has no first value to take
                 single.append(f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}")
@@ -47,11 +49,11 @@ def test_every_printed_command_composes() -> None:
     wrong = []
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
         for page, command in dict.fromkeys(commands("", "bash")):
-            tool = shlex.split(command)[0]
+            tool = shlex.split(command)[1]
             if tool in NOT_CONFIGURED:
                 continue
             try:
-                compose(tool.removeprefix("saunet-"), overrides=_overrides(command), return_hydra_config=True)
+                compose(tool, overrides=_overrides(command), return_hydra_config=True)
             except (HydraException, OmegaConfBaseException) as error:
                 wrong.append(f"{page}: {command}: {error}")
     assert not wrong, "\n".join(wrong)
@@ -109,7 +111,7 @@ def test_the_commands_of_a_page_run(page: str, tmp_path: Path) -> None:
 def test_the_python_of_the_readme_runs(tmp_path: Path) -> None:
     """Its reader has a model and a picture by then, under the names that it says."""
     beforehand = (
-        "saunet-train experiment=smoke output_dir=smoke\n"
+        "saunet train experiment=smoke output_dir=smoke\n"
         "cp smoke/checkpoints/best.ckpt best.ckpt\n"
         "cp docs/images/demo.png road.png"
     )
@@ -129,7 +131,7 @@ QUICKLY = "model=sau_net_nano data=synthetic_tiny data.workers=0 logger=none tra
 TRAININGS = [
     (page, command)
     for page, command in commands("")
-    if command.startswith("saunet-train") and not OWN_DATA.search(command)
+    if command.startswith("saunet train") and not OWN_DATA.search(command)
 ]
 
 

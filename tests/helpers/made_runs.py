@@ -114,7 +114,7 @@ def make_evaluation(
     drive: str = "drive",
     **settings: Any,
 ) -> Path:
-    """Write what saunet-evaluate writes: a model and constant depth, six images.
+    """Write what saunet evaluate writes: a model and constant depth, six images.
 
     Without a checkpoint, ``settings`` name the predictions of another system.
     """

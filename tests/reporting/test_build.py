@@ -148,7 +148,7 @@ def test_labels_must_fit(tmp_path: Path, names: tuple[str, ...], words: str) -> 
 def test_a_foreign_json_is_no_benchmark(tmp_path: Path) -> None:
     (tmp_path / "benchmark.json").write_text("{}")
     make_run(tmp_path / "a")
-    with pytest.raises(DataError, match="not a result of saunet-benchmark"):
+    with pytest.raises(DataError, match="not a result of saunet benchmark"):
         build(collect([tmp_path / "a", tmp_path / "benchmark.json"]), Options(figures=False))
 
 

@@ -30,7 +30,7 @@ SMOKE = (
 
 
 def _run(tool: str, folder: Path, *overrides: str) -> str:
-    command = [sys.executable, "-m", f"saunet.cli.{tool}", *overrides, f"hydra.run.dir={folder}"]
+    command = [sys.executable, "-m", "saunet", tool, *overrides, f"hydra.run.dir={folder}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, env=environment, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
@@ -127,7 +127,7 @@ def test_a_killed_process_ends_the_run_with_a_sentence_and_a_checkpoint(victim: 
     done = _train(tmp_path, 2, 500, victim, signal.SIGKILL)
     assert done.returncode != 0
     named = "process 1 of 2 was killed (signal 9)" if victim == 1 else "the first process of the run is gone"
-    assert f"saunet-train: {named}" in done.stderr
+    assert f"saunet train: {named}" in done.stderr
     assert "resume with resume=" in done.stderr
     record = json.loads((tmp_path / "run.json").read_text())
     assert record["status"] == "failed"

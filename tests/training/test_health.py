@@ -104,7 +104,7 @@ def test_copies_are_advised_where_the_data_can_be_read_from_them(
     monkeypatch.setattr(trainer, "datamodule", data, raising=False)
     monkeypatch.setattr("saunet.training.loading.available_cores", lambda: 0)
     said = sentence(Loading(images=360, seconds=10.0, waited=4.0), trainer)
-    assert ("with saunet-prepare cache" in said) == (cacheable and not cached)
+    assert ("with saunet prepare cache" in said) == (cacheable and not cached)
     assert ("use a faster disk or more cores" in said) == (not cacheable or cached)
 
 
@@ -152,4 +152,4 @@ def test_a_slow_loader_is_named_with_its_figures_and_a_fast_one_is_not(
     if slow:
         assert "75 images/s arrive and the model could use 300 (75% of the time" in said[0]
         assert "raise data.workers (now 0" in said[0]
-        assert "load smaller copies made once with saunet-prepare cache" in said[0]
+        assert "load smaller copies made once with saunet prepare cache" in said[0]

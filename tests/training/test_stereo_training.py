@@ -19,7 +19,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "scale.md"
 
 @pytest.mark.slow
 def test_stereo_training_is_metric(tmp_path: Path) -> None:
-    (command,) = re.findall(r"^saunet-train (.*data\.stereo=true.*)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    (command,) = re.findall(r"^saunet train (.*data\.stereo=true.*)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     overrides = [*shlex.split(command), f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}"]
     subprocess.run(
         [sys.executable, "-m", "saunet.cli.train", *overrides], check=True, capture_output=True, timeout=1500

@@ -64,7 +64,7 @@ def picture(tmp_path: Path) -> Path:
 def street(checkpoint: Path, picture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rounding:
     """The tiny model as the shipped one."""
     monkeypatch.setattr(locating, "BOX", tmp_path / "box")
-    return pack(checkpoint, tmp_path / "box" / "street", images=picture, command="saunet-train experiment=street")
+    return pack(checkpoint, tmp_path / "box" / "street", images=picture, command="saunet train experiment=street")
 
 
 def depth_of(source: Any, image: Path) -> NDArray[np.float32]:
@@ -126,7 +126,7 @@ def test_record_and_card(street: Rounding, tmp_path: Path) -> None:
         assert "rendered" in text
         assert "secret" not in text
     assert json.loads(config)["height"] == 64
-    for words in ("# street", "saunet-train experiment=street", str(street), 'saunet.load("street")', "Not evaluated"):
+    for words in ("# street", "saunet train experiment=street", str(street), 'saunet.load("street")', "Not evaluated"):
         assert words in card
 
 

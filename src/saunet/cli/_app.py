@@ -21,7 +21,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from saunet import schema
 from saunet.cli._folders import Folder, noted
-from saunet.cli._globs import expand_globs
 from saunet.cli._runs import planned_jobs
 from saunet.cli._sweep import check_folder, swept_folder
 from saunet.config import config_dir, register_configs
@@ -42,7 +41,7 @@ def run(name: str, task: Callable[[DictConfig], Any], kinds: Collection[str] = t
     ``HYDRA_FULL_ERROR=1`` shows it always. In a sweep, the other jobs go on, and failures are named at the end.
 
     Args:
-        name: The tool, without ``saunet-``.
+        name: The tool, without ``saunet ``.
         task: What it does with its config.
         kinds: Those of the components that the config may name: a tool without losses and data sets starts without
             importing what they are made of, Lightning among it.
@@ -76,7 +75,6 @@ def run(name: str, task: Callable[[DictConfig], Any], kinds: Collection[str] = t
 
     try:
         register_configs(kinds)
-        sys.argv[1:] = expand_globs(sys.argv[1:], config_dir())
         hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(required)()
         if failed:
             raise failed[0]
@@ -130,7 +128,7 @@ def _job(name: str, task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
     except Exception as error:
         job = HydraConfig.get().job
         reason = sentence(error) or f"{type(error).__name__}: {error}"
-        print(f"saunet-{name}: job {job.num} ({job.override_dirname}) failed: {reason}", file=sys.stderr)
+        print(f"saunet {name}: job {job.num} ({job.override_dirname}) failed: {reason}", file=sys.stderr)
         if name == "train" and owned:
             record_failed_start(cfg.output_dir, cfg.name, error, sentence)
         raise
@@ -184,7 +182,7 @@ def _one_voice() -> None:
 
 
 def _fail(name: str, message: str, code: int = 1) -> NoReturn:
-    print(f"saunet-{name}: {message}", file=sys.stderr)
+    print(f"saunet {name}: {message}", file=sys.stderr)
     raise SystemExit(code)
 
 

@@ -1,4 +1,4 @@
-"""Which models ``saunet-benchmark`` measures, and the names they go by."""
+"""Which models ``saunet benchmark`` measures, and the names they go by."""
 
 from __future__ import annotations
 

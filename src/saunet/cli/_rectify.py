@@ -14,7 +14,7 @@ def rectify(cfg: DictConfig, predictor: Any) -> Any:
     """Make a predictor straighten its images, and return their `Camera` where it is known; None without ``rectify``.
 
     Args:
-        cfg: The root of ``saunet-predict``.
+        cfg: The root of ``saunet predict``.
         predictor: An `ImagePredictor`.
 
     Raises:
@@ -31,7 +31,7 @@ def rectify(cfg: DictConfig, predictor: Any) -> Any:
     if cfg.scale.method in METHODS:
         raise ConfigError(
             f"scale.method={cfg.scale.method} measures on the images as they are, so it does not go with rectify; "
-            "measure with saunet-evaluate data=video scale.store=true first"
+            "measure with saunet evaluate data=video scale.store=true first"
         )
     if cfg.camera is not None:
         raise ConfigError("camera and rectify are both set; the camera file has the intrinsics, leave camera out")

@@ -22,7 +22,7 @@ def scale_predictor(cfg: DictConfig, predictor: Any) -> None:
     """Give a predictor the scale that ``cfg.scale`` asks for; report what was measured.
 
     Args:
-        cfg: The root of ``saunet-predict``.
+        cfg: The root of ``saunet predict``.
         predictor: An `ImagePredictor`; its own scale is the stored one.
 
     Raises:

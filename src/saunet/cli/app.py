@@ -36,7 +36,9 @@ class Tool:
         positional: The key that plain words stand for; a trailing ``*`` takes several.
         aliases: Short form -> key.
         recorded: Whether the function is also given ``choices`` and ``overrides`` for the record of a run, and
-            ``describe``, which puts an error into one sentence.
+            ``describe``, which puts an error into one sentence; what it returns is not printed.
+        config: Name of the root config; the tool's own by default.
+        preset: Overrides that come before those of the command line.
     """
 
     summary: str
@@ -46,13 +48,23 @@ class Tool:
     positional: str | None = None
     aliases: dict[str, str] = field(default_factory=dict)
     recorded: bool = False
+    config: str = ""
+    preset: Sequence[str] = ()
 
 
 TOOLS: dict[str, Tool] = {
     "train": Tool(
         "train a depth network on driving video",
-        function="saunet.cli.train:main",
-        examples=("train experiment=selfsup data=kitti data.root=/data/kitti/raw",),
+        "saunet.training.tool:TrainOptions",
+        "saunet.training.tool:train",
+        (
+            "train experiment=selfsup data=kitti data.root=/data/kitti/raw",
+            "train experiment=smoke model/encoder=resnet18 epochs=2 lr=2e-4",
+            "train -m sweep=loss_ablation experiment=smoke",
+            "resume outputs/train/2026-01-31_12-00-00",
+        ),
+        aliases={"epochs": "trainer.max_epochs", "lr": "optim.lr", "batch": "data.batch_size"},
+        recorded=True,
     ),
     "predict": Tool(
         "depth of an image, a folder, a video or a camera, as pictures, points and videos",
@@ -61,13 +73,17 @@ TOOLS: dict[str, Tool] = {
     ),
     "evaluate": Tool(
         "score a checkpoint, or predictions made elsewhere",
-        function="saunet.cli.evaluate:main",
-        examples=("evaluate checkpoint=last.ckpt data=kitti data.root=/data/kitti/raw",),
+        "saunet.evaluation.tool:EvaluateOptions",
+        "saunet.evaluation.tool:evaluate",
+        ("evaluate last.ckpt data=kitti data.root=/data/kitti/raw", "evaluate predictions=maps data=kitti"),
+        positional="checkpoint",
     ),
     "odometry": Tool(
         "the camera's path through whole sequences, with its errors",
-        function="saunet.cli.odometry:main",
-        examples=("odometry checkpoint=last.ckpt data.root=/data/kitti/odometry",),
+        "saunet.evaluation.tool_odometry:OdometryOptions",
+        "saunet.evaluation.tool_odometry:odometry",
+        ("odometry last.ckpt data.root=/data/kitti/odometry",),
+        positional="checkpoint",
     ),
     "export": Tool(
         "write a checkpoint as files to deploy or share, each checked against the network",
@@ -111,8 +127,13 @@ TOOLS: dict[str, Tool] = {
     ),
     "demo": Tool(
         "the README's demo: train on rendered video, evaluate, draw",
-        function="saunet.cli.demo:main",
-        examples=("demo",),
+        "saunet.training.tool:TrainOptions",
+        "saunet.cli.demo:demo",
+        ("demo", "demo epochs=2"),
+        aliases={"epochs": "trainer.max_epochs", "lr": "optim.lr", "batch": "data.batch_size"},
+        recorded=True,
+        config="train",
+        preset=("experiment=demo",),
     ),
 }
 """Every tool by name, in the order of ``saunet --help``."""
@@ -250,6 +271,10 @@ def run(name: str, argv: Sequence[str], read: Callable[[Sequence[str]], Sequence
         code = _run(name, read(argv))
     except KeyboardInterrupt:
         code = _say(name, "interrupted", 130)
+    except SystemExit as stop:  # a run that was asked to stop says how to resume
+        if not stop.code or str(stop) == str(stop.code):
+            raise
+        code = _say(name, str(stop), int(stop.code) if isinstance(stop.code, int) else 1)
     except Exception as error:
         from saunet.cli.errors import sentence
 
@@ -282,8 +307,8 @@ def _run(name: str, argv: Sequence[str]) -> int:
 
         print(tool_help(name, tool, keys, words.choices(line.overrides)))
         return 0
-    config, overrides = flags.config_name or name, list(line.overrides)
-    with compose.hydra(name, keys, conf, flags.config_dir) as hydra:
+    config, overrides = flags.config_name or tool.config or name, [*tool.preset, *line.overrides]
+    with compose.hydra(name, tool.config or name, keys, conf, flags.config_dir) as hydra:
         if flags.cfg:
             hydra.show_cfg(config, overrides, flags.cfg, flags.package, flags.resolve)
             return 0
@@ -319,7 +344,7 @@ def call(name: str, composed: Composed, keys: Table) -> tuple[int, object]:
     result = function(options, **(record if tool.recorded else {}))
     if isinstance(result, Shown):
         result.show()
-    elif result is not None:
+    elif result is not None and not tool.recorded:
         print(result)
     if isinstance(result, Partial):
         for failure in result.failures:
@@ -337,19 +362,23 @@ def job(name: str, raising: bool, cfg: DictConfig) -> object:
 
     from saunet.cli import compose
     from saunet.cli.errors import sentence
-    from saunet.cli.sweeps import Failed, check_folder
+    from saunet.cli.sweeps import Failed, check_job
 
-    hydra = HydraConfig.get()
+    hydra, own = HydraConfig.get(), False
     try:
         plugins.load(cfg.plugins)
         keys = table()
         composed = compose.of_job(cfg, cast("DictConfig", hydra))
-        if "output_dir" in composed.config:
-            check_folder(composed.config["output_dir"], composed.folder)
+        check_job(composed.config, composed.folder)
+        own = True
         code, result = call(name, composed, keys)
         if code:
             raise ConfigError("some of it failed")
     except Exception as error:
+        if own and TOOLS[name].recorded:
+            from saunet.runs.folder import record_failed_start
+
+            record_failed_start(composed.folder, name, error, sentence, overrides=list(composed.overrides))
         reason = sentence(error) or f"{type(error).__name__}: {error}"
         print(f"saunet {name}: job {hydra.job.num} ({hydra.job.override_dirname}) failed: {reason}", file=sys.stderr)
         if raising:

@@ -1,4 +1,4 @@
-"""``saunet-benchmark``: parameters, FLOPs, time and memory of models, beside the paper's Table 2."""
+"""``saunet benchmark``: parameters, FLOPs, time and memory of models, beside the paper's Table 2."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def benchmark(cfg: DictConfig) -> None:
 
 
 def main() -> None:
-    """Entry point of ``saunet-benchmark``."""
+    """Entry point of ``saunet benchmark``."""
     run("benchmark", benchmark, kinds=("encoder", "decoder", "pose"))
 
 

@@ -31,16 +31,19 @@ from saunet.errors import ConfigError, one_of
 from saunet.registry import Spec
 
 T = TypeVar("T")
+PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "predictions", "resume", "root")
+"""Options that name files or folders."""
 _CONVERTED = (tuple, Sequence, Mapping, typing.Literal)
 _TYPES: Mapping[str, object] = {"bool": bool, "int": int, "float": float, "str": str}
 
 
 @contextmanager
-def hydra(tool: str, table: Table, conf: Path, extra: str | None = None) -> Iterator[Hydra]:
+def hydra(tool: str, root: str, table: Table, conf: Path, extra: str | None = None) -> Iterator[Hydra]:
     """Give Hydra, knowing the keys of a tool and of all components.
 
     Args:
         tool: The tool.
+        root: Name of its root config.
         table: All config keys.
         conf: The folder of the YAML files.
         extra: Another folder of YAML files, which comes first.
@@ -48,14 +51,7 @@ def hydra(tool: str, table: Table, conf: Path, extra: str | None = None) -> Iter
     Raises:
         ConfigError: if there is no such folder.
     """
-    store = ConfigStore.instance()
-    root = table.tools[tool]
-    # A group's members bring the types of its keys.
-    keys = [dataclasses.replace(key, type="any") if key.name in table.library else key for key in root.keys]
-    store.store(name=f"{tool}_schema", node=structured(dataclasses.replace(root, keys=(*keys, words.PLUGINS))))
-    for group, nodes in table.groups().items():
-        for name, node in nodes.items():
-            store.store(group=group, name=name, node=structured(node))
+    register(table, {root: tool})
     setbase("1.3")
     setup_globals()
     path = create_config_search_path(str(conf))
@@ -69,6 +65,24 @@ def hydra(tool: str, table: Table, conf: Path, extra: str | None = None) -> Iter
         yield Hydra.create_main_hydra2(task_name=tool, config_search_path=path)
     finally:
         GlobalHydra.instance().clear()
+
+
+def register(table: Table, roots: Mapping[str, str]) -> None:
+    """Give Hydra the typed keys of tools and of all components.
+
+    Args:
+        table: All config keys.
+        roots: Root config -> the tool whose keys it has.
+    """
+    store = ConfigStore.instance()
+    for root, tool in roots.items():
+        node = table.tools[tool]
+        # A group's members bring the types of its keys.
+        keys = [dataclasses.replace(key, type="any") if key.name in table.library else key for key in node.keys]
+        store.store(name=f"{root}_schema", node=structured(dataclasses.replace(node, keys=(*keys, words.PLUGINS))))
+    for group, nodes in table.groups().items():
+        for name, each in nodes.items():
+            store.store(group=group, name=name, node=structured(each))
 
 
 def structured(node: schema.Node) -> type:
@@ -181,7 +195,19 @@ def options(cls: Callable[..., T], composed: Composed, table: Table) -> T:
     """
     given = {key: value for key, value in composed.config.items() if key != words.PLUGINS.name}
     _check(given, "", table)
+    for key in PATHS:
+        if given.get(key) == "":
+            raise ConfigError(f"{key}= is empty, perhaps from a shell variable that is not set; name a path")
+    for key in ("checkpoint", "init_from", "resume"):
+        if key in given:
+            given[key] = _checkpoint(given[key], ("last",) if key == "resume" else ("best", "last"))
     return _build(cls, given, composed, table, "")
+
+
+def _checkpoint(given: object, names: Sequence[str]) -> object:
+    """Return the checkpoint in a run's folder; what is no such folder stays as it is."""
+    files = [Path(str(given)).expanduser() / "checkpoints" / f"{name}.ckpt" for name in names]
+    return next((str(file) for file in files if given and file.is_file()), given)
 
 
 def _build(cls: Callable[..., T], given: Mapping[str, object], composed: Composed, table: Table, prefix: str) -> T:

@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
-from saunet import config
-from saunet.cli._app import run
-from saunet.cli.train import fit
+import saunet
+from saunet.data.drive import Drive
+from saunet.evaluation import write_results
+from saunet.evaluation.tool import evaluate_network
+from saunet.io.images import write_image
+from saunet.prediction.panel import depth_panel
+from saunet.prediction.predictor import Predictor
+from saunet.prediction.video import render_video
+from saunet.tables import show
+from saunet.training.tool import TrainOptions, train
 
 PICTURES = 3
 """Test frames shown in the panel, evenly spread over the drive."""
 
 
-def demo(cfg: DictConfig) -> None:
+def demo(
+    options: TrainOptions,
+    *,
+    choices: Mapping[str, str | None],
+    overrides: Sequence[str],
+    describe: Callable[[Exception], str | None],
+) -> None:
     """Train, evaluate, draw; print where everything is."""
-    import saunet
-    from saunet.evaluation import write_results
-    from saunet.evaluation.tool import evaluate_network
-    from saunet.tables import show
-
-    data = fit(cfg).data
-    folder = Path(cfg.output_dir)
+    data = train(options, choices=choices, overrides=overrides, describe=describe).data
+    folder = Path(options.output_dir)
     predictor = saunet.load(folder / "checkpoints" / "best.ckpt")
     result = evaluate_network(predictor.network, data)
     write_results(result, folder)
@@ -39,7 +45,7 @@ def demo(cfg: DictConfig) -> None:
     print(f"model     {folder / 'checkpoints' / 'best.ckpt'}")
 
 
-def draw(predictor: Any, drive: Any, folder: Path) -> None:
+def draw(predictor: Predictor, drive: Drive, folder: Path) -> None:
     """Write ``depth.png`` (a few frames with truth and error) and ``depth.mp4`` (the whole drive).
 
     Args:
@@ -47,10 +53,6 @@ def draw(predictor: Any, drive: Any, folder: Path) -> None:
         drive: A `saunet.data.drive.Drive` with true depth.
         folder: Where the files go.
     """
-    from saunet.io.images import write_image
-    from saunet.prediction.panel import depth_panel
-    from saunet.prediction.video import render_video
-
     frames = list(drive.indices)
     chosen = [frames[round(place)] for place in np.linspace(0, len(frames) - 1, PICTURES + 2)[1:-1]]
     panels = []
@@ -59,14 +61,3 @@ def draw(predictor: Any, drive: Any, folder: Path) -> None:
         panels.append(depth_panel(prediction.image, prediction.disparity, drive.depth(frame), tile_width=384))
     write_image(folder / "depth.png", np.concatenate(panels, axis=1))
     render_video(predictor, (drive.image(frame) for frame in frames), folder / "depth.mp4")
-
-
-def main() -> None:
-    """Entry point of the demo; further arguments are overrides, such as ``trainer.max_epochs=2``."""
-    config.register_training_configs()
-    sys.argv.insert(1, "experiment=demo")
-    run("train", demo)
-
-
-if __name__ == "__main__":
-    main()

@@ -24,6 +24,8 @@ def sentence(error: BaseException, table: Table | None = None) -> str | None:
         return str(error)
     if type(error).__name__ == "OutOfMemoryError":  # torch's, which is not imported for its name
         return "the GPU's memory is too small for this; lower the batch size (in training data.batch_size) or the size"
+    if "Config group override must be a string or a list" in text:
+        return "a group of the config cannot be null; choose logger=none, or set single members to null"
     spawned = re.search(r"^saunet\.errors\.\w+: (.*)", str(error), re.MULTILINE)
     if spawned:  # raised in a process that was spawned: only its traceback's text arrives here
         return spawned[1]
@@ -48,8 +50,6 @@ def sentence(error: BaseException, table: Table | None = None) -> str | None:
 
 
 def _of_hydra(text: str, table: Table | None) -> str:
-    if "Config group override must be a string or a list" in text:
-        return "a group of the config cannot be null; choose logger=none, or set single members to null"
     wanted = re.search(r"Could not find '([^']+)'", text)
     listed = re.search(r"Available options in '([^']+)':\n(.*?)(?=\n\S|\Z)", text, re.DOTALL)
     if wanted and listed:

@@ -1,4 +1,4 @@
-"""``saunet-export``: a checkpoint as files to deploy or share, each checked against the network it came from."""
+"""``saunet export``: a checkpoint as files to deploy or share, each checked against the network it came from."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def export(cfg: DictConfig) -> None:
     from saunet.exporting.export import export_model
 
     if cfg.images is None:
-        print("saunet-export: images is not set, so only random images are compared", file=sys.stderr)
+        print("saunet export: images is not set, so only random images are compared", file=sys.stderr)
     reports = export_model(
         cfg.checkpoint,
         cfg.output,
@@ -45,7 +45,7 @@ def export(cfg: DictConfig) -> None:
 
 
 def main() -> None:
-    """Entry point of ``saunet-export``."""
+    """Entry point of ``saunet export``."""
     run("export", export, kinds=())
 
 

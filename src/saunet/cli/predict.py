@@ -1,4 +1,4 @@
-"""``saunet-predict``: depth of an image, a folder, a pattern, a video or a camera, as pictures, points and videos."""
+"""``saunet predict``: depth of an image, a folder, a pattern, a video or a camera, as pictures, points and videos."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _predict_images(cfg: DictConfig, predictor: Any, outputs: list[str], shared:
 
     summary = predict_files(predictor, cfg.input, cfg.output, outputs, **shared)
     for failure in summary.failures:
-        print(f"saunet-predict: {failure}", file=sys.stderr)
+        print(f"saunet predict: {failure}", file=sys.stderr)
     print(f"{len(summary.written)} files written, {summary.skipped} images were finished before: {cfg.output}")
     if summary.failures:
         raise SystemExit(1)
@@ -80,12 +80,12 @@ def _predict_clip(cfg: DictConfig, predictor: Any, source: Any, outputs: list[st
     print(f"{clip.frames} frames: {', '.join(map(str, clip.paths))}")
     if clip.missing:
         message = f"{source} ends {clip.missing} frames earlier than it declares: it may be truncated"
-        print(f"saunet-predict: {message}", file=sys.stderr)
+        print(f"saunet predict: {message}", file=sys.stderr)
         raise SystemExit(1)
 
 
 def main() -> None:
-    """Entry point of ``saunet-predict``."""
+    """Entry point of ``saunet predict``."""
     run("predict", predict, kinds=())
 
 

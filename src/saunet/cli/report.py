@@ -1,4 +1,4 @@
-"""``saunet-report``: one page of tables, curves and pictures from finished runs; with ``compare``, how runs differ."""
+"""``saunet report``: one page of tables, curves and pictures from finished runs; with ``compare``, how runs differ."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ def scenes(node: Any) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Entry point of ``saunet-report``."""
+    """Entry point of ``saunet report``."""
     try:
         sys.argv[1:] = arguments(sys.argv[1:])
     except ConfigError as error:
-        sys.exit(f"saunet-report: {error}")
+        sys.exit(f"saunet report: {error}")
     run("report", report)
 
 

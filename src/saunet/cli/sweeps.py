@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -79,15 +79,36 @@ def _planned(cfg: DictConfig) -> list[list[str]]:
     return [list(job) for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]
 
 
-def check_folder(output_dir: object, job: str) -> None:
-    """Check that a job of a sweep writes into its own folder: one named for all would hold the last job alone.
+def check_job(config: Mapping[str, object], job: str) -> None:
+    """Check what a job of a sweep must not do.
+
+    Args:
+        config: Its configuration.
+        job: The folder that the sweep gave it.
 
     Raises:
-        ConfigError: if it would write anywhere else.
+        ConfigError: if it would write anywhere else, where the next job writes too, or start the sweep once more.
     """
-    given, own = Path(str(output_dir)).resolve(), Path(job).resolve()
-    if own != given and own not in given.parents:
+    folder = config.get("output_dir")
+    if folder is not None:
+        given, own = Path(str(folder)).resolve(), Path(job).resolve()
+        if own != given and own not in given.parents:
+            raise ConfigError(
+                f"output_dir is '{folder}' and the jobs of a sweep must not share a folder; "
+                f"leave it out and set hydra.sweep.dir={folder}, below which each job gets its own"
+            )
+    trainer = config.get("trainer")
+    if isinstance(trainer, Mapping) and _replays(trainer):
         raise ConfigError(
-            f"output_dir is '{output_dir}' and the jobs of a sweep must not share a folder; "
-            f"leave it out and set hydra.sweep.dir={output_dir}, below which each job gets its own"
+            "--multirun with several processes per job would replay the whole sweep on every process; "
+            "use one process per job, through a Hydra launcher where there are several devices"
         )
+
+
+def _replays(trainer: Mapping[str, object]) -> bool:
+    """Return whether a trainer will start further processes by running this command again."""
+    strategy = str(trainer.get("strategy", "auto")).lower()  # a name, or a node with a _target_
+    if "spawn" in strategy or "fork" in strategy:
+        return False
+    several = str(trainer.get("devices", 1)) not in ("1", "[0]", "auto") or trainer.get("num_nodes", 1) not in (1, None)
+    return several or any(kind in strategy for kind in ("ddp", "fsdp", "deepspeed"))

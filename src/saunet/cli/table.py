@@ -21,11 +21,7 @@ import saunet
 from saunet import schema
 from saunet.registry import REGISTRIES
 
-LIBRARY = {
-    ("trainer", "lightning"): ("lightning:Trainer", "lightning.Trainer"),
-    ("optim", "recipe"): ("saunet.training.optim:Recipe", ""),
-    ("speed", "switches"): ("saunet.training.speed:Speed", ""),
-}
+LIBRARY = {("trainer", "lightning"): ("lightning:Trainer", "lightning.Trainer")}
 """Config nodes that are not components: (group, name) -> what it configures, and the path to build it from."""
 
 

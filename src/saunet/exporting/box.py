@@ -2,7 +2,7 @@
 
 ```
 python -m saunet.exporting.box outputs/street/checkpoints/best.ckpt src/saunet/weights/street \
-    --images 'pictures/*.png' --evaluation outputs/evaluate --command 'saunet-train experiment=street'
+    --images 'pictures/*.png' --evaluation outputs/evaluate --command 'saunet train experiment=street'
 ```
 """
 
@@ -79,7 +79,7 @@ def pack(
         source: A checkpoint or any other model that `saunet.load` takes, but ONNX.
         folder: Where the files go; made if need be.
         images: Real images to measure the rounding on, besides random ones; at most eight are taken, evenly.
-        evaluations: Folders of ``saunet-evaluate``; their results go into the card.
+        evaluations: Folders of ``saunet evaluate``; their results go into the card.
         command: How the model was made; goes into the card.
         overwrite: Replace an earlier model in the folder.
 
@@ -217,7 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("source", help="a checkpoint, or an exported folder")
     parser.add_argument("folder", help="where the files go; its name becomes the model's")
     parser.add_argument("--images", nargs="*", default=[], help="real images to measure the rounding on")
-    parser.add_argument("--evaluation", nargs="*", default=[], help="folders of saunet-evaluate, for the card")
+    parser.add_argument("--evaluation", nargs="*", default=[], help="folders of saunet evaluate, for the card")
     parser.add_argument("--command", default="", help="how the model was made, for the card")
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier model in the folder")
     given = parser.parse_args(arguments)

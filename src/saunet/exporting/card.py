@@ -113,7 +113,7 @@ def fingerprint(value: Any) -> str:
 def quality_lines(metrics: Mapping[str, Any] | None) -> list[str]:
     """Return the results of an evaluation as lines of a Markdown table."""
     if metrics is None:
-        return ["No evaluation was given when this was exported (`evaluation=` the folder of a saunet-evaluate run)."]
+        return ["No evaluation was given when this was exported (`evaluation=` the folder of a saunet evaluate run)."]
     return [
         f"| predictor | protocol | {' | '.join(ERROR_HEADINGS)} | images |",
         f"|---|---|{'---:|' * (len(ERROR_HEADINGS) + 1)}",

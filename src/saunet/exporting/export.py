@@ -57,13 +57,13 @@ def export_model(
     """Export a trained model's depth network into a folder, with its config, a parity report and a model card.
 
     Args:
-        checkpoint: A checkpoint written by ``saunet-train``, or a folder written by this function.
+        checkpoint: A checkpoint written by ``saunet train``, or a folder written by this function.
         output_dir: Where the files of `FILES`, ``config.json``, ``report.json`` and ``README.md`` go.
         formats: Which files to write; see `FORMATS`.
         images: Real images to compare on, besides random ones: files, folders or patterns; at most eight are taken,
             evenly.
         batch: How many images the files take at once; see `saunet.exporting.exporters.BATCHES`.
-        evaluation: A ``metrics.json`` of ``saunet-evaluate``, or the folder that holds it; goes into the card.
+        evaluation: A ``metrics.json`` of ``saunet evaluate``, or the folder that holds it; goes into the card.
         overwrite: Replace what an earlier export left in the folder.
         progress: Show a progress bar on a terminal.
 
@@ -143,9 +143,9 @@ def read_metrics(path: str | Path) -> Mapping[str, Any]:
         if [row for row in content["results"] if not isinstance(row["predictor"], str)]:
             raise ValueError("a row without predictor")
     except OSError as reason:
-        raise DataError(f"cannot read {path}: {reason.strerror}; give the folder of a saunet-evaluate run") from reason
+        raise DataError(f"cannot read {path}: {reason.strerror}; give the folder of a saunet evaluate run") from reason
     except (ValueError, TypeError, KeyError) as reason:
-        raise DataError(f"{path} is not an evaluation ({reason}); give the metrics.json of saunet-evaluate") from reason
+        raise DataError(f"{path} is not an evaluation ({reason}); give the metrics.json of saunet evaluate") from reason
     return content  # type: ignore[no-any-return]
 
 

@@ -29,7 +29,7 @@ def read_plain(path: Path, what: str) -> Any:
         if any(mark in str(reason) for mark in ("GLOBAL", "Unsupported class", "Trying to")):
             raise CheckpointError(
                 f"{path} holds pickled objects, which could run code when read, so it is refused; "
-                "save plain containers and tensors only, as saunet-train does"
+                "save plain containers and tensors only, as saunet train does"
             ) from reason
         raise CheckpointError(f"{path} is not {what}, or is damaged; copy it again") from reason
     except OSError as reason:

@@ -13,7 +13,7 @@ def load(source: str | Path, *, device: str = "cpu", flip: bool = False, keep_as
     """Load a trained model for prediction; nothing in the file is run.
 
     Args:
-        source: A checkpoint, a folder written by ``saunet-export``, a ``model.onnx`` (run by onnxruntime; torch is not
+        source: A checkpoint, a folder written by ``saunet export``, a ``model.onnx`` (run by onnxruntime; torch is not
             even imported), the name of a shipped model such as ``street``, or a hub id: ``hf://organization/name``, or
             short ``organization/name``, with ``@revision`` where a certain one is meant.
         device: Where to run, such as ``"cpu"`` or ``"cuda"``.

@@ -53,7 +53,7 @@ class Predictor(ImagePredictor):
         """Load a trained model, a checkpoint or an exported folder; nothing in the file is run.
 
         Args:
-            path: A checkpoint file, or a folder that ``saunet-export`` wrote.
+            path: A checkpoint file, or a folder that ``saunet export`` wrote.
             device: Where the network runs.
             flip: Also predict the mirrored image and blend: slower and a little better.
             keep_aspect: Keep the shape of images instead of stretching them to the size of the training.

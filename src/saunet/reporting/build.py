@@ -120,7 +120,7 @@ def build(
     missing += [*no_rows, *no_sizes, *no_ablation, *no_speed]
     missing.append(Missing("Published curves and pictures", "the paper prints them as images only"))
     if len(shown) < len(everyone):
-        why = "they are in the tables of their sweeps; saunet-evaluate puts their checkpoints here too"
+        why = "they are in the tables of their sweeps; saunet evaluate puts their checkpoints here too"
         missing.append(Missing("Table 1, jobs of sweeps", why))
     return Document(options.title, _facts(everyone), tuple(sections), tuple(missing))
 

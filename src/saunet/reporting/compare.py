@@ -82,7 +82,7 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
         if not both:
             left_out.append(
                 f"{names[0]} and {other} were not both evaluated under one protocol, so nothing is paired; "
-                "run saunet-evaluate on both with the same data"
+                "run saunet evaluate on both with the same data"
             )
         for protocol in both:
             ours, theirs = found[names[0]][protocol], found[other][protocol]
@@ -181,12 +181,12 @@ def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
             if one.images == two.images:
                 return (
                     f"the first was evaluated with {one.how or 'no flip or scale'} and the second with "
-                    f"{two.how or 'no flip or scale'}; run saunet-evaluate on both with the same settings"
+                    f"{two.how or 'no flip or scale'}; run saunet evaluate on both with the same settings"
                 )
     counts = [", ".join(f"{len(one.images)} of {one.data}" for one in each) for each in (ours, theirs)]
     return (
         f"the images do not pair up ({counts[0]} against {counts[1]}, by their names not the same); "
-        "run saunet-evaluate on both with the same data"
+        "run saunet evaluate on both with the same data"
     )
 
 
@@ -204,7 +204,7 @@ def print_comparison(inputs: Inputs, wanted: Sequence[str], console: Console) ->
     """
     members = inputs.all_runs
     if len(members) < 2:
-        raise DataError(f"{len(members)} run is not enough to compare; name two or more: saunet-report compare A B")
+        raise DataError(f"{len(members)} run is not enough to compare; name two or more: saunet report compare A B")
     if wanted and len(set(wanted)) != len(members):
         raise ConfigError(f"labels holds {len(set(wanted))} names for {len(members)} runs; give each its own")
     runs = dict(zip(wanted or labels([members])[0], members, strict=True))

@@ -1,4 +1,4 @@
-"""What ``saunet-evaluate`` left behind: scores, on which images and with which settings, and of what."""
+"""What ``saunet evaluate`` left behind: scores, on which images and with which settings, and of what."""
 
 from __future__ import annotations
 

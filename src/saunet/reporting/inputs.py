@@ -58,7 +58,7 @@ def collect(
     """
     one_of("checkpoint", checkpoint, ("best", "last"))
     if not paths:
-        raise DataError("no run given; name folders of runs or sweeps, or checkpoints: saunet-report outputs/train/...")
+        raise DataError("no run given; name folders of runs or sweeps, or checkpoints: saunet report outputs/train/...")
     runs: dict[Path, Run] = {}
     sweeps: dict[Path, Sweep] = {}
     evaluations: dict[Path, Evaluation] = {}

@@ -1,4 +1,4 @@
-"""Fig. 10: accuracy of the runs against the time that saunet-benchmark measured for exactly their networks."""
+"""Fig. 10: accuracy of the runs against the time that saunet benchmark measured for exactly their networks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def read_benchmark(folder: Path) -> list[dict[str, object]]:
     rows = content.get("results") if isinstance(content, dict) else None
     keys = ("model", "size", "device", "precision", "mode", "batch_size", "depth_parameters", "median")
     if not isinstance(rows, list) or not all(isinstance(row, dict) and all(key in row for key in keys) for row in rows):
-        raise DataError(f"{folder / 'benchmark.json'} is not a result of saunet-benchmark; measure again")
+        raise DataError(f"{folder / 'benchmark.json'} is not a result of saunet benchmark; measure again")
     return rows
 
 
@@ -76,7 +76,7 @@ def speed(
                 why = "its time is of several images at once" if batch > 1 else "its accuracy is of other images"
                 missing.append(Missing(f"Fig. 10, point of {name} ({how})", why))
     if not measured:
-        missing.append(Missing("Fig. 10", "no benchmark given; name the folder that saunet-benchmark wrote"))
+        missing.append(Missing("Fig. 10", "no benchmark given; name the folder that saunet benchmark wrote"))
         return [], None, missing
     columns = (
         Column("Method"),

@@ -225,7 +225,7 @@ def _scored(runs: Mapping[str, Run]) -> tuple[list[tuple[str, Score]], list[str]
 def _no_score(run: Run) -> str:
     if run.error:
         return f"{run.status}: {run.error}"
-    return "neither evaluated nor validated against depth; run saunet-evaluate on its checkpoint"
+    return "neither evaluated nor validated against depth; run saunet evaluate on its checkpoint"
 
 
 def _pattern(run: Run, score: Score) -> str:

@@ -144,7 +144,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         or not isinstance(content.get("state_dict"), Mapping)
     ):
         raise CheckpointError(
-            f"{path} is not a saunet checkpoint (no model record and weights); give a file written by saunet-train"
+            f"{path} is not a saunet checkpoint (no model record and weights); give a file written by saunet train"
         )
     try:
         record = ModelRecord.from_plain(content["saunet"])

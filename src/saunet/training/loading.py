@@ -97,7 +97,7 @@ def sentence(loading: Loading, trainer: Trainer) -> str:
     data = getattr(trainer, "datamodule", None)
     advice = [f"raise data.workers (now {workers}, there are {cores} cores)"] if workers < cores else []
     if getattr(data, "cacheable", False) and data.copies is None:  # type: ignore[union-attr]
-        advice.append("load smaller copies made once with saunet-prepare cache")
+        advice.append("load smaller copies made once with saunet prepare cache")
     return (
         f"the loader is the bottleneck: {loading.reached:.0f} images/s arrive{each} and the model could use "
         f"{loading.needed:.0f} ({loading.share:.0%} of the time is spent waiting); "

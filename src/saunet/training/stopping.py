@@ -193,7 +193,7 @@ class ProcessWatch(Callback):
     def _end(self, reason: str, started: list[Popen[bytes]]) -> None:
         sentence = f"{reason}; {way_on(self.checkpoints)}"
         mark_lost(self.folder, sentence)
-        print(f"\nsaunet-train: {sentence}", file=sys.stderr, flush=True)
+        print(f"\nsaunet train: {sentence}", file=sys.stderr, flush=True)
         for process in started:
             process.kill()
         os._exit(1)  # the main thread waits inside a collective call, which no exception reaches

@@ -20,7 +20,7 @@ def read_model(source: str | Path) -> Checkpoint:
     """Read a trained model into memory, without running anything from it.
 
     Args:
-        source: A checkpoint, a folder written by ``saunet-export`` (or the safetensors file in it), the name of a
+        source: A checkpoint, a folder written by ``saunet export`` (or the safetensors file in it), the name of a
             shipped model, or a hub id; see `saunet.weights.locate.locate`.
 
     Raises:

@@ -180,7 +180,7 @@ def test_what_cannot_work_is_one_sentence(tree, tmp_path):
             use()
     with pytest.raises(DataError, match="is not empty and not a cache"):
         build_cache(recordings, tree, SMALL)
-    with pytest.raises(DataError, match=r"no cache at .* make it: saunet-prepare cache"):
+    with pytest.raises(DataError, match=r"no cache at .* make it: saunet prepare cache"):
         ImageCache(tmp_path / "nowhere")
     for wrong, message in (({"quality": 0}, "quality is 0"), ({"format": "gif"}, "format")):
         with pytest.raises((ConfigError, TypeError), match=message):
@@ -260,7 +260,7 @@ def test_a_damaged_list_is_one_sentence(tree, tmp_path, content):
         lambda: build_cache(recordings, folder, SMALL),
         lambda: ImageCache(folder).drive(recordings[0][0], [0]),
     ):
-        with pytest.raises(DataError, match=r"frames\.json is damaged; delete it and run saunet-prepare cache again"):
+        with pytest.raises(DataError, match=r"frames\.json is damaged; delete it and run saunet prepare cache again"):
             use()
     (folder / name(1) / "l" / "frames.json").unlink()
     assert build_cache(recordings, folder, SMALL).verified == 10

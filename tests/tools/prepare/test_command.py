@@ -1,4 +1,4 @@
-"""``saunet-prepare`` on the command line."""
+"""``saunet prepare`` on the command line."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_each_job_runs_and_leaves_only_its_results(command, tree, tmp_path):
         (["densfy"], "job is 'densfy'; did you mean 'densify'? allowed: densify, teacher, cache"),
         ([], "job is not set; add job=..."),
         (["densify"], "root is not set; add root=..."),
-        (["cache", "data=synthetic", "folder=c"], "SyntheticDataModule reads no copies made by saunet-prepare; use"),
+        (["cache", "data=synthetic", "folder=c"], "SyntheticDataModule reads no copies made by saunet prepare; use"),
         (["densify", "root=raw", "kinds=liner"], "kinds is 'liner'; did you mean 'linear'?"),
         (["densify", "root=raw", "workers=-1", "folder=maps"], "workers is -1; it must be at least 0"),
     ],

@@ -61,7 +61,7 @@ def test_a_teachers_depth_follows_crops_and_flips_beside_the_scan(tree, tmp_path
 def test_missing_maps_name_the_command(tree, tmp_path):
     with pytest.raises(DataError, match=r"6 of 6 frames have no linear depth map.*densify kinds=\[linear\] root="):
         module(tree, dense="linear").setup("fit")
-    with pytest.raises(DataError, match=r"no teacher depth map.*saunet-prepare teacher .* folder="):
+    with pytest.raises(DataError, match=r"no teacher depth map.*saunet prepare teacher .* folder="):
         module(tree, teacher=True, maps=str(tmp_path / "maps")).setup("fit")
     densify(kitti_recordings(tree, ["left"]), ["linear"])
     DepthMaps("linear").path(kitti_recordings(tree, ["left"])[0][0], 3).unlink()

@@ -46,10 +46,10 @@ class KittiDataModule(DepthDataModule):
         depth: Ground truth: LiDAR depth as ``camera_z`` or ``lidar_x`` (evaluation only), or ``improved``.
         target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
         dense: Dense depth maps as that target in place of the sparse scan: ``linear`` or ``colorization``, made
-            beforehand by ``saunet-prepare densify``; ``none`` uses the scan.
-        teacher: Batches carry another model's depth, made beforehand by ``saunet-prepare teacher``.
+            beforehand by ``saunet prepare densify``; ``none`` uses the scan.
+        teacher: Batches carry another model's depth, made beforehand by ``saunet prepare teacher``.
         maps: Folder of these maps; None: beside the recordings.
-        cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
+        cache: Folder of smaller copies made by ``saunet prepare cache``; training and validation read images from it.
         stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
             ``offsets: []`` it is the only one.
         with_speed: Batches carry the way traveled, from OXTS, for the velocity term; unknown where a record lacks.
@@ -155,7 +155,7 @@ class KittiDataModule(DepthDataModule):
                 wanted.append((drive, [f for f in frames if f in existing and (not dense or drive.has_depth(f))]))
             what = "teacher checkpoint=..." if maps.kind == "teacher" else f"densify kinds=[{maps.kind}]"
             folder = f" folder={maps.folder}" if maps.folder else ""
-            maps.check(wanted, f"saunet-prepare {what} root={self.root}{folder}")
+            maps.check(wanted, f"saunet prepare {what} root={self.root}{folder}")
 
     def listed(self, split: str) -> list[str]:
         """Return the names of all images that a split lists, in its order, also of those that the root lacks."""

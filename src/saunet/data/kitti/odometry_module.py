@@ -31,7 +31,7 @@ class KittiOdometryDataModule(DepthDataModule):
         with_pose: Batches carry the true motion.
         stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
             ``offsets: []`` it is the only one.
-        cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
+        cache: Folder of smaller copies made by ``saunet prepare cache``; training and validation read images from it.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:

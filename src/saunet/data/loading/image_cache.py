@@ -1,4 +1,4 @@
-"""Smaller copies of recordings, decoded in a fraction of the time; made once by ``saunet-prepare cache``.
+"""Smaller copies of recordings, decoded in a fraction of the time; made once by ``saunet prepare cache``.
 
 ``cache.json`` says what all copies have in common; ``frames.json`` of each recording lists its frames with their bytes
 and hashes, and bytes and time of the originals, and is written last, so that a recording without it is not finished.
@@ -62,7 +62,7 @@ class ImageCache:
     """A folder of smaller copies.
 
     Args:
-        folder: The folder that ``saunet-prepare cache`` made.
+        folder: The folder that ``saunet prepare cache`` made.
 
     Raises:
         DataError: if it is not there, not whole, or of another version.
@@ -77,7 +77,7 @@ class ImageCache:
         if plain.get("version") != VERSION:
             raise DataError(
                 f"the cache at {self.folder} has version {plain.get('version')} and this is for {VERSION}; "
-                "delete it and make it again with saunet-prepare cache"
+                "delete it and make it again with saunet prepare cache"
             )
         try:
             self.settings = CacheSettings(**{key: plain[key] for key in CacheSettings.__dataclass_fields__})
@@ -156,7 +156,7 @@ class ImageCache:
         return CachedDrive(drive, self, frames)
 
     def _command(self) -> str:
-        return f"saunet-prepare cache root=... folder={self.folder} (data=... data.root=... where it is not KITTI raw)"
+        return f"saunet prepare cache root=... folder={self.folder} (data=... data.root=... where it is not KITTI raw)"
 
     @staticmethod
     def _json(path: Path) -> dict[str, Any]:
@@ -167,7 +167,7 @@ class ImageCache:
 
 
 def _damaged(path: Path) -> DataError:
-    return DataError(f"{path} is damaged; delete it and run saunet-prepare cache again")
+    return DataError(f"{path} is damaged; delete it and run saunet prepare cache again")
 
 
 class CachedDrive(DriveProxy):

@@ -1,4 +1,4 @@
-"""Which frames a training should leave out: what ``saunet-doctor`` writes and ``data.manifest=`` reads, as JSON."""
+"""Which frames a training should leave out: what ``saunet doctor`` writes and ``data.manifest=`` reads, as JSON."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ class Manifest:
         if len(strange) == len(mine):
             raise DataError(
                 f"{self.path} names {len(mine)} recordings and none of them is trained on ({listed}...); make it with "
-                "saunet-doctor and the data settings of this run, or set data.manifest=null"
+                "saunet doctor and the data settings of this run, or set data.manifest=null"
             )
         rank_zero_warn(
             f"{self.path} names {len(mine)} recordings, and {len(strange)} of them are not trained on ({listed}...); "
-            "if they should be, run saunet-doctor again with the data settings of this run"
+            "if they should be, run saunet doctor again with the data settings of this run"
         )
 
     def apply(self, selection: Selection, offsets: Sequence[int]) -> Selection:
@@ -76,7 +76,7 @@ class Manifest:
             raise DataError(
                 f"{self.path} was made for '{name}' with {self.numbering[name] or 'other settings'} and it is now read "
                 f"with {selection.drive.numbering or 'other settings'}, which counts its frames differently; "
-                "run saunet-doctor again with the settings of this run, or set data.manifest=null"
+                "run saunet doctor again with the settings of this run, or set data.manifest=null"
             )
         kept, left_out = list(selection.frames), dict(selection.left_out)
         for reason, numbers in self.leave_out.get(name, {}).items():
@@ -118,12 +118,12 @@ def read_manifest(path: str | Path) -> Manifest:
     try:
         plain = read_json(path)
     except FileNotFoundError as reason:
-        raise DataError(f"no manifest at {path}; make one with saunet-doctor, or set data.manifest=null") from reason
+        raise DataError(f"no manifest at {path}; make one with saunet doctor, or set data.manifest=null") from reason
     except (OSError, ValueError) as reason:
-        raise DataError(f"{reason}; make it again with saunet-doctor") from reason
+        raise DataError(f"{reason}; make it again with saunet doctor") from reason
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         found = plain.get("format") if isinstance(plain, dict) else type(plain).__name__
-        raise DataError(f"{path} is not a manifest of format {FORMAT} (found {found}); make it with saunet-doctor")
+        raise DataError(f"{path} is not a manifest of format {FORMAT} (found {found}); make it with saunet doctor")
     leave_out, numbered = plain.get("leave_out"), plain.get("numbering", {})
     if not isinstance(leave_out, dict) or not isinstance(numbered, dict) or not all(map(_is_entry, leave_out.values())):
         raise DataError(

@@ -40,7 +40,7 @@ class DepthDataModule(LightningDataModule):
         target_depth: Training batches carry the depth of the target, for losses that use it.
         with_pose: Batches carry the true motion.
         stereo: Training and validation batches carry the stereo view as one more source, which makes depth metric.
-        cache: Folder of smaller copies made by ``saunet-prepare cache``; training and validation read images from it.
+        cache: Folder of smaller copies made by ``saunet prepare cache``; training and validation read images from it.
         **loading: Fields of `LoadOptions`.
 
     Raises:
@@ -55,7 +55,7 @@ class DepthDataModule(LightningDataModule):
     ground_truth: str = "camera_z"
     """What kind of depth evaluation batches carry, as the protocols call it."""
     cacheable: bool = True
-    """Whether ``saunet-prepare cache`` can make copies for it."""
+    """Whether ``saunet prepare cache`` can make copies for it."""
     root: str | None = None
     """Where its files are; None if it reads none."""
 

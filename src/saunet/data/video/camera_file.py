@@ -117,7 +117,7 @@ def read_camera(path: str | Path) -> CameraFile:
         plain = read_yaml(path)
     except FileNotFoundError as reason:
         raise DataError(
-            f"no camera file at {path}; make one with saunet-calibrate, or write one (see docs/your_camera.md)"
+            f"no camera file at {path}; make one with saunet calibrate, or write one (see docs/your_camera.md)"
         ) from reason
     except OSError as reason:
         raise DataError(f"cannot read {path}: {reason.strerror or reason}; check its rights") from reason

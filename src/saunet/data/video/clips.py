@@ -247,7 +247,7 @@ def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraF
             return known[file]
     raise DataError(
         f"no {FILE_NAME} for {path}: put one beside it or at {base / FILE_NAME}, or set data.camera; "
-        "saunet-calibrate makes one (see docs/your_camera.md)"
+        "saunet calibrate makes one (see docs/your_camera.md)"
     )
 
 

@@ -132,7 +132,7 @@ def calibrate(
     output = Path(options.output)
     camera = replace(result.camera, camera_height=options.camera_height, condition=options.condition)
     note = f"from {len(result.views)} views of a {board} in {Path(options.input).name}"
-    write_camera(output, camera, f"saunet-calibrate: {note}")
+    write_camera(output, camera, f"saunet calibrate: {note}")
     picture = output.with_name(f"{output.stem}_check.png")
     write_image(picture, check_picture(result))
     K = camera.K

@@ -301,7 +301,7 @@ def _speed(survey: Survey) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"a core reads {1 / seconds:.0f} images a second; a training step of 12 samples needs 36",
-            f"{'make a cache of small images once (saunet-prepare cache), ' if survey.cacheable else ''}"
+            f"{'make a cache of small images once (saunet prepare cache), ' if survey.cacheable else ''}"
             "use more data.workers or a faster disk",
         )
 

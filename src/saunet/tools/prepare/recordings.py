@@ -57,7 +57,7 @@ def module_recordings(data: DepthDataModule) -> list[tuple[Drive, Sequence[int]]
     """
     if not data.cacheable:
         raise ConfigError(
-            f"{type(data).__name__} reads no copies made by saunet-prepare; use data=kitti, kitti_odometry or video"
+            f"{type(data).__name__} reads no copies made by saunet prepare; use data=kitti, kitti_odometry or video"
         )
     data.prepare_data()
     drives: dict[str, Drive] = {}
