@@ -152,3 +152,13 @@ def test_frames_of_another_size_are_named():
     lens = Lens(camera([]), 200, 320)
     with pytest.raises(DataError, match=r"a.png is 100x50 .* where other frames of its clip are 320x200"):
         lens(np.zeros((50, 100, 3), np.uint8), "a.png")
+
+
+def test_numbers_that_yaml_reads_as_text_are_numbers(tmp_path):
+    camera = read_camera(write(tmp_path, "image_size: [752, 480]\nK: [4.58654e2, 4.57296e2, 3.67e2, 248.4]\n"
+                            "distortion: [-2.83e-01, 7.39e-2, 1e-5, -1E-5]\nfps: 1e1\n"))  # fmt: skip
+    assert camera.K[0, 0] == 458.654
+    assert camera.distortion == (-0.283, 0.0739, 1e-5, -1e-5)
+    assert camera.fps == 10
+    with pytest.raises(DataError, match="finite numbers, got 'many'"):
+        read_camera(write(tmp_path, "image_size: [752, 480]\nK: [many, 457, 367, 248]\n"))

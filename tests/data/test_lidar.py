@@ -84,3 +84,13 @@ def test_broken_scans_are_named(tmp_path):
     (tmp_path / "b.bin").touch()
     with pytest.raises(DataError, match=r"b.bin is empty"):
         read_scan(tmp_path / "b.bin")
+
+
+def test_points_that_are_no_numbers_are_counted_and_said(tmp_path):
+    points = np.array([[10, 0, 0, 0.5], [np.nan, 1, 1, 0.5], [20, np.inf, 1, 0.5]], np.float32)
+    points.tofile(tmp_path / "scan.bin")
+    with pytest.warns(UserWarning, match=r"scan\.bin: 2 of 3 points"):
+        assert read_scan(tmp_path / "scan.bin").tolist() == [[10, 0, 0]]
+    points[1:].tofile(tmp_path / "scan.bin")
+    with pytest.raises(DataError, match=r"scan\.bin contains only points"):
+        read_scan(tmp_path / "scan.bin")

@@ -169,3 +169,40 @@ def test_real_sequence(kitti_mini):
     assert sample["T_src_tgt"][1, 2, 3] == pytest.approx(-1.185, abs=0.02)  # forward in 0.1 s
     assert sample["K"][0, 0] == pytest.approx(707.0912 * 30 / 1226)
     assert torch.equal(sample["frames"][0, 0], sample["frames"][0, 2])
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("3 0 0 0 0 3 0 0 0 0 3 1", "not a rotation"),
+        ("0 0 0 0 0 0 0 0 0 0 0 1", "not a rotation"),
+        ("-1 0 0 0 0 1 0 0 0 0 1 1", "mirrors"),
+    ],
+)
+def test_poses_whose_rotation_is_none_are_refused(root, row, message):
+    (root / "poses" / "09.txt").write_text(f"1 0 0 0 0 1 0 0 0 0 1 0\n{row}\n")
+    with pytest.raises(DataError, match=rf"09\.txt, line 2.*{message}"):
+        OdometrySequence(root, "09")
+
+
+def test_resized_copies_have_a_k_of_their_size_and_cropped_ones_are_refused(root):
+    folder = root / "sequences" / "00"
+    real = "718.856 0 607.1928 45.38 0 718.856 185.2157 -0.11 0 0 1 0.0038"
+    (folder / "calib.txt").write_text(f"P0: {real}\nP2: {real}\n")
+    images = sorted((folder / "image_2").iterdir())
+    for path in images:
+        cv2.imwrite(str(path), np.zeros((188, 620, 3), np.uint8))
+    K = OdometrySequence(root, "00").intrinsics(0)
+    assert K[0, 0] == pytest.approx(718.856 * 620 / 1241)
+    assert K[1, 1] == pytest.approx(718.856 * 188 / 376)
+    assert K[0, 2] == pytest.approx((606.1928 + 0.5) * 620 / 1241 - 0.5)
+    for path in images:
+        cv2.imwrite(str(path), np.zeros((188, 1241, 3), np.uint8))
+    with pytest.raises(DataError, match=r"188x1241 .*calib\.txt is for 376x1241"):
+        OdometrySequence(root, "00")
+
+
+def test_broken_times_are_named_with_their_line(root):
+    (root / "sequences" / "00" / "times.txt").write_text("0.0\n0.1\nnan\n")
+    with pytest.raises(DataError, match=r"times\.txt, line 3: expected seconds"):
+        OdometrySequence(root, "00")

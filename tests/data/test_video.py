@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import shutil
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from clip_tree import CAMERA, frames, make_clip, make_video
 from jaxtyping import TypeCheckError
 
-from saunet.data.video.clips import every, find_clips, read_clip
+from saunet.data.video.clips import every, find_clips, frame_paths, read_clip
 from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 
@@ -292,3 +293,25 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path, on_error):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(DataError, match=r"cannot keep the frames of .*x.avi in .*file.*set data.frames_cache"):
         module(tmp_path / "r", frames_cache=str(tmp_path / "file" / "cache"), on_error=on_error).setup("fit")
+
+
+def test_thumbnails_and_attributes_are_no_clips(tmp_path):
+    make_clip(tmp_path / "r", "clip")
+    make_clip(tmp_path / "r", "clip/@eaDir/000.png")
+    make_clip(tmp_path / "r", "clip/.ipynb_checkpoints")
+    make_clip(tmp_path / "r", "__MACOSX/clip")
+    (tmp_path / "r" / "clip" / "._frame_1.png").write_bytes(b"\0\x05\x16\x07")
+    clips = find_clips(tmp_path / "r")
+    assert [clip.name for clip in clips] == ["clip"]
+    assert len(frame_paths(clips[0].path)) == 10
+
+
+def test_depth_beside_color_is_no_clip(tmp_path):
+    folder = make_clip(tmp_path, "drive/rgb").parent
+    (folder / "depth").mkdir()
+    for index in range(3):
+        cv2.imwrite(str(folder / "depth" / f"{index}.png"), np.full((200, 320), 5000, np.uint16))
+    with pytest.warns(UserWarning, match=r"1 folders .*16-bit images of one channel.*depth"):
+        assert [clip.name for clip in find_clips(tmp_path)] == ["drive/rgb"]
+    shutil.rmtree(folder / "rgb")
+    assert [clip.name for clip in find_clips(tmp_path)] == ["drive/depth"]  # a camera of 16 bits alone is one

@@ -61,6 +61,8 @@ def check_intrinsics(
         )
 
 
+ROTATION_ERROR = 1e-3
+"""Largest difference of R R^T from 1; matrices printed with seven digits, as KITTI's, are within 2e-7."""
 LOOKED_AT = 5
 """Frames whose size is looked at: a broken or odd one among them decides nothing."""
 
@@ -105,3 +107,19 @@ def check_frame(drive: Drive, frame: int, image: NDArray[np.uint8]) -> None:
             f"{what} is {image.shape[1]}x{image.shape[0]} (width x height) where the frames of '{drive.name}' are "
             f"{size[1]}x{size[0]}; frames of a recording share one size"
         )
+
+
+def check_rotation(R: NDArray[np.float64], where: str) -> None:
+    """Check that a 3 x 3 matrix is a rotation: orthonormal within `ROTATION_ERROR`, and not a mirror image.
+
+    Raises:
+        DataError: with ``where`` it comes from and what is wrong with it.
+    """
+    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    if error > ROTATION_ERROR:
+        raise DataError(
+            f"{where} has a matrix that is not a rotation (R R^T differs from 1 by {error:.2g}, determinant "
+            f"{np.linalg.det(R):.3g}); its rows must be orthogonal and of length 1: copy the file again"
+        )
+    if np.linalg.det(R) < 0:
+        raise DataError(f"{where} has a matrix that mirrors (determinant -1) instead of a rotation: swap its axes back")

@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+GAP = 1.5
+"""Steps of time over this many median ones are gaps."""
+
 
 class Drive(ABC):
     """One continuous recording of one camera: what every data set is reduced to before training sees it.
@@ -70,6 +73,18 @@ class Drive(ABC):
             return None
         step = float(np.nanmedian(np.diff(times) / np.diff(numbers)))
         return 1 / step if step > 0 else None
+
+    @property
+    def gaps(self) -> frozenset[int]:
+        """Indices of frames after which time is missing, so that no window may bridge it.
+
+        By default those followed by a step of `timestamps` over `GAP` times the median one.
+        """
+        times = self.timestamps
+        if times is None or len(times) < 3:
+            return frozenset()
+        steps = np.diff(times) / np.diff(self.indices)
+        return frozenset(self.indices[place] for place in np.flatnonzero(steps > GAP * np.nanmedian(steps)).tolist())
 
     def speed(self, index: int) -> float | None:
         """Return the speed of the vehicle in m/s; None if unknown."""
@@ -183,6 +198,10 @@ class DriveProxy(Drive):
     @property
     def fps(self) -> float | None:
         return self._drive.fps
+
+    @property
+    def gaps(self) -> frozenset[int]:
+        return self._drive.gaps
 
     def speed(self, index: int) -> float | None:
         return self._drive.speed(index)

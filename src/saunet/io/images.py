@@ -7,6 +7,7 @@ written whole. There is one reader and one resize, so that a model sees in use w
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,33 @@ def natural_order(name: str | Path) -> tuple[list[tuple[int, int, str]], str]:
     text = str(name)
     parts = [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", text)]
     return parts, text  # frame_1 and frame_01 are equal as numbers
+
+
+def name_times(names: Sequence[str]) -> list[float] | None:
+    """Return the seconds that names of frames (without ending) state; None if they are not time stamps.
+
+    Read are decimal seconds (``12.25``) and, behind the same text in every name, Unix time in seconds, milliseconds,
+    microseconds or nanoseconds (``cam0_1403636579763555584``).
+    """
+    found = [re.fullmatch(r"(.*?)(\d+)(\.\d+)?", name) for name in names]
+    parts = [(match[1], match[2], (match[3] or ".")[1:]) for match in found if match]
+    if len(parts) < max(1, len(names)) or len({prefix for prefix, _, _ in parts}) > 1:
+        return None
+    unix = {len(whole) for _, whole, _ in parts} in ({10}, {13}, {16}, {19})
+    if unix and all("1" <= whole[0] < "2" for _, whole, _ in parts):
+        times = [float(f"{whole[:10]}.{whole[10:]}{decimals}") for _, whole, decimals in parts]
+    elif all(decimals and not prefix for prefix, _, decimals in parts):
+        times = [float(name) for name in names]
+    else:
+        return None
+    return times if len(set(times)) == len(times) else None
+
+
+def frame_order(names: Sequence[str]) -> list[int]:
+    """Return the places of frames in order of time: by the time stamps in their names, else by the numbers in them."""
+    times = name_times([name.rpartition(".")[0] for name in names])
+    keys = [natural_order(name) for name in names] if times is None else times
+    return sorted(range(len(names)), key=keys.__getitem__)
 
 
 def read_bytes(path: str | Path) -> UInt8[np.ndarray, " n"]:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.data.checks import check_intrinsics
+from saunet.data.checks import check_intrinsics, check_rotation
 from saunet.errors import DataError
 
 Array = NDArray[np.float64]
@@ -32,10 +32,11 @@ def read_matrices(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str
 
     Args:
         path: The file.
-        shapes: The keys wanted and their shapes; other keys are not looked at. Keys that the file lacks are absent.
+        shapes: The keys wanted and their shapes (3 x 3 are rotations); other keys are ignored. Keys that the file
+            lacks are absent.
 
     Raises:
-        DataError: if the file cannot be read, or a line is malformed: names file, line and what was expected.
+        DataError: if the file cannot be read, a line is malformed, a key is given twice, or a rotation is none.
     """
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -45,7 +46,7 @@ def read_matrices(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str
         ) from reason
     except OSError as reason:
         raise DataError(f"cannot read calibration {path}: {reason.strerror or reason}") from reason
-    found = {}
+    found: dict[str, Array] = {}
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
@@ -53,7 +54,12 @@ def read_matrices(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str
         if not colon:
             raise DataError(f"{path}, line {number}: expected 'key: numbers', got '{line.strip()[:60]}'")
         if key.strip() in shapes:
-            found[key.strip()] = _numbers(text, shapes[key.strip()], f"{path}, line {number} ({key.strip()})")
+            where = f"{path}, line {number} ({key.strip()})"
+            if key.strip() in found:
+                raise DataError(f"{where}: this key is given twice; delete the wrong line")
+            found[key.strip()] = _numbers(text, shapes[key.strip()], where)
+            if shapes[key.strip()] == (3, 3):
+                check_rotation(found[key.strip()], where)
     return found
 
 

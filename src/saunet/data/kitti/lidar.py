@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Literal
 
@@ -20,12 +21,20 @@ def read_scan(path: Path) -> NDArray[np.float32]:
     """Return the points of a Velodyne scan, n x 3: x forward, y left, z up, in meters.
 
     Raises:
-        DataError: if the file is missing, empty, or not a whole number of points of four 32-bit numbers.
+        DataError: if the file is missing, empty, not a whole number of points of four 32-bit numbers, or no point is
+            finite; some that are not are left out with a warning that counts them.
     """
     data = read_bytes(path)
     if data.size % 16:
         raise DataError(f"{path} has {data.size} bytes, not a multiple of the 16 bytes of a point; copy the file again")
-    return data.view(np.float32).reshape(-1, 4)[:, :3]
+    points = data.view(np.float32).reshape(-1, 4)[:, :3]
+    known = np.isfinite(points).all(axis=1)
+    if not known.any():
+        raise DataError(f"{path} contains only points that are not finite numbers; copy the file again")
+    if not known.all():
+        lost = len(points) - int(known.sum())
+        warnings.warn(f"{path}: {lost} of {len(points)} points are not finite numbers and are left out", stacklevel=2)
+    return points[known]
 
 
 def lidar_depth(

@@ -7,15 +7,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from saunet.data.checks import check_intrinsics, common_size
+from saunet.data.checks import check_intrinsics, check_rotation, common_size
 from saunet.data.drive import Drive
 from saunet.data.kitti.calibration import read_matrices, zero_based
 from saunet.data.kitti.raw import CAMERA_HEIGHT, frame_files
 from saunet.errors import DataError, one_of
+from saunet.geometry.camera import scale_intrinsics
 from saunet.io.images import read_image
 from saunet.io.trajectories import read_kitti
+
+_SIZES = {(607.19, 185.22): (376, 1241), (609.56, 172.85): (375, 1242), (601.89, 183.11): (370, 1226)}
+"""Principal point in the benchmark's calibration files -> (height, width) of its images."""
 
 CAMERAS = {"gray_left": (0, "l"), "gray_right": (1, "r"), "color_left": (2, "l"), "color_right": (3, "r")}
 """Camera name -> its number on disk and its letter in names."""
@@ -58,12 +63,21 @@ class OdometrySequence(Drive):
             raise DataError(f"{folder / 'calib.txt'} lacks {key}; expected a line '{key}: ' with 12 numbers")
         self._K = matrices[key][:, :3]
         _, self._size = common_size([self.path(index) for index in self._indices])
-        check_intrinsics(self._K, *self._size, f"{folder / 'calib.txt'}: {key}")
+        self._native = _native_size(self._K, self._size)
+        if abs(self._size[0] / self._native[0] * self._native[1] / self._size[1] - 1) > 0.02:
+            raise DataError(
+                f"{self._images} has images of {self._size[0]}x{self._size[1]} (height x width) but "
+                f"{folder / 'calib.txt'} is for {self._native[0]}x{self._native[1]}; use the original images or ones "
+                "scaled as a whole"
+            )
+        check_intrinsics(self._K, *self._native, f"{folder / 'calib.txt'}: {key}")
         # P = K [I | t] maps points of camera 0, so t is where camera 0 lies seen from this camera
         self._T_cam_cam0 = np.eye(4)
         self._T_cam_cam0[:3, 3] = np.linalg.solve(self._K, matrices[key][:, 3])
         poses = root / "poses" / f"{sequence}.txt"
         self._poses = read_kitti(poses) if poses.is_file() else None
+        for number, T_world_cam in enumerate(() if self._poses is None else self._poses, 1):
+            check_rotation(T_world_cam[:3, :3], f"{poses}, line {number}")
         self._times = _read_times(folder / "times.txt")
 
     @property
@@ -92,7 +106,8 @@ class OdometrySequence(Drive):
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
         """Return K of this camera, 3 x 3, in pixels counted from zero."""
-        return zero_based(self._K)
+        K = torch.from_numpy(zero_based(self._K))
+        return scale_intrinsics(K, self._size[1] / self._native[1], self._size[0] / self._native[0]).numpy()
 
     def time(self, index: int) -> float | None:
         """Return the seconds at which a frame was taken, by ``times.txt``; None where that is missing or shorter."""
@@ -145,10 +160,27 @@ def sequences(root: Path) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir() if entry.is_dir()) if folder.is_dir() else []
 
 
+def _native_size(K: NDArray[np.float64], size: tuple[int, int]) -> tuple[int, int]:
+    """Return the (height, width) that K belongs to: the benchmark's own, where it is its K, else that of the images."""
+    for (cx, cy), native in _SIZES.items():
+        if abs(K[0, 2] - cx) < 0.05 and abs(K[1, 2] - cy) < 0.05:
+            return native
+    return size
+
+
 def _read_times(path: Path) -> NDArray[np.float64]:
     if not path.is_file():
         return np.empty(0)
-    try:
-        return np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
-    except ValueError as reason:
-        raise DataError(f"{path} holds what is no number ({reason}); expected seconds, one a frame") from reason
+    words = path.read_text(encoding="utf-8", errors="replace").split()
+    times = np.empty(len(words))
+    for number, word in enumerate(words):
+        try:
+            times[number] = float(word)
+        except ValueError:
+            times[number] = np.nan
+        if not np.isfinite(times[number]):
+            raise DataError(
+                f"{path}, line {number + 1}: expected seconds, got the non-numeric value '{word[:40]}'; "
+                "copy the file again"
+            )
+    return times

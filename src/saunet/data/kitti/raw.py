@@ -6,6 +6,7 @@ import functools
 import hashlib
 import os
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -18,7 +19,7 @@ from saunet.data.checks import check_intrinsics, common_size
 from saunet.data.drive import Drive
 from saunet.data.kitti.calibration import KittiCalibration, read_calibration
 from saunet.data.kitti.lidar import lidar_depth, read_scan
-from saunet.data.kitti.oxts import oxts_speed
+from saunet.data.kitti.oxts import oxts_speed, read_timestamps
 from saunet.errors import DataError, one_of
 from saunet.geometry.camera import scale_intrinsics
 from saunet.io.images import read_depth, read_image
@@ -29,8 +30,8 @@ CAMERAS = {"left": (2, "l"), "right": (3, "r")}
 """Camera name -> its number on disk and its letter in names."""
 CAMERA_HEIGHT = 1.65
 """Meters from the road to the cameras."""
-FRAME_SECONDS = 0.1
-"""Time between frames: the scanner turns ten times a second and triggers the cameras."""
+FRAME_SECONDS = 0.1037
+"""Mean time between frames over KITTI's drives, whose own stamps are 0.1031 to 0.1042 s apart."""
 
 PROJECTION = 1
 """Version of the LiDAR projection, part of `KittiDrive.depth_key`; raise it when cached maps become wrong."""
@@ -178,12 +179,38 @@ class KittiDrive(Drive):
         return oxts_speed(record) if record.is_file() else None
 
     def distance(self, first: int, second: int) -> float | None:
-        """Return the meters traveled between two frames: OXTS speed times time; None where a record is missing."""
+        """Return the meters traveled between two frames, by OXTS speeds and time stamps; None if a record is missing.
+
+        Without ``timestamps.txt``, frames are taken to be `FRAME_SECONDS` apart, and a warning says so.
+        """
         passed = range(min(first, second), max(first, second) + 1)
         speeds = [speed for speed in map(self.speed, passed) if speed is not None]
         if len(speeds) != len(passed):
             return None
-        return FRAME_SECONDS * (sum(speeds) - (speeds[0] + speeds[-1]) / 2)  # the trapezoidal rule
+        times = [self.time(index) for index in passed]
+        if None in times:
+            _say_clock_is_missing(self._clock)
+            times = [FRAME_SECONDS * index for index in passed]
+        steps = np.diff(np.array(times, dtype=np.float64))
+        return float(steps @ (np.array(speeds[1:]) + speeds[:-1]) / 2)  # the trapezoidal rule
+
+    def time(self, index: int) -> float | None:
+        """Return when the frame was taken, by ``timestamps.txt``; None where that is missing or shorter."""
+        times = self._times
+        return float(times[index]) if times is not None and 0 <= index < len(times) else None
+
+    @property
+    def fps(self) -> float:
+        """Frames per second by the time stamps; the mean of all drives without them."""
+        return super().fps or 1 / FRAME_SECONDS
+
+    @property
+    def _clock(self) -> Path:
+        return self._folder / f"image_{self.number:02d}" / "timestamps.txt"
+
+    @functools.cached_property
+    def _times(self) -> NDArray[np.float64] | None:
+        return read_timestamps(self._clock)
 
     def stereo(self) -> KittiDrive:
         """Return the other color camera's recording; it has no frames where its images are missing."""
@@ -255,6 +282,11 @@ class KittiRaw:
 
 
 _NO_CALIBRATION = KittiCalibration(Path(), {}, {}, np.eye(3), None)
+
+
+@functools.cache
+def _say_clock_is_missing(path: Path) -> None:
+    warnings.warn(f"{path} is missing, so frames are taken to be {FRAME_SECONDS} s apart, KITTI's mean", stacklevel=3)
 
 
 def _find_drives(root: Path) -> list[Path]:

@@ -7,6 +7,7 @@ their own, as KITTI stores depth (16 bits, 256 steps a unit). ``maps.json`` besi
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -99,9 +100,14 @@ class DepthMaps:
         path = self.home(drive) / INFO
         try:
             info = read_json(path)
-            version, _ = info["version"], float(info["factor"])
+            version, factor = info["version"], float(info["factor"])
         except (OSError, ValueError, KeyError, TypeError) as reason:
             raise DataError(f"{path} is missing or damaged; delete {path.parent} and make its maps again") from reason
+        if not (math.isfinite(factor) and factor > 0):
+            raise DataError(
+                f"{path}: factor is {factor:g}; stored depth is true depth times it, so it must be a positive number: "
+                f"delete {path.parent} and make its maps again"
+            )
         if version != VERSION:
             raise DataError(
                 f"the depth maps in {path.parent} have version {version} and this is for {VERSION}; "

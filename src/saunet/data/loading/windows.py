@@ -6,6 +6,7 @@ A window is usable when the frames at all offsets exist. What is left out is cou
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -67,7 +68,7 @@ class Usage:
 def find_windows(
     selections: Sequence[Selection], offsets: Sequence[int], stereo: bool = False
 ) -> tuple[list[tuple[int, int]], list[Usage]]:
-    """Find the frames whose neighbors at all offsets exist.
+    """Find the frames whose neighbors at all offsets exist, with no gap in time between them.
 
     Args:
         selections: Drives with the frames wanted of each.
@@ -85,6 +86,8 @@ def find_windows(
         drive = selection.drive
         existing = set(drive.indices)
         paired = set(other_view(drive)[0].indices) if stereo else existing
+        gaps = sorted(drive.gaps) if offsets else []
+        first, last = min((0, *offsets)), max((0, *offsets))
         left_out = dict(selection.left_out)
         used = 0
         for frame in selection.frames:
@@ -92,6 +95,8 @@ def find_windows(
                 left_out["missing"] = left_out.get("missing", 0) + 1
             elif any(frame + offset not in existing for offset in offsets):
                 left_out["without neighbor"] = left_out.get("without neighbor", 0) + 1
+            elif bisect_left(gaps, frame + first) != bisect_left(gaps, frame + last):
+                left_out["across a gap in time"] = left_out.get("across a gap in time", 0) + 1
             elif frame not in paired:
                 left_out["without stereo view"] = left_out.get("without stereo view", 0) + 1
             else:

@@ -17,6 +17,7 @@ needed.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,6 +55,7 @@ _SAME_SHAPE = 0.02
 """Relative difference of the two aspect ratios up to which a frame is the calibrated image at another size."""
 
 
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 _LARGEST = 1e300
 """Beyond it a whole number is no float; NaN and infinity are not within it either."""
 
@@ -208,10 +210,18 @@ def _numbers(path: Path, key: str, value: Any, counts: Sequence[int]) -> list[fl
     if not isinstance(value, list) or len(value) not in counts:
         got = f"{len(value)}" if isinstance(value, list) else repr(value)[:40]
         raise DataError(f"{path}: {key} needs a list of {allowed} numbers, got {got}")
+    value = [_as_number(number) for number in value]
     for number in value:
         if isinstance(number, bool) or not isinstance(number, int | float) or not abs(number) <= _LARGEST:
             raise DataError(f"{path}: {key} needs {allowed} finite numbers, got {str(number)[:40]!r} among them")
     return [float(number) for number in value]
+
+
+def _as_number(value: Any) -> Any:
+    """Return text that is a number as one: YAML 1.1 reads ``1e-5`` and ``4.5e2`` as text."""
+    if not isinstance(value, str) or not _NUMBER.fullmatch(value.strip()):
+        return value
+    return float(value)
 
 
 def _positive(path: Path, key: str, value: Any) -> float | None:

@@ -7,21 +7,27 @@ originals are only ever read.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 import os
 import shutil
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from saunet.data.video.camera_file import FILE_NAME, CameraFile, read_camera
 from saunet.errors import DataError
 from saunet.io.atomic import write_json
-from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, natural_order, resize
+from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order, resize
 from saunet.io.plain import read_json
-from saunet.io.video import VIDEO_SUFFIXES, VideoReader
+from saunet.io.video import VIDEO_SUFFIXES, VideoReader, nearest_steps
 
+_NO_CLIPS = frozenset({"@eaDir", "__MACOSX"})
+"""Folders in which other systems keep thumbnails and attributes; names with a dot in front are skipped as well."""
 QUALITY = 95
 """JPEG quality of cached frames."""
 
@@ -60,7 +66,7 @@ class Recording:
     passed_over: int = 0
     """Frames between those taken, which the frame rate asked for does not need."""
     times: tuple[float, ...] | None = None
-    """Seconds of each since the first frame of a video; None if unknown."""
+    """Seconds of each from any fixed origin, by the video or by stamps in the names; None if unknown."""
 
 
 def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]:
@@ -80,6 +86,14 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
     paths = [root] if root.is_file() else sorted(_clip_paths(root), key=natural_order)
     if root.is_file() and root.suffix.lower() not in VIDEO_SUFFIXES:
         raise DataError(f"{root} is neither a folder nor a video; videos end in {' '.join(sorted(VIDEO_SUFFIXES))}")
+    depth = [path for path in paths if path.is_dir() and _is_depth(path)]
+    if 0 < len(depth) < len(paths):
+        paths = [path for path in paths if path not in depth]
+        warnings.warn(
+            f"{len(depth)} folders below {root} contain 16-bit images of one channel, such as {depth[0]}; beside color "
+            "images these are taken for depth, not for clips",
+            stacklevel=2,
+        )
     if not paths:
         raise DataError(f"{root} holds neither folders of images nor videos; put each clip below it")
     base = root.parent if root.is_file() else root
@@ -89,10 +103,11 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
 
 
 def frame_paths(folder: Path) -> list[Path]:
-    """Return the images directly in a folder in natural order: ``frame_2`` before ``frame_10``."""
+    """Return the images directly in a folder in order of time: ``frame_2`` before ``frame_10``, stamps as numbers."""
     with os.scandir(folder) as entries:
         names = [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
-    return [folder / name for name in sorted(names, key=natural_order) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
+    names = [name for name in names if Path(name).suffix.lower() in IMAGE_SUFFIXES]
+    return [folder / names[place] for place in frame_order(names)]
 
 
 def every(recorded: float | None, wanted: float | None) -> Iterator[int]:
@@ -131,9 +146,17 @@ def read_clip(
     """
     if not clip.is_video:
         paths = frame_paths(clip.path)
-        numbers = _below(every(clip.camera.fps, fps), len(paths))
+        stamps = name_times([path.stem for path in paths])
+        rate = clip.camera.fps or _rate(stamps)
+        if stamps is None or fps is None:
+            numbers = _below(every(rate, fps), len(paths))
+        else:
+            numbers = tuple(
+                number for number, _, _ in nearest_steps(zip(range(len(paths)), stamps, paths, strict=False), fps)
+            )
         taken = tuple(paths[number] for number in numbers)
-        return Recording(taken, numbers, clip.camera.fps, passed_over=len(paths) - len(taken))
+        times = None if stamps is None else tuple(stamps[number] for number in numbers)
+        return Recording(taken, numbers, rate, passed_over=len(paths) - len(taken), times=times)
     folder = cache / f"{clip.path.stem[:60]}-{_key(clip.path, fps, max_width)}"
     if not (folder / "clip.json").is_file():
         _decode(clip.path, clip.camera.fps, fps, folder, max_width, advance)
@@ -142,12 +165,19 @@ def read_clip(
         numbers, rate, missing = tuple(facts["numbers"]), facts["fps"], int(facts["missing"])
         times = None if facts["times"] is None else tuple(map(float, facts["times"]))
         count = int(facts["count"])
+        if not numbers or (times is not None and len(times) != len(numbers)):
+            raise ValueError(f"it lists {len(numbers)} frames and {len(times or ())} times")
     except (OSError, ValueError, LookupError, TypeError) as reason:
         raise DataError(f"{folder / 'clip.json'} is damaged ({reason}); delete the folder {folder}") from reason
     paths = frame_paths(folder)
     if len(paths) != len(numbers):
         raise DataError(f"{folder} holds {len(paths)} of {len(numbers)} frames; delete it, so that it is made again")
     return Recording(tuple(paths), numbers, rate, missing, count - len(numbers), times)
+
+
+def _rate(times: Sequence[float] | None) -> float | None:
+    """Return the frames per second of the median step; None if unknown."""
+    return None if times is None or len(times) < 2 else 1 / float(np.median(np.diff(times)))
 
 
 def default_cache() -> Path:
@@ -211,6 +241,15 @@ def _below(numbers: Iterator[int], count: int) -> tuple[int, ...]:
     return tuple(itertools.takewhile(lambda number: number < count, numbers))
 
 
+def _is_depth(folder: Path) -> bool:
+    """Return whether the first image of a folder is a 16-bit PNG of one channel."""
+    for path in frame_paths(folder)[:1]:
+        with contextlib.suppress(OSError), path.open("rb") as stream:
+            head = stream.read(26)
+            return head[:8] == b"\x89PNG\r\n\x1a\n" and tuple(head[24:26]) == (16, 0)
+    return False
+
+
 def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
     """Yield the folders that hold images and the video files, at any depth; a folder once, however linked.
 
@@ -219,7 +258,7 @@ def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
     seen = set() if seen is None else seen
     links: list[Path] = []
     for place, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
+        folders[:] = [name for name in folders if not name.startswith(".") and name not in _NO_CLIPS]
         if os.path.realpath(place) in seen:
             folders.clear()
             continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saunet.data.checks import common_size
-from saunet.data.drive import Drive
+from saunet.data.drive import GAP, Drive
 from saunet.data.video.clips import Clip, Recording
 from saunet.data.video.lens import Lens
 from saunet.data.video.motion import Motion, even_steps
@@ -86,6 +87,26 @@ class ClipDrive(Drive):
     def fps(self) -> float | None:
         """Frames a second of the recording; None where nobody says."""
         return self.recording.fps
+
+    def time(self, index: int) -> float | None:
+        """Return when the frame was taken: as recorded, or by its number where only the frame rate is known."""
+        if self.recording.times is not None:
+            return self.recording.times[self._places[index]]
+        return None if self.fps is None else self.recorded(index) / self.fps
+
+    @functools.cached_property
+    def gaps(self) -> frozenset[int]:
+        """Indices of frames after which the recording lacks frames; the steps between chosen frames are no measure."""
+        times, numbers = self.recording.times, self.recording.numbers
+        if times is None or len(times) < 3:
+            return frozenset()
+        steps = np.diff(times) / np.diff(numbers)
+        lost = np.concatenate([[0], np.cumsum(steps > GAP * np.median(steps))])
+        return frozenset(
+            before
+            for before, after in itertools.pairwise(self._indices)
+            if lost[self._places[before]] != lost[self._places[after]]
+        )
 
     def static(self) -> frozenset[int]:
         """Return the numbers of the frames in which the picture does not move."""

@@ -1,0 +1,119 @@
+"""When frames were taken: stamps of KITTI, of videos and in names; what is measured by them; gaps between them."""
+
+from __future__ import annotations
+
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+from clip_tree import CAMERA, frames, make_clip
+from drives import NumberDrive
+from kitti_tree import make_drive, name
+
+from saunet.data.kitti.oxts import read_timestamps
+from saunet.data.kitti.raw import KittiRaw
+from saunet.data.loading.windows import Selection, find_windows
+from saunet.data.video.clips import find_clips, frame_paths, read_clip
+from saunet.data.video.drive import ClipDrive
+from saunet.errors import DataError
+from saunet.io.images import name_times
+
+
+def kitti(root, steps=(), speed=10.0):
+    """Return a drive whose car goes at 10 m/s and whose frames come after these steps, in seconds."""
+    folder = make_drive(root, 1, scans=False, frames=range(len(steps) + 1) if steps else range(6))
+    (folder / "oxts" / "data").mkdir(parents=True)
+    for index in range(len(steps) + 1 if steps else 6):
+        record = ["0"] * 8 + [str(speed), "0", "0"] + ["0"] * 19
+        (folder / "oxts" / "data" / f"{index:010d}.txt").write_text(" ".join(record))
+    if steps:
+        start = np.datetime64("2011-09-26T13:02:25.964389445", "ns")
+        stamps = start + (1e9 * np.cumsum([0, *steps])).astype("timedelta64[ns]")
+        lines = [str(stamp).replace("T", " ") for stamp in stamps]
+        (folder / "image_02" / "timestamps.txt").write_text("\n".join(lines) + "\n")
+    return KittiRaw(root).drive(name(1))
+
+
+def test_kittis_distance_goes_by_its_own_clock(tmp_path):
+    drive = kitti(tmp_path, [0.1031, 0.1042, 0.1037, 0.1033])
+    assert drive.time(1) - drive.time(0) == pytest.approx(0.1031, abs=1e-6)
+    assert drive.distance(0, 4) == pytest.approx(10 * 0.4143, abs=1e-4)  # 4.0 with the nominal 0.1 s
+    assert drive.distance(3, 1) == pytest.approx(10 * 0.2079, abs=1e-4)
+    assert drive.fps == pytest.approx(1 / 0.1035, rel=1e-3)
+    again = pickle.loads(pickle.dumps(drive))
+    np.testing.assert_array_equal(again.timestamps, drive.timestamps)
+
+
+def test_without_a_clock_the_mean_of_kitti_is_used_and_said(tmp_path):
+    drive = kitti(tmp_path)
+    with pytest.warns(UserWarning, match=r"timestamps\.txt is missing.*0\.1037 s"):
+        assert drive.distance(0, 5) == pytest.approx(10 * 5 * 0.1037)
+    assert drive.timestamps is None
+
+
+@pytest.mark.parametrize("line", ["yesterday", "2011-09-26 25:02:25.9", ""])
+def test_a_broken_clock_is_named_with_its_line(tmp_path, line):
+    (tmp_path / "timestamps.txt").write_text(f"2011-09-26 13:02:25.964389445\n{line}\n2011-09-26 13:02:26.07\n")
+    with pytest.raises(DataError, match=r"timestamps\.txt, line 2: expected a time"):
+        read_timestamps(tmp_path / "timestamps.txt")
+
+
+def test_no_window_bridges_a_gap_in_time():
+    class Timed(NumberDrive):
+        def time(self, index):
+            return 0.1 * index + (0.06 if index > 3 else 0) + (2.0 if index > 5 else 0)
+
+    drive = Timed(indices=range(10))
+    assert drive.gaps == {3, 5}
+    windows, usage = find_windows([Selection(drive, drive.indices)], (-1, 1))
+    assert [frame for _, frame in windows] == [1, 2, 7, 8]
+    assert usage[0].left_out == {"without neighbor": 2, "across a gap in time": 4}
+    assert len(find_windows([Selection(drive, drive.indices)], ())[0]) == 10
+    assert NumberDrive().gaps == frozenset()
+
+
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        (["1403636579.5", "1403636579.55"], [1403636579.5, 1403636579.55]),
+        (["1403636579763555584", "1403636579813555584"], [1403636579.763555584, 1403636579.813555584]),
+        (["cam0_1403636579763555", "cam0_1403636579813555"], [1403636579.763555, 1403636579.813555]),
+        (["1403636579763", "1403636579813"], [1403636579.763, 1403636579.813]),
+        (["0.05", "0.1", "12.35"], [0.05, 0.1, 12.35]),
+        *(([first, second], None) for first, second in (("0000000012", "0000000013"), ("frame_1", "frame_2"))),
+        *(([first, second], None) for first, second in (("1.1", "1.10"), ("2024050312", "2024050313"), ("a", "1"))),
+    ],
+)
+def test_stamps_in_names(names, times):
+    assert name_times(names) == (times if times is None else pytest.approx(times, abs=1e-6))
+
+
+def stamped(root, stamps, camera=CAMERA):
+    root.mkdir()
+    for picture, stamp in zip(frames(len(stamps)), stamps, strict=True):
+        cv2.imwrite(str(root / f"{stamp}.png"), picture)
+    (root / "camera.yaml").write_text(camera)
+    return find_clips(root)[0]
+
+
+def test_frames_are_in_order_of_their_stamps_and_keep_them(tmp_path):
+    stamps = ["1403636579.5", "1403636579.55", "1403636579.6", "1403636579.7", "1403636579.75", "1403636580.75"]
+    clip = stamped(tmp_path / "clip", stamps, CAMERA.replace("fps: 10\n", ""))
+    assert [path.stem for path in frame_paths(clip.path)] == stamps  # by numbers .5 came before .55, .6 before .55
+    recording = read_clip(clip, None, tmp_path, 1280)
+    assert recording.times == tuple(map(float, stamps))
+    drive = ClipDrive(clip, recording)
+    assert drive.time(2) == 1403636579.6
+    assert drive.gaps == {2, 4}
+    chosen = read_clip(clip, 10.0, tmp_path, 1280)
+    assert [round(10 * (time - chosen.times[0])) for time in chosen.times] == [0, 1, 2, 2, 12]
+    assert chosen.passed_over == 1
+
+
+def test_a_rate_in_the_camera_file_gives_times(tmp_path):
+    make_clip(tmp_path, "clip")
+    clip = find_clips(tmp_path)[0]
+    drive = ClipDrive(clip, read_clip(clip, None, tmp_path, 1280))
+    assert drive.time(3) == pytest.approx(0.3)
+    assert drive.gaps == frozenset()
