@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import colorsys
 import pickle
 
 import pytest
@@ -136,3 +137,14 @@ def test_transforms_pickle():
     transform = Augment(H, W)
     again = pickle.loads(pickle.dumps(transform))
     assert torch.equal(transform(batch)["target"], again(batch)["target"])
+
+
+@pytest.mark.parametrize(("drawn", "degrees"), [(0.0, -36), (0.25, -18), (0.75, 18), (1 - 1e-6, 36)])
+def test_hue_turns_by_a_tenth_of_the_circle_at_most(drawn, degrees):
+    batch = frame_batch(b=1)
+    batch["frames"][:] = torch.tensor([200, 60, 60], dtype=torch.uint8)[:, None, None]  # red: hue 0
+    batch["draws"][:] = 0.5
+    batch["draws"][0, 3], batch["draws"][0, 7] = 0.0, drawn
+    red, green, blue = (float(c) for c in Augment(H, W, color_jitter_prob=1.0)(batch)["target"][0, :, 0, 0])
+    hue = colorsys.rgb_to_hsv(red, green, blue)[0] * 360
+    assert (hue + 180) % 360 - 180 == pytest.approx(degrees, abs=1)

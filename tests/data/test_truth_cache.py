@@ -48,7 +48,7 @@ def test_a_frame_without_scan_has_none(drive, tmp_path):
     assert CachedTruth(drive, tmp_path / "cache").depth(2) is None
 
 
-def test_whatever_the_depth_depends_on_changes_the_name(drive, tmp_path):
+def test_whatever_the_depth_depends_on_changes_the_name(drive, tmp_path, monkeypatch):
     cached = CachedTruth(drive, tmp_path / "cache")
     names = {cached.truth_path(0), cached.truth_path(1)}
     drive.depth_kind = "lidar_x"
@@ -58,7 +58,23 @@ def test_whatever_the_depth_depends_on_changes_the_name(drive, tmp_path):
     scan = drive.depth_file(0)
     os.utime(scan, ns=(scan.stat().st_atime_ns, scan.stat().st_mtime_ns + 1))
     names.add(cached.truth_path(0))
-    assert len(names) == 5
+    scan.write_bytes(scan.read_bytes()[:-16])
+    os.utime(scan, ns=(scan.stat().st_atime_ns, 10**18))
+    shorter = cached.truth_path(0)
+    scan.write_bytes(scan.read_bytes()[:-16])
+    os.utime(scan, ns=(scan.stat().st_atime_ns, 10**18))
+    names |= {shorter, cached.truth_path(0)}
+    calibration = drive.calibration
+    moved = {number: P + 1e-9 for number, P in calibration.projections.items()}
+    drive.calibration = dataclasses.replace(calibration, projections=moved)
+    names.add(cached.truth_path(0))
+    drive.calibration = dataclasses.replace(calibration, T_cam_velo=calibration.T_cam_velo + 1e-9)
+    names.add(cached.truth_path(0))
+    monkeypatch.setattr(type(drive), "native_size", (64, 98))
+    names.add(cached.truth_path(0))
+    monkeypatch.setattr("saunet.data.kitti.raw.PROJECTION", 99)
+    names.add(cached.truth_path(0))
+    assert len(names) == 11
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 half", b"junk"])

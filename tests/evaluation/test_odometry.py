@@ -15,6 +15,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from saunet.errors import ConfigError
+from saunet.evaluation import paths
 from saunet.evaluation.paths import (
     STRAIGHT,
     Path3d,
@@ -149,6 +150,18 @@ def test_the_picture_shows_a_path(tmp_path, known):
     assert picture.shape[0] > 400
     blue, green, red = (picture[..., k].astype(int) for k in range(3))
     assert ((red - green > 100) & (red - blue > 100)).sum() > 500  # the predicted path is drawn in red
+
+
+def test_the_title_says_the_root_mean_square_distance(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    drawn = []
+    monkeypatch.setattr(paths, "save", lambda figure, file: drawn.append(figure))
+    path = a_path(40)
+    draw_path(path, tmp_path / "path.png")
+    off = [float(np.linalg.norm((ours - true)[:3, 3])) for ours, true in zip(path.aligned, path.true, strict=True)]
+    expected = sum(each**2 for each in off) / len(off)
+    assert f"{expected**0.5:.2f}" != f"{sum(off) / len(off):.2f}"
+    assert drawn[0].axes[1].get_title() == f"off by {expected**0.5:.2f} m (root mean square)"
 
 
 def table_text(*errors):
