@@ -36,11 +36,14 @@ class Curve(Callback):
 
 def main(folder: Path, processes: int, epochs: int, rank: int | None = None, number: int = signal.SIGTERM) -> None:
     with recording(folder, "curve"):
-        # The mean of the halves' losses is the whole's where all pixels count and no sample sees another: no auto-mask,
-        # no validity mask, no dropout, no batch norm (which is synchronized on GPUs only).
+        # The mean of the halves' losses is the whole's where no sample sees another and nothing is drawn: masks are on,
+        # but no noise decides their ties, no dropout, no batch norm (which is synchronized on GPUs only).
         model = tiny.tiny_model(Recipe(lr=3e-3, schedule="cosine"), dropout=0.0)
         photometric: Any = model.objective.terms["photometric"]
-        photometric.automask, photometric.use_validity = False, False
+        assert photometric.automask
+        assert photometric.use_validity
+        assert photometric.reduction == "masked"
+        photometric.noise = 0.0
         model.depth.encoder[1] = torch.nn.Identity()  # type: ignore[union-attr, index, operator]
         curve = Curve(rank, number)
         watch = [

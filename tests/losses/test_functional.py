@@ -77,6 +77,12 @@ def test_sobel_reference(load: Callable[[str], dict[str, Tensor]]) -> None:
             torch.testing.assert_close(gy, data[f"{prefix}_sobel_y_{name}"], rtol=0, atol=2e-4)
 
 
+def as_one_image(maps: Tensor) -> Tensor:
+    """Stack a batch into one image, with an unknown row (0) between: the reference pools the pixels of the batch."""
+    gap = maps.new_zeros(1, 1, 1, maps.shape[-1])
+    return torch.cat([part for each in maps[:, None] for part in (each, gap)], 2)
+
+
 def test_gradient_loss_reference(load: Callable[[str], dict[str, Tensor]]) -> None:
     data = load("gradient")
     maps, known = (data["prediction"], data["ground_truth"]), data["mask"] == 1
@@ -87,7 +93,8 @@ def test_gradient_loss_reference(load: Callable[[str], dict[str, Tensor]]) -> No
         ("replicate_loss_no_mask", "sobel", "replicate", False),
     }
     for name, operator, padding, masked in expected:
-        loss = gradient_loss(*maps, known if masked else None, operator, padding)
+        given = (*map(as_one_image, maps), as_one_image(known)) if masked else (*maps, None)
+        loss = gradient_loss(*given, operator, padding)
         torch.testing.assert_close(loss.double(), data[name], rtol=0, atol=1e-5)
 
 
@@ -179,8 +186,17 @@ def test_masked_mean_of_nothing_is_zero_with_a_graph() -> None:
 
 
 def test_masked_mean_takes_weights() -> None:
-    values, weights = torch.tensor([1.0, 2.0, 5.0]), torch.tensor([1.0, 3.0, 0.0])
+    values, weights = torch.tensor([[1.0, 2.0, 5.0]]), torch.tensor([[1.0, 3.0, 0.0]])
     torch.testing.assert_close(masked_mean(values, weights), torch.tensor(7 / 4))
+
+
+@pytest.mark.parametrize("parts", [2, 3, 6])
+def test_masked_mean_does_not_depend_on_how_a_batch_is_split(parts: int) -> None:
+    values, mask = double(6, 2, 1, 5, 7), torch.rand(6, 2, 1, 5, 7) > torch.linspace(0, 1, 6).reshape(6, 1, 1, 1, 1)
+    split = [masked_mean(v, m) for v, m in zip(values.chunk(parts), mask.chunk(parts), strict=True)]
+    torch.testing.assert_close(torch.stack(split).mean(), masked_mean(values, mask), rtol=1e-12, atol=0)
+    expected = [float(v[m].mean()) if m.any() else 0.0 for v, m in zip(values, mask, strict=True)]
+    assert float(masked_mean(values, mask)) == pytest.approx(sum(expected) / 6)
 
 
 def test_smoothness_ignores_scale_and_stops_at_edges() -> None:

@@ -24,7 +24,7 @@ def test_velocity_is_the_difference_in_meters() -> None:
     translation = torch.tensor([[[3.0, 0.0, 4.0], [0.0, 0.0, -1.0]], [[0.0, 2.0, 0.0], [9.0, 9.0, 9.0]]])
     poses = pose_matrix(torch.randn(2, 2, 3), translation)
     batch: Any = {"distance": torch.tensor([[4.0, 1.0], [5.0, torch.nan]])}
-    torch.testing.assert_close(Velocity()(batch, EMPTY, poses, ()).value, torch.tensor((1 + 0 + 3) / 3))
+    torch.testing.assert_close(Velocity()(batch, EMPTY, poses, ()).value, torch.tensor(((1 + 0) / 2 + 3) / 2))
 
 
 def test_velocity_takes_true_motion_where_there_is_no_speed() -> None:

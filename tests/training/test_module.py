@@ -217,3 +217,33 @@ def test_parts_that_do_not_fit_are_refused(config: dict[str, Any], walls: DepthD
     walls.height = 90
     with pytest.raises(ConfigError, match="nearest valid size is 96x96"):
         assemble(TrainOptions.from_plain(config), walls)
+
+
+@pytest.mark.parametrize("parts", [2, 4])
+def test_loss_and_gradient_do_not_depend_on_how_a_batch_is_split(parts: int) -> None:
+    """Processes, accumulated passes and validation batches: with masks on, only the images count."""
+    data = tiny.tiny_walls(batch_size=4)
+    data.setup("fit")
+    batch = data.on_after_batch_transfer(next(iter(data.train_dataloader())), 0)
+    model = tiny.tiny_model(dropout=0.0)
+    model.depth.encoder[1] = torch.nn.Identity()  # type: ignore[union-attr, index, operator]
+    model.objective.terms["photometric"].noise = 0.0  # type: ignore[union-attr, assignment]
+
+    def gradients(batches: list[Any]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        model.zero_grad()
+        results = [model.step(each)[-1] for each in batches]
+        loss = torch.stack([result.total for result in results]).mean()
+        loss.backward()
+        kept.extend(result.maps["automask"].mean((1, 2, 3)) for result in results)
+        return loss.detach(), [parameter.grad.clone() for parameter in model.parameters() if parameter.grad is not None]
+
+    kept: list[torch.Tensor] = []
+    pieces = [
+        {key: value[slice(start, start + 4 // parts)] for key, value in batch.items()}
+        for start in range(0, 4, 4 // parts)
+    ]
+    whole, split = gradients([batch]), gradients(pieces)
+    assert kept[0].min() < 0.9 * kept[0].max()  # the masks keep unlike shares of the images
+    torch.testing.assert_close(split[0], whole[0], rtol=1e-6, atol=1e-6)
+    for one, other in zip(split[1], whole[1], strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)

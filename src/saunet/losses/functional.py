@@ -131,14 +131,19 @@ def automask(
 
 
 @full_precision
-def masked_mean(values: Float[Tensor, "*n"], mask: Bool[Tensor, "*#n"] | Float[Tensor, "*#n"]) -> Float[Tensor, ""]:
-    """``sum(values * mask) / max(sum(mask), 1)``: the mean under a mask or weights; 0 if that is empty.
+def masked_mean(
+    values: Float[Tensor, " b *n"], mask: Bool[Tensor, " b *#n"] | Float[Tensor, " b *#n"]
+) -> Float[Tensor, ""]:
+    """Mean over the images of each image's ``sum(values * mask) / max(sum(mask), 1)``; 0 with a graph for empty masks.
 
-    Values may be NaN or infinite where the mask is 0; an empty mask keeps the graph.
+    An image counts as one whatever its mask keeps, so a batch may be split over processes or passes in any way: the
+    loss is the mean of the parts' losses. One mean over all kept pixels would depend on the split. Values may be
+    anything, even NaN, where the mask is 0.
     """
-    mask = mask.expand_as(values)
-    total = torch.where(mask != 0, values, 0.0).mul(mask).sum()
-    return total / mask.sum().clamp(min=1)
+    mask = mask.expand_as(values).flatten(1)
+    values = values.flatten(1)
+    totals = torch.where(mask != 0, values, 0.0).mul(mask).sum(1)
+    return (totals / mask.sum(1).clamp(min=1)).mean()
 
 
 @full_precision
