@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,14 @@ import tiny
 import torch
 from lightning import Callback
 
+from saunet.data.windows import Selection
 from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
+from saunet.registry import objectives
+from saunet.runs.folder import RunRecord
 from saunet.training.health import HealthMonitor, health, holes
 from saunet.training.loading import LoaderMonitor, Loading, sentence
+from saunet.training.optim import Recipe
 from saunet.types import DepthPyramid, LossTerms
 
 
@@ -56,6 +61,10 @@ def test_the_figures_of_a_step() -> None:
         ("holes", 0.2, "20.0% of the pixels are holes"),
         ("automask", 0.01, "only 1.0% of the pixels teach"),
         ("translation", 1e-9, "the pose network has collapsed"),
+        ("rotation", 1.0, "turns by 1.00 rad"),
+        ("automask", 1.0, "drops no pixel (100.00% teach)"),
+        ("loss", 1e-6, "the loss is nearly zero (1.0e-06)"),
+        ("disparity_spread", float("nan"), "is not a number"),
     ],
 )
 def test_each_sickness_is_said_once(figure: str, value: float, words: str) -> None:
@@ -81,6 +90,93 @@ def test_the_figures_are_logged_while_training(tmp_path: Path) -> None:
     trainer.fit(tiny.tiny_model(), tiny.tiny_walls())
     names = {"disparity_spread", "holes", "automask", "translation", "rotation"}
     assert {f"health/{name}" for name in names} <= trainer.callback_metrics.keys()
+
+
+def test_small_rotations_are_measured() -> None:
+    poses = pose_matrix(torch.tensor([[[0, 1e-5, 0]]]), torch.zeros(1, 1, 3))
+    terms = LossTerms(torch.tensor(1.0), {}, {})
+    figures = health(pyramid(torch.rand(1, 1, 4, 4) + 0.1), poses, terms, 100.0)
+    assert float(figures["rotation"]) == pytest.approx(1e-5, rel=1e-3)
+
+
+class Doubled(tiny.Wall):
+    """A wall whose frames are all the same: nothing moves."""
+
+    def image(self, index: int) -> Any:
+        return super().image(0)
+
+
+class DoubledWalls(tiny.TinyWalls):
+    def select(self, split: str) -> Any:
+        return [Selection(Doubled(f"{split} 1"), range(8))]
+
+
+class Holed(tiny.TinyDepth):
+    """Depth with a hole at the far limit below something near."""
+
+    def forward(self, image: torch.Tensor) -> DepthPyramid:
+        near = super().forward(image)
+        disparity = near.disparity[0].clone()
+        disparity[..., 16:, 8:40] = 0.01  # of a limit of 100
+        return DepthPyramid(near.sigmoid, (disparity,), (1 / disparity,))
+
+
+def flat(model: Any) -> None:
+    torch.nn.init.zeros_(model.depth.decoder.weight)
+
+
+def frozen(model: Any) -> None:
+    torch.nn.init.zeros_(model.pose.layer.weight)
+    torch.nn.init.zeros_(model.pose.layer.bias)
+
+
+def turning(model: Any) -> None:
+    torch.nn.init.constant_(model.pose.layer.bias, 100.0)
+
+
+def holed(model: Any) -> None:
+    model.depth = Holed()
+
+
+def photometric_alone(model: Any) -> None:
+    model.objective = objectives.build("saunet", beta=0.0)
+
+
+@pytest.mark.parametrize(
+    ("sicken", "data", "freeze", "figures"),
+    [
+        (flat, tiny.TinyWalls, ["depth.decoder"], {"disparity_spread"}),
+        (frozen, tiny.TinyWalls, ["pose"], {"translation"}),
+        (turning, tiny.TinyWalls, ["pose"], {"rotation"}),
+        (holed, tiny.TinyWalls, [], {"holes"}),
+        (photometric_alone, DoubledWalls, [], {"automask", "loss"}),
+    ],
+    ids=["flat", "frozen pose", "turning pose", "holes", "doubled frames"],
+)
+def test_a_training_that_is_really_sick_says_so_in_its_record(
+    sicken: Any, data: Any, freeze: list[str], figures: set[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = tiny.tiny_model(Recipe(lr=1e-3, freeze=freeze))
+    sicken(model)
+    model.run_record = RunRecord(tmp_path, "sick")
+    model.run_record.start()
+    monitor = HealthMonitor(every_n_steps=1, after=2)
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=3, limit_val_batches=0, callbacks=[monitor], log_every_n_steps=1)
+    with caplog.at_level("INFO"):
+        trainer.fit(model, data(height=32, width=48, batch_size=2, workers=0))
+    found = json.loads((tmp_path / "run.json").read_text())["health"]
+    assert figures <= found.keys()
+    assert all(sentence in caplog.text for sentence in found.values())
+
+
+def test_a_healthy_training_has_no_marks(tmp_path: Path) -> None:
+    model = tiny.tiny_model(Recipe(lr=1e-3))
+    model.run_record = RunRecord(tmp_path, "well")
+    model.run_record.start()
+    monitor = HealthMonitor(every_n_steps=1, after=1, automask=0.0)  # fresh networks are masked
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=2, limit_val_batches=0, callbacks=[monitor], log_every_n_steps=1)
+    trainer.fit(model, tiny.tiny_walls())
+    assert json.loads((tmp_path / "run.json").read_text())["health"] == {}
 
 
 def test_thresholds_are_checked() -> None:

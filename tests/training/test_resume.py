@@ -20,8 +20,9 @@ from saunet.registry import poses
 from saunet.runs.folder import Stopped
 from saunet.training.callbacks import LastCheckpoint
 from saunet.training.optim import Recipe
-from saunet.training.resume import changes, resume_path, warm_start
+from saunet.training.resume import changes, check_resume, resume_path, warm_start
 from saunet.training.stopping import GracefulStop
+from saunet.training.tool import TrainOptions, assemble
 
 EPOCHS = 3
 BATCHES = 18  # twelve windows in batches of two, three epochs; two batches a step
@@ -90,6 +91,57 @@ def test_asked_to_stop_it_saves_and_says_how_to_go_on(batch: int, whole: Path, t
     same(whole, tmp_path)
 
 
+@pytest.mark.parametrize("name", ["SIGHUP", "SIGUSR1"])
+def test_a_closed_terminal_and_a_batch_systems_warning_stop_it_too(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SLURM_JOB_ID", "1")  # SIGUSR1 is a warning there only
+    number = signal.Signals[name]
+    before = signal.signal(number, signal.SIG_DFL)
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=2, callbacks=[Ask(2, number), GracefulStop(str(tmp_path))])
+    try:
+        with pytest.raises(Stopped, match=rf"stopped by {name} after step 2") as stop:
+            trainer.fit(tiny.tiny_model(), tiny.tiny_walls())
+    finally:
+        assert signal.signal(number, before) == signal.SIG_DFL
+    assert stop.value.code == 128 + number
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == 2
+
+
+def test_a_training_under_nohup_outlives_its_terminal(tmp_path: Path) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=1, callbacks=[Ask(1, signal.SIGHUP), GracefulStop(str(tmp_path))])
+    try:
+        trainer.fit(tiny.tiny_model(), tiny.tiny_walls())
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert trainer.global_step == 3
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda stored: stored.pop("loops"), "no loop state"),
+        (lambda stored: stored.pop("optimizer_states"), "no optimizer state"),
+        (lambda stored: stored["optimizer_states"][0]["state"].clear(), r"no optimizer state \(it is empty\)"),
+        (lambda stored: [stored.pop(key) for key in ("loops", "optimizer_states", "lr_schedulers")], "weights only"),
+    ],
+)
+def test_what_lacks_the_state_of_a_training_is_not_resumed(
+    spoil: Any, words: str, config: dict[str, Any], walls: Any, tmp_path: Path
+) -> None:
+    few = {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 0}
+    model = assemble(TrainOptions.from_plain(config), walls)
+    tiny.tiny_trainer(tmp_path, **few, callbacks=[LastCheckpoint(str(tmp_path))]).fit(model, walls)
+    last = tmp_path / "last.ckpt"
+    assert check_resume(model, str(last), walls) == 1
+    stored = torch.load(last, weights_only=True)
+    spoil(stored)
+    torch.save(stored, last)
+    with pytest.raises(CheckpointError, match=rf"{words}.*init_from="):
+        check_resume(model, str(last), walls)
+
+
 def test_a_second_interrupt_ends_at_once(tmp_path: Path) -> None:
     stop = GracefulStop(str(tmp_path))
     stop._receive(signal.SIGINT, None)
@@ -134,7 +186,6 @@ def test_where_a_run_resumes_from(tmp_path: Path) -> None:
 
 def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Path, config: Any, walls: Any) -> None:
     from saunet.runs.checkpoint import atomic_save
-    from saunet.training.tool import TrainOptions, assemble
 
     with torch.no_grad():
         next(model.depth.parameters()).fill_(0.5)
@@ -244,8 +295,6 @@ def test_changed_networks_and_objectives_are_named(model: Any) -> None:
 def test_a_changed_objective_is_not_kept_in_silence(
     config: dict[str, Any], walls: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from saunet.training.tool import TrainOptions, assemble
-
     few = {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 0}
     first = tiny.tiny_trainer(tmp_path, **few, callbacks=[LastCheckpoint(str(tmp_path))])
     first.fit(assemble(TrainOptions.from_plain(config), walls), walls)

@@ -206,7 +206,7 @@ def training_panel(
         tiles[f"warped neighbor{tag}"] = _rgb(views[0].image[row, 0])
         for name, values in terms.maps.items():
             shown = _array(values[row, 0].float())
-            top = max(float(shown.max()), 1e-6) if name != "automask" else 1.0
+            top = max(float(shown.max()), 1e-6) if name not in ("automask", "visible") else 1.0
             tiles[f"{name.replace('_', ' ')}{tag}"] = colorize(shown, (0.0, top), "gray")
     return panel(tiles, columns=len(tiles) // count, tile_width=320)
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_info
@@ -54,23 +56,40 @@ def holes(far: Bool[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
 
 @full_precision
 def _motion(T: Float[Tensor, "b s 4 4"]) -> dict[str, Tensor]:
-    trace = T[..., 0, 0] + T[..., 1, 1] + T[..., 2, 2]
-    angle = ((trace - 1) / 2).clamp(-1, 1).acos()
+    R = T[..., :3, :3]
+    skew = R - R.transpose(-1, -2)
+    sine = torch.stack((skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]), -1).norm(dim=-1) / 2
+    cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    angle = torch.atan2(sine, cosine)  # acos of float32 reads 0 below 2e-4
     return {"translation": T[..., :3, 3].norm(dim=-1).mean(), "rotation": angle.mean()}
 
 
-class HealthMonitor(Callback):
-    """Say in one sentence when depth collapses, holes open, hardly a pixel teaches, or the camera seems not to move.
+@dataclass(frozen=True)
+class Limit:
+    """When a figure is sick, and what to say then; ``{}`` in the sentence is the figure."""
 
-    The figures are in the log as ``health/...`` all the time. Each sentence is said once a run.
+    least: float
+    most: float
+    below: str
+    above: str = ""
+
+
+class HealthMonitor(Callback):
+    """Say in one sentence when depth collapses, holes open, the mask or the pose network fails, or the loss is nothing.
+
+    The figures are in the log as ``health/...`` all the time. Each sentence is said once a run, and stands in
+    ``run.json`` under ``health``.
 
     Args:
-        every_n_steps: How often the figures are looked at.
+        every_n_steps: How often the figures are looked at, and once more at the end of the training.
         after: Step from which on they are; fresh networks may look strange.
         spread: Smallest healthy ``disparity_spread``.
-        holes: Largest healthy share of holes.
-        automask: Smallest healthy share of pixels that teach.
+        holes: Largest healthy fraction of holes.
+        automask: Smallest healthy fraction of pixels that teach.
         translation: Smallest healthy length of motion.
+        unmasked: Largest healthy fraction of pixels that teach, where there is a mask.
+        rotation: Largest healthy rotation between frames, radians.
+        loss: Smallest healthy loss.
     """
 
     def __init__(
@@ -81,51 +100,94 @@ class HealthMonitor(Callback):
         holes: float = 0.05,
         automask: float = 0.05,
         translation: float = 1e-5,
+        unmasked: float = 0.9999,
+        rotation: float = 0.5,
+        loss: float = 1e-4,
     ) -> None:
         self.every_n_steps = int(positive("every_n_steps", every_n_steps))
         self.after = int(positive("after", after, allow_zero=True))
-        self.least = {
-            "disparity_spread": positive("spread", spread, allow_zero=True),
-            "automask": in_range("automask", automask, 0, 1),
-            "translation": positive("translation", translation, allow_zero=True),
+        spread, translation = (
+            positive(name, value, allow_zero=True) for name, value in (("spread", spread), ("translation", translation))
+        )
+        loss, rotation = positive("loss", loss, allow_zero=True), positive("rotation", rotation)
+        holes, automask = in_range("holes", holes, 0, 1), in_range("automask", automask, 0, 1)
+        self.limits = {
+            "disparity_spread": Limit(spread, math.inf, _FLAT),
+            "holes": Limit(-math.inf, holes, "", _HOLES),
+            "automask": Limit(automask, in_range("unmasked", unmasked, 0, 1), _MASKED, _UNMASKED),
+            "translation": Limit(translation, math.inf, _FROZEN),
+            "rotation": Limit(-math.inf, rotation, "", _TURNING),
+            "loss": Limit(loss, math.inf, _NOTHING),
         }
-        self.most = {"holes": in_range("holes", holes, 0, 1)}
-        self._said: set[str] = set()
+        self.found: dict[str, str] = {}
+        """What was sick so far: the sentence by the figure's name."""
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         """Look at the figures now and then."""
-        step = trainer.global_step
-        if step < self.after or step % self.every_n_steps or not trainer.is_global_zero:
+        if trainer.global_step >= self.after and trainer.global_step % self.every_n_steps == 0:
+            self._look(trainer, pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Look at a short training too, unless its networks are still fresh."""
+        if trainer.global_step >= min(self.after, self.every_n_steps):
+            self._look(trainer, pl_module)
+
+    def _look(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.is_global_zero:
             return
-        names = [name for name in (*self.least, *self.most) if f"health/{name}" in trainer.callback_metrics]
-        for said in self.judge({name: float(trainer.callback_metrics[f"health/{name}"]) for name in names}):
-            rank_zero_info(f"step {step}: {said}")
+        logged = {**{f"health/{name}": name for name in self.limits}, "train/loss": "loss"}
+        metrics = trainer.callback_metrics
+        said = self.judge({name: float(metrics[key]) for key, name in logged.items() if key in metrics})
+        for sentence in said:
+            rank_zero_info(f"step {trainer.global_step}: {sentence}")
+        record = getattr(pl_module, "run_record", None)
+        if said and record is not None:
+            record.write(health=self.found)
 
     def judge(self, figures: Mapping[str, float]) -> list[str]:
-        """Return a sentence for each figure that is outside its healthy range for the first time.
+        """Return a sentence for each figure that is outside its healthy range for the first time."""
+        said = {}
+        for name, value in figures.items():
+            limit = self.limits.get(name)
+            if limit is None or name in self.found:
+                continue
+            if math.isnan(value):
+                said[name] = f"{name} is not a number, so the training is broken; lower optim.lr and start again"
+            elif value < limit.least:
+                said[name] = limit.below.format(value)
+            elif value > limit.most:
+                said[name] = limit.above.format(value)
+        self.found.update(said)
+        return list(said.values())
 
-        Args:
-            figures: Figures of `health`, by name.
-        """
-        sick = [
-            name
-            for name, value in figures.items()
-            if name not in self._said
-            and (value < self.least.get(name, -math.inf) or value > self.most.get(name, math.inf))
-        ]
-        self._said.update(sick)
-        return [_SENTENCES[name].format(figures[name]) for name in sick]
 
-
-_SENTENCES = {
-    "disparity_spread": "disparity is nearly flat (it varies by {:.2%} of its mean), so depth has collapsed; lower "
-    "optim.lr, check data.offsets and the intrinsics, or start from public weights",
-    "holes": "{:.1%} of the pixels are holes at the far limit inside the picture, as cars driving along leave them; "
-    "leave frames out in which the camera stands still, and use objective.photometric.automask=true",
-    "automask": "only {:.1%} of the pixels teach (auto-mask): the camera stands still in most frames, or exposure "
-    "jumps between them; leave static frames out, or use larger data.offsets",
-    "translation": "the predicted motion is nearly zero ({:.1e}), so the pose network has collapsed; lower optim.lr, "
-    "or leave static frames out",
-}
+_FLAT = (
+    "disparity is nearly flat (it varies by {:.2%} of its mean), so depth has collapsed; lower optim.lr, check "
+    "data.offsets and the intrinsics, or start from public weights"
+)
+_HOLES = (
+    "{:.1%} of the pixels are holes at the far limit inside the picture, as cars driving along leave them; leave out "
+    "frames in which the camera stands still, and use objective.photometric.automask=true"
+)
+_MASKED = (
+    "only {:.1%} of the pixels teach (auto-mask): the camera stands still in most frames, or exposure jumps between "
+    "them; leave static frames out, or use larger data.offsets"
+)
+_UNMASKED = (
+    "the auto-mask drops no pixel ({:.2%} teach), so even the wrong depth explains the frames better than no motion: "
+    "the sources may not be neighbors of the target; check data.offsets and the order of the frames"
+)
+_FROZEN = (
+    "the predicted motion is nearly zero ({:.1e}), so the pose network has collapsed; lower optim.lr, or leave static "
+    "frames out"
+)
+_TURNING = (
+    "the predicted camera turns by {:.2f} rad between frames, which no vehicle does, so the pose network has "
+    "diverged; lower optim.lr, or check that neighboring frames follow each other"
+)
+_NOTHING = (
+    "the loss is nearly zero ({:.1e}), so there is nothing to learn: target and sources are the same picture; leave "
+    "static and doubled frames out (data.static=drop)"
+)

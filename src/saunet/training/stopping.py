@@ -30,7 +30,7 @@ def way_on(folder: str | Path) -> str:
 
 
 class GracefulStop(Callback):
-    """On SIGTERM, Ctrl-C, or a batch system's SIGUSR1: finish the step, save ``last.ckpt``, end with a message.
+    """On SIGTERM, SIGHUP, Ctrl-C, or a batch system's SIGUSR1: finish the step, save ``last.ckpt``, end with a message.
 
     All processes of a run stop after the same step, whichever of them was asked. A second Ctrl-C ends at once. A
     validation that is under way or due is finished first, and so is an epoch after its last step: a training that has
@@ -54,6 +54,8 @@ class GracefulStop(Callback):
         if threading.current_thread() is not threading.main_thread():
             return
         wanted = [signal.SIGTERM, signal.SIGINT]
+        if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup sets it
+            wanted.append(signal.SIGHUP)
         if "SLURM_JOB_ID" in os.environ and hasattr(signal, "SIGUSR1"):
             wanted.append(signal.SIGUSR1)
         self._before = {number: signal.signal(number, self._receive) for number in wanted}
@@ -119,7 +121,12 @@ class GracefulStop(Callback):
         if self.received == signal.SIGINT == number:
             raise KeyboardInterrupt
         self.received = number
-        print(f"\n{signal.Signals(number).name}: finishing the step, then saving", file=sys.stderr, flush=True)
+        try:
+            print(f"\n{signal.Signals(number).name}: finishing the step, then saving", file=sys.stderr, flush=True)
+        except OSError:  # the terminal is gone: whatever writes there, such as the bar, must not fail before the saving
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for stream in (1, 2):
+                os.dup2(nowhere, stream)
 
     def _restore(self) -> None:
         before, self._before = self._before, {}
@@ -131,6 +138,9 @@ class ProcessWatch(Callback):
     """End the whole run with one sentence when one of its processes dies, instead of waiting for it for ever.
 
     For runs whose processes the trainer starts (``trainer=ddp``); torchrun and SLURM look after theirs themselves.
+    Torchrun's own watch is no replacement there: it starts the processes itself, gives the others 30 s after a SIGTERM
+    that a process inside a collective call cannot follow, and leaves ``run.json`` at "running". Lightning's kills all
+    processes, this one included, without a word.
 
     Args:
         folder: The run's folder, whose record is told.

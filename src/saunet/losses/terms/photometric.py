@@ -61,7 +61,7 @@ class Photometric(Term):
         poses: Float[Tensor, "b s 4 4"],
         views: Sequence[View],
     ) -> TermResult:
-        """Return the mean over scales, with the maps ``photometric_error`` and ``automask`` of scale 0."""
+        """Return the mean over scales; maps of scale 0: ``photometric_error``, ``automask`` or without it ``visible``."""
         target = batch["loss_target"][:, None]
         identity = self._identity(batch["loss_sources"], target) if self.automask else None
         values: list[Tensor] = []
@@ -72,7 +72,8 @@ class Photometric(Term):
             value, mask = self._reduce(error, known, identity)
             values.append(value)
             if not maps:
-                maps = {"photometric_error": error.detach(), "automask": mask.to(error.dtype)}
+                kind = "automask" if self.automask else "visible"
+                maps = {"photometric_error": error.detach(), kind: mask.to(error.dtype)}
         return TermResult(value=torch.stack(values).mean(), maps=maps)
 
     @torch.no_grad()
