@@ -61,7 +61,7 @@ class Photometric(Term):
         poses: Float[Tensor, "b s 4 4"],
         views: Sequence[View],
     ) -> TermResult:
-        """Return the mean over scales; maps of scale 0: ``photometric_error``, ``automask`` (``visible`` without one)."""
+        """Return the mean over scales; maps: ``photometric_error``, and ``automask`` or, without one, ``visible``."""
         target = batch["loss_target"][:, None]
         identity = self._identity(batch["loss_sources"], target) if self.automask else None
         values: list[Tensor] = []
