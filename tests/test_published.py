@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.published import published
-from saunet.tools.benchmark.report import PAPER_METHODS
+from saunet.tools.benchmark.tool import PAPER_METHODS
 
 
 def test_the_papers_numbers_are_the_papers() -> None:

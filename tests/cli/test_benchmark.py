@@ -54,7 +54,7 @@ def test_a_changed_model_does_not_go_by_the_papers_name(tool: Tool, tmp_path: Pa
 
 def test_accuracy_of_a_changed_model_may_be_given(tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[dict[str, float]] = []
-    monkeypatch.setattr("saunet.tools.benchmark.report.draw_figure", lambda rows, path, given: drawn.append(given))
+    monkeypatch.setattr("saunet.tools.benchmark.tool.draw_figure", lambda rows, path, given: drawn.append(given))
     change = ("model/encoder=resnet18", "model/decoder=unet", "figure=true")
     assert tool("benchmark", *change, "+abs_rel.sau_net=0.2", *QUICK, f"hydra.run.dir={tmp_path}").code == 0
     assert drawn[0]["sau_net (changed)"] == 0.2

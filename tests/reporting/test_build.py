@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import re
-import sys
 from pathlib import Path
 
 import cv2
@@ -16,13 +15,13 @@ from made_runs import ERRORS, add_checkpoint, make_evaluation, make_run
 from rich.console import Console
 
 from saunet.errors import ConfigError, DataError
-from saunet.reporting import Options, build, collect, write
-from saunet.reporting.compare import print_comparison
-from saunet.reporting.document import Column, Document, Row, Section, Table
-from saunet.reporting.markdown import as_markdown, table_csv
-from saunet.reporting.models import Seen, look
-from saunet.reporting.page import as_html
+from saunet.reporting import ReportOptions, collect, report
+from saunet.reporting.compare import compared
+from saunet.reporting.page import Document, Section, as_html, as_markdown, write
+from saunet.reporting.scenes import Seen, look
 from saunet.reporting.speed import speed
+from saunet.reporting.tool import build
+from saunet.tables import Column, Row, Table, show
 
 
 @pytest.fixture
@@ -53,7 +52,7 @@ def _state(file: Path) -> dict[str, object]:
 
 
 def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path: Path) -> None:
-    options = Options(scenes={"kitti": str(picture), "campus_sunny": [str(picture)]})
+    options = ReportOptions(scenes={"kitti": str(picture), "campus_sunny": [str(picture)]})
     document = build(collect(everything), options)
     files = write(document, tmp_path / "report")
     page = files["report.html"].read_text()
@@ -79,7 +78,7 @@ def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path:
         "figures/sweep_alpha_beta_ratio.svg",
     } <= files.keys()
     rows = list(csv.DictReader(io.StringIO(files["tables/figure10.csv"].read_text())))
-    assert [(row["Method"], row["ms an image"]) for row in rows] == [("Mono R18", "2.8"), ("run", "10.0")]
+    assert [(row["Method"], row["ms per image"]) for row in rows] == [("Mono R18", "2.8"), ("run", "10.0")]
     methods = [row["Method"] for row in csv.DictReader(io.StringIO(files["tables/table1.csv"].read_text()))]
     assert not any(method.startswith("α/β") for method in methods)
     missing = {one.what: one.why for one in document.missing}
@@ -92,7 +91,7 @@ def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path:
 
 
 def test_the_page_fetches_nothing(everything: list[Path], picture: Path) -> None:
-    page = as_html(build(collect(everything), Options(scenes={"kitti": str(picture)})))
+    page = as_html(build(collect(everything), ReportOptions(scenes={"kitti": str(picture)})))
     links = re.findall(r"""(?<![-\w])(?:src|href)=["']?([^"'\s>]+)""", page)
     assert links
     assert all(link.startswith(("data:", "#")) for link in links)
@@ -105,7 +104,7 @@ def test_the_page_fetches_nothing(everything: list[Path], picture: Path) -> None
 def test_losses_side_by_side_are_figure_7(sweep: Path, picture: Path) -> None:
     for job in (0, 2):
         add_checkpoint(sweep / str(job))
-    document = build(collect([sweep]), Options(scenes={"kitti": str(picture)}, figures=False))
+    document = build(collect([sweep]), ReportOptions(scenes={"kitti": str(picture)}, figures=False))
     titles = [block.title for section in document.sections for block in section.blocks]
     assert "Fig. 7. Loss functions side by side: kitti" in titles
     missing = {one.what: one.why for one in document.missing}
@@ -120,19 +119,22 @@ def test_what_has_no_data_is_listed(tmp_path: Path) -> None:
     assert "Fig. 4, loss of runs" in what
 
 
-def test_without_matplotlib_there_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    inputs = collect([make_run(tmp_path / "a")])
-    with pytest.raises(ConfigError, match=r"need matplotlib; run `pip install 'saunet\[plot\]'` or set figures=false"):
-        build(inputs)
-    assert build(inputs, Options(figures=False)).sections
+def test_without_matplotlib_the_page_has_no_drawings_and_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("saunet.reporting.tool.find_spec", lambda name: None)
+    result = report(ReportOptions(runs=(str(make_run(tmp_path / "a")),), output_dir=str(tmp_path / "page")))
+    (told,) = (sentence for sentence in result.left_out if sentence.startswith("Figs. 4, 5 and 10: "))
+    assert "pip install 'saunet[plot]'" in told
+    assert (tmp_path / "page" / "report.html").is_file()
+    assert not list((tmp_path / "page").rglob("*.svg"))
 
 
 def test_a_damaged_checkpoint_costs_its_pictures_only(tmp_path: Path, picture: Path) -> None:
     folder = make_run(tmp_path / "a")
     (folder / "checkpoints").mkdir()
     (folder / "checkpoints" / "best.ckpt").write_bytes(b"PK broken")
-    document = build(collect([folder]), Options(scenes={"kitti": str(picture)}))
+    document = build(collect([folder]), ReportOptions(scenes={"kitti": str(picture)}))
     why = {one.what: one.why for one in document.missing}
     assert "damaged" in why["Size and pictures of a"]
     assert any(row.kind == "measured" for row in document.tables[0].rows)
@@ -142,14 +144,14 @@ def test_a_damaged_checkpoint_costs_its_pictures_only(tmp_path: Path, picture: P
 def test_labels_must_fit(tmp_path: Path, names: tuple[str, ...], words: str) -> None:
     inputs = collect([make_run(tmp_path / name) for name in "ab"])
     with pytest.raises(ConfigError, match=words):
-        build(inputs, Options(labels=names, figures=False))
+        build(inputs, ReportOptions(labels=names, figures=False))
 
 
 def test_a_foreign_json_is_no_benchmark(tmp_path: Path) -> None:
     (tmp_path / "benchmark.json").write_text("{}")
     make_run(tmp_path / "a")
     with pytest.raises(DataError, match="not a result of saunet benchmark"):
-        build(collect([tmp_path / "a", tmp_path / "benchmark.json"]), Options(figures=False))
+        build(collect([tmp_path / "a", tmp_path / "benchmark.json"]), ReportOptions(figures=False))
 
 
 def test_names_from_outside_cannot_become_markup() -> None:
@@ -160,16 +162,11 @@ def test_names_from_outside_cannot_become_markup() -> None:
     assert "&lt;script>\\|" in text
 
 
-def test_csv_keeps_full_numbers_and_its_sources() -> None:
-    row = Row(("x", 0.123456789), "measured", "Measured", "a note")
-    text = table_csv(Table("t", "T", (Column("a"), Column("b", 3)), (row,)))
-    assert text == "a,b,Source,Note\nx,0.123456789,Measured,a note\n"
-
-
 def _compared(*paths: Path) -> str:
     stream = io.StringIO()
-    print_comparison(collect(list(paths)), (), Console(file=stream, width=200))
-    return stream.getvalue()
+    tables, left_out = compared(collect(list(paths)), ())
+    show(tables, Console(file=stream, width=200))
+    return stream.getvalue() + "".join(f"left out: {sentence}\n" for sentence in left_out)
 
 
 def test_two_runs_are_compared_image_by_image(tmp_path: Path) -> None:
@@ -178,8 +175,8 @@ def test_two_runs_are_compared_image_by_image(tmp_path: Path) -> None:
         make_evaluation(folder / "test", "x", value)
     text = _compared(*runs)
     assert re.search(r"objective\.beta\s+0\.1\s+0\.2", text)
-    assert "Paired on 6 images under synthetic: beta = 0.2 minus beta = 0.1" in text
-    assert re.search(r"Abs Rel\s+0\.2750\s+0\.3250\s+0\.0500\s+0\.0500\s+0\.0500\s+0%", text)
+    assert "synthetic: second 'beta = 0.2' against first 'beta = 0.1'" in text
+    assert re.search(r"Abs Rel ↓\s+0\.2750\s+0\.3250\s+\+0\.0500\s+\+0\.0500\s+\+0\.0500\s+0%\s+–", text)
 
 
 def test_what_cannot_be_paired_is_said(tmp_path: Path) -> None:
@@ -203,8 +200,8 @@ def test_among_all_evaluations_those_of_the_same_images_are_paired(tmp_path: Pat
     make_evaluation(one / "zzz_other", "x", 0.9, drive="another drive")
     make_evaluation(two / "test", "x", 0.3)
     text = _compared(one, two)
-    assert text.count("Paired on 6 images under synthetic") == 1
-    assert re.search(r"Abs Rel\s+0\.2750\s+0\.3250\s+0\.0500", text)
+    assert text.count("against first") == 1
+    assert re.search(r"Abs Rel ↓\s+0\.2750\s+0\.3250\s+\+0\.0500", text)
     assert "left out" not in text
 
 
@@ -213,13 +210,13 @@ def test_a_flipped_evaluation_is_not_paired_with_a_plain_one(tmp_path: Path) -> 
     make_evaluation(one / "flipped", "x", 0.25, post_processing="monodepth blend of two flips")
     make_evaluation(two / "test", "x", 0.3)
     text = " ".join(_compared(one, two).split())
-    assert "Paired on" not in text
+    assert "paired;" not in text
     assert "the first was evaluated with flip=true and the second with no flip or scale" in text
     make_evaluation(two / "flipped", "x", 0.26, post_processing="monodepth blend of two flips")
     text = _compared(one, two)
-    assert text.count("Paired on 6 images") == 1
-    assert re.search(r"Abs Rel\s+0\.2750\s+0\.2850", text)
-    assert "synthetic, test split, flip=true; resampled" in text
+    assert text.count("6 images, paired") == 1
+    assert re.search(r"Abs Rel ↓\s+0\.2750\s+0\.2850", text)
+    assert "synthetic, test split, flip=true" in text
 
 
 def test_other_systems_are_compared_under_their_names(tmp_path: Path) -> None:
@@ -227,8 +224,8 @@ def test_other_systems_are_compared_under_their_names(tmp_path: Path) -> None:
     make_evaluation(ours / "test", "x", 0.25)
     theirs = [make_evaluation(tmp_path / f"foreign_{key}", None, 0.3, predictions=f"{key}.npy") for key in "ab"]
     text = _compared(ours, *theirs)
-    assert "Paired on 6 images under synthetic: foreign_a minus ours" in text
-    assert "Paired on 6 images under synthetic: foreign_b minus ours" in text
+    assert "second 'foreign_a' against first 'ours'" in text
+    assert "second 'foreign_b' against first 'ours'" in text
     assert "?" not in text
     assert "predictions" not in text
 
@@ -244,7 +241,10 @@ def test_figure_10_has_a_point_where_a_run_was_timed_at_its_own_size(everything:
     assert isinstance(seen, Seen)
     points, table, missing = speed(inputs.benchmarks, {"run": run}, {"run": seen})
     accuracy = ERRORS[4]
-    assert points == [("run (cpu, fp32, eager)", accuracy, 0.02), ("run (cpu, fp32, compiled)", accuracy, 0.01)]
+    assert [(one.name, one.accuracy, one.seconds, one.setting) for one in points] == [
+        ("run", accuracy, 0.02, "cpu, fp32, eager"),
+        ("run", accuracy, 0.01, "cpu, fp32, compiled"),
+    ]
     assert table is not None
     assert [(row.cells[0], row.cells[2], row.cells[3]) for row in table.rows[1:]] == [
         *[("run", "32x64", accuracy)] * 4,

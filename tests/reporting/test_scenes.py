@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from saunet.errors import ConfigError, DataError
-from saunet.reporting.curves import curve
+from saunet.reporting.figures import curve
 from saunet.reporting.scenes import View, edge_boxes, read_views, scene
 
 

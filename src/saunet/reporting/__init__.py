@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from saunet.reporting.build import Options, build
-from saunet.reporting.inputs import Inputs, Sweep, collect
-from saunet.reporting.output import write
-from saunet.runs.folder import Run, Score, read_run
+from saunet.reporting.inputs import collect
+from saunet.reporting.tool import ReportOptions, ReportResult, report
 
-__all__ = ["Inputs", "Options", "Run", "Score", "Sweep", "build", "collect", "read_run", "write"]
+__all__ = ["ReportOptions", "ReportResult", "collect", "report"]

@@ -5,22 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from rich.box import HORIZONTALS
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table as RichTable
-
 from saunet.errors import ConfigError, DataError
 from saunet.evaluation.files import read_rows
-from saunet.evaluation.result import Comparison, ImageRow
+from saunet.evaluation.result import ERROR_COLUMNS, ImageRow
 from saunet.evaluation.statistics import compare as paired
-from saunet.reporting.document import Column, Row, Table
-from saunet.reporting.evaluations import read_evaluation
 from saunet.reporting.groups import Groups
-from saunet.reporting.inputs import Inputs
-from saunet.reporting.tables import ERRORS
+from saunet.reporting.inputs import Inputs, read_evaluation
 from saunet.runs.folder import SUBJECTS, Run
 from saunet.runs.sweep import differing, labels, values
+from saunet.tables import Column, Row, Table
 
 
 def settings_table(runs: Mapping[str, Run]) -> Table:
@@ -41,7 +34,7 @@ def scores_table(runs: Mapping[str, Run]) -> Table:
     group = Groups(score for _, score in scored)
     rows = [Row((name, *score.errors), "measured", group(score)) for name, score in scored]
     rows.sort(key=lambda row: row.group)
-    return Table("scores", "Scores", (Column("run"), *ERRORS), tuple(rows))
+    return Table("scores", "Scores", (Column("run"), *ERROR_COLUMNS), tuple(rows))
 
 
 @dataclass(frozen=True)
@@ -90,63 +83,12 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
             try:
                 for one, two in pairs:
                     comparison = paired(one.rows, two.rows, names=(names[0], other))
-                    tables.append(comparison_table(comparison, _told(one, two)))
+                    tables.append(comparison.table(_told(one, two)))
                 if not pairs:
                     left_out.append(f"{names[0]} and {other} under {protocol}: {_apart(ours, theirs)}")
             except DataError as reason:
                 left_out.append(f"{names[0]} and {other} under {protocol}: {reason}")
     return tables, left_out
-
-
-def comparison_table(comparison: Comparison, what: str) -> Table:
-    """Return one paired comparison as a table.
-
-    Args:
-        comparison: The comparison.
-        what: Which images, and how they were predicted.
-    """
-    columns = (
-        Column("error"),
-        Column(comparison.first, 4),
-        Column(comparison.second, 4),
-        Column("difference", 4),
-        Column(f"{comparison.level:.0%} low", 4),
-        Column(f"{comparison.level:.0%} high", 4),
-        Column("second better", None),
-        Column("p", 4),
-    )
-    rows = tuple(
-        Row(
-            (column.heading, one.first, one.second, one.difference, one.low, one.high, f"{one.better:.0%}", one.p_value)
-        )
-        for column, one in zip(ERRORS, comparison.differences, strict=True)
-    )
-    pair = f"{comparison.second} minus {comparison.first}"
-    title = f"Paired on {comparison.images} images under {comparison.protocol}: {pair}"
-    notes = (f"{what};", f"resampled: {comparison.groups} {comparison.by}s")
-    return Table("paired", title, columns, rows, notes)
-
-
-def print_table(table: Table, console: Console) -> None:
-    """Print a table of a report on the terminal."""
-    shown = RichTable(
-        title=f"[bold]{escape(table.title)}[/bold]", box=HORIZONTALS, show_edge=False, title_justify="left"
-    )
-    shown.title_style, shown.caption_justify = "", "left"
-    for index, column in enumerate(table.columns):
-        number = any(isinstance(row.cells[index], int | float) for row in table.rows)
-        arrow = {-1: " ↓", 0: "", 1: " ↑"}[column.better]
-        shown.add_column(escape(column.heading) + arrow, justify="right" if number else "left", overflow="fold")
-    group = ""
-    for row in table.rows:
-        if row.group != group:
-            group = row.group
-            shown.add_row(f"[italic]{escape(group)}[/italic]")
-        cells = [escape(table.text(row, index)) for index in range(len(row.cells))]
-        shown.add_row(*(f"[bold]{cell}[/bold]" if table.best(row, index) else cell for index, cell in enumerate(cells)))
-    if table.notes:
-        shown.caption = escape(" ".join(table.notes))
-    console.print(shown, "")
 
 
 def _scored(run: Run) -> dict[str, list[Scored]]:
@@ -190,13 +132,12 @@ def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
     )
 
 
-def print_comparison(inputs: Inputs, wanted: Sequence[str], console: Console) -> None:
-    """Print everything that this file can say about the runs.
+def compared(inputs: Inputs, wanted: Sequence[str]) -> tuple[list[Table], list[str]]:
+    """Return everything that can be said about the differences of runs: tables, and sentences about what is left out.
 
     Args:
         inputs: The runs.
         wanted: Their names; made from what sets them apart if empty.
-        console: Where.
 
     Raises:
         ConfigError: if there are not as many names as runs.
@@ -208,12 +149,6 @@ def print_comparison(inputs: Inputs, wanted: Sequence[str], console: Console) ->
     if wanted and len(set(wanted)) != len(members):
         raise ConfigError(f"labels holds {len(set(wanted))} names for {len(members)} runs; give each its own")
     runs = dict(zip(wanted or labels([members])[0], members, strict=True))
-    print_table(settings_table(runs), console)
     scores = scores_table(runs)
-    if scores.rows:
-        print_table(scores, console)
     found, left_out = comparisons(runs)
-    for table in found:
-        print_table(table, console)
-    for sentence in left_out:
-        console.print(f"left out: {escape(sentence)}")
+    return [settings_table(runs), *([scores] if scores.rows else []), *found], left_out

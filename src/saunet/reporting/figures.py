@@ -1,40 +1,17 @@
-"""The drawings: curves against epochs (Figs. 4 and 5), errors against alpha/beta, accuracy against time (Fig. 10).
-
-Everything is drawn as SVG with its letters as outlines, so that pages are sharp at any size and need no font.
-"""
+"""The drawings: curves against epochs (Figs. 4 and 5), and errors against alpha/beta."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from saunet.reporting.curves import curve
 from saunet.reporting.groups import comparable
 from saunet.runs.folder import Run
 from saunet.runs.sweep import RATIO, ratio
+from saunet.tables.drawing import COLORS, colors, new_figure, svg
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7b6fd0", "#444444")
-"""Okabe and Ito's colors, which color-blind readers can tell apart, the yellow left out on white paper."""
-_STYLE = {
-    "font.size": 9.5,
-    "axes.labelcolor": "#444444",
-    "axes.edgecolor": "#b9bec5",
-    "axes.linewidth": 0.8,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": "#e8eaed",
-    "grid.linewidth": 0.8,
-    "xtick.color": "#555555",
-    "ytick.color": "#555555",
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "lines.linewidth": 1.7,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "saunet",
-}
+Curve = tuple[list[float], list[float]]
+"""Epochs and values."""
 
 
 def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, ordered: bool = False) -> bytes | None:
@@ -51,11 +28,11 @@ def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, o
     drawn = [(key, title) for key, title in panels if any(curve(run.history, key)[0] for run in runs.values())]
     if not drawn:
         return None
-    figure, axes = _figure(len(drawn), legend=len(runs) > 1)
-    colors = _colors(len(runs), ordered)
+    figure, axes = new_figure(len(drawn), 11.7 if len(drawn) > 1 else 7.6, 3.8 if len(runs) > 1 else 3.3)
+    tints = colors(len(runs), ordered=ordered)
     for axis, (key, title) in zip(axes, drawn, strict=True):
         few = max(len(curve(run.history, key)[0]) for run in runs.values()) <= 25
-        for (name, run), color in zip(runs.items(), colors, strict=True):
+        for (name, run), color in zip(runs.items(), tints, strict=True):
             x, y = curve(run.history, key)
             if x:
                 axis.plot(x, y, color=color, label=name, marker="o" if few else None, markersize=3.5)
@@ -66,7 +43,7 @@ def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, o
             axis.xaxis.get_major_locator().set_params(integer=True)
     if len(runs) > 1:
         _legend(figure, axes)
-    return _svg(figure)
+    return svg(figure)
 
 
 def draw_ratio(runs: Mapping[str, Run]) -> bytes | None:
@@ -78,7 +55,7 @@ def draw_ratio(runs: Mapping[str, Run]) -> bytes | None:
     )
     if len(points) < 2:
         return None
-    figure, axes = _figure(2, legend=False)
+    figure, axes = new_figure(2, 11.7, 3.3)
     for axis, column, title in zip(
         axes, (1, 2), ("Abs Rel (smaller is better)", "δ < 1.25 (larger is better)"), strict=True
     ):
@@ -89,43 +66,7 @@ def draw_ratio(runs: Mapping[str, Run]) -> bytes | None:
         axis.set_title(title, loc="left", fontsize=10)
         axis.set_xlabel(RATIO)
     axes[0].legend(loc="best", frameon=False, fontsize=9)
-    return _svg(figure)
-
-
-def draw_speed(ours: Sequence[tuple[str, float, float]], printed: Sequence[tuple[str, float, float]]) -> bytes:
-    """Draw seconds an image against accuracy, the paper's Fig. 10.
-
-    Args:
-        ours: Name, accuracy and seconds of what was measured.
-        printed: The same of what the paper gives in numbers.
-    """
-    figure, (axis,) = _figure(1, legend=False, height=4.2)
-    axis.plot(
-        [p[1] for p in printed], [p[2] for p in printed], "D", color="#8a9099", markerfacecolor="white", markersize=7
-    )
-    for (name, accuracy, seconds), color in zip(ours, _colors(len(ours), ordered=False), strict=True):
-        axis.plot([accuracy], [seconds], "o", color=color, markersize=8, label=name)
-    points = (*printed, *ours)
-    middle = (min(point[1] for point in points) + max(point[1] for point in points)) / 2
-    for name, accuracy, seconds in points:  # names grow towards the middle, where there is room
-        side, offset = ("right", -9) if accuracy > middle else ("left", 9)
-        place = {"textcoords": "offset points", "xytext": (offset, 5), "ha": side}
-        axis.annotate(name, (accuracy, seconds), fontsize=9, color="#333333", **place)
-    axis.set_yscale("log")
-    axis.margins(x=0.25, y=0.25)
-    axis.set_xlabel("accuracy, δ < 1.25")
-    axis.set_ylabel("seconds an image")
-    return _svg(figure)
-
-
-def _figure(panels: int, *, legend: bool, height: float = 3.3) -> tuple[Any, list[Any]]:
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context(_STYLE):  # type: ignore[arg-type]
-        figure = Figure(figsize=(11.7 if panels > 1 else 7.6, height + 0.5 * legend), layout="constrained")
-        axes = figure.subplots(1, panels, squeeze=False)[0]
-    return figure, list(axes)
+    return svg(figure)
 
 
 def _legend(figure: Any, axes: Sequence[Any]) -> None:
@@ -141,19 +82,34 @@ def _legend(figure: Any, axes: Sequence[Any]) -> None:
     )
 
 
-def _colors(count: int, ordered: bool) -> list[Any]:
-    if not ordered and count <= len(COLORS):
-        return list(COLORS[:count])
-    from matplotlib import colormaps
+def curve(history: Sequence[Mapping[str, float]], key: str, points: int = 150) -> Curve:
+    """Return one column of a log against epochs; long ones as means of neighbors.
 
-    return [colormaps["viridis"](0.9 * index / max(1, count - 1)) for index in range(count)]
+    What is logged during an epoch lies between its whole numbers, what is logged after it on the next one: epoch 1 is
+    the end of the first.
+
+    Args:
+        history: Rows with ``epoch`` and ``step``, both counted from 0.
+        key: The column.
+        points: How many points a training curve has at most.
+    """
+    rows = [row for row in history if key in row and "step" in row and "epoch" in row]
+    if not rows:
+        return [], []
+    if key.startswith("val/"):
+        return [row["epoch"] + 1 for row in rows], [row[key] for row in rows]
+    steps = _steps_per_epoch(history)
+    size = -(-len(rows) // points)
+    groups = [rows[start : start + size] for start in range(0, len(rows), size)]
+    return (
+        [sum(row["step"] + 1 for row in group) / len(group) / steps for group in groups],
+        [sum(row[key] for row in group) / len(group) for group in groups],
+    )
 
 
-def _svg(figure: Any) -> bytes:
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-    stream = io.BytesIO()
-    with rc_context(_STYLE):  # type: ignore[arg-type]
-        FigureCanvasSVG(figure).print_svg(stream, metadata={"Date": None})  # type: ignore[no-untyped-call]
-    return stream.getvalue()
+def _steps_per_epoch(history: Sequence[Mapping[str, float]]) -> float:
+    """Return the length of an epoch: exact after a validation, else from how far the log goes."""
+    placed = [row for row in history if "step" in row and "epoch" in row]
+    ends = [row for row in placed if any(key.startswith("val/") for key in row)] or placed
+    last = max(ends, key=lambda row: row["step"])
+    return (last["step"] + 1) / (last["epoch"] + 1)

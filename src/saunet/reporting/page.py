@@ -1,12 +1,113 @@
-"""A report as one HTML page: pictures are inside, nothing is fetched, and the page itself forbids it."""
+"""What a report consists of, and how it is written: one HTML page that fetches nothing, Markdown, CSV, pictures."""
 
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from html import escape
 from importlib import resources
+from pathlib import Path
 
-from saunet.reporting.document import Document, Figure, Gallery, Picture, Scene, Section, Table, Tile
+from saunet.io.atomic import write_bytes
+from saunet.tables import Table, markdown_line, markdown_text
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """An encoded image; its name is that of its file."""
+
+    name: str
+    data: bytes = field(repr=False)
+    alt: str
+
+    @property
+    def media(self) -> str:
+        """The media type, by the name's suffix."""
+        return {"svg": "image/svg+xml", "png": "image/png"}.get(self.name.rpartition(".")[2], "image/jpeg")
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A drawing with its caption."""
+
+    title: str
+    picture: Picture
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """One picture of a scene, with enlarged parts of it."""
+
+    label: str
+    picture: Picture
+    zooms: tuple[Picture, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The same scene as input and as several models see it."""
+
+    title: str
+    tiles: tuple[Tile, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Gallery:
+    """Scenes under one caption."""
+
+    title: str
+    scenes: tuple[Scene, ...]
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """Something that was not made, and why."""
+
+    what: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of the report under a heading."""
+
+    title: str
+    blocks: Sequence[Table | Figure | Gallery]
+    intro: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """A whole report."""
+
+    title: str
+    facts: tuple[str, ...]
+    """What stands below the title: when, from how many runs, by which version."""
+    sections: tuple[Section, ...]
+    missing: tuple[Missing, ...]
+
+    @property
+    def tables(self) -> list[Table]:
+        """All tables."""
+        return [block for section in self.sections for block in section.blocks if isinstance(block, Table)]
+
+    @property
+    def pictures(self) -> list[Picture]:
+        """All pictures, those of scenes included."""
+        found = []
+        for section in self.sections:
+            for block in section.blocks:
+                if isinstance(block, Figure):
+                    found.append(block.picture)
+                elif isinstance(block, Gallery):
+                    for scene in block.scenes:
+                        for tile in scene.tiles:
+                            found += [tile.picture, *tile.zooms]
+        return found
+
 
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
@@ -40,55 +141,26 @@ def _section(section: Section) -> str:
 
 def _block(block: Table | Figure | Gallery) -> str:
     if isinstance(block, Table):
-        return _table(block)
+        return block.html()
     if isinstance(block, Figure):
         caption = f"<figcaption><b>{escape(block.title)}.</b> {escape(block.caption)}</figcaption>"
-        return f"<figure>{_image(block.picture)}{caption}</figure>"
-    scenes = "\n".join(map(_scene, block.scenes))
+        return f"<figure>{_html_image(block.picture)}{caption}</figure>"
+    scenes = "\n".join(map(_html_scene, block.scenes))
     return f"<h3>{escape(block.title)}</h3><p class=note>{escape(block.caption)}</p>{scenes}"
 
 
-def _table(table: Table) -> str:
-    numeric = ["number" if _is_number(table, index) else "text" for index in range(len(table.columns))]
-    arrows = {-1: " <i>↓</i>", 0: "", 1: " <i>↑</i>"}
-    head = "".join(
-        f"<th class={kind}>{escape(column.heading)}{arrows[column.better]}</th>"
-        for column, kind in zip(table.columns, numeric, strict=True)
-    )
-    body, group = [], ""
-    for row in table.rows:
-        if row.group != group:
-            group = row.group
-            body.append(f'<tr class="group {row.kind}"><th colspan={len(table.columns)}>{escape(group)}</th></tr>')
-        cells = []
-        for index, kind in enumerate(numeric):
-            text = escape(table.text(row, index))
-            text = f"<b>{text}</b>" if table.best(row, index) else text
-            if table.columns[index].heading == "Status":
-                text = f'<span class="chip {escape(str(row.cells[index]))}">{text}</span>'
-            cells.append(f"<td class={kind}>{text}</td>")
-        body.append(f"<tr class={row.kind}>{''.join(cells)}</tr>")
-        if row.note:
-            body.append(f'<tr class="{row.kind} why"><td colspan={len(table.columns)}>{escape(row.note)}</td></tr>')
-    notes = "".join(f"<p class=note>{escape(note)}</p>" for note in table.notes)
-    return (
-        f"<h3>{escape(table.title)}</h3><div class=scroll><table><thead><tr>{head}</tr></thead>"
-        f"<tbody>{''.join(body)}</tbody></table></div>{notes}"
-    )
-
-
-def _scene(scene: Scene) -> str:
+def _html_scene(scene: Scene) -> str:
     tiles = "".join(map(_tile, scene.tiles))
     pairs = " pairs" if len(scene.tiles) in (1, 2, 4) else ""
     return f'<div class=scene><h4>{escape(scene.title)}</h4><div class="tiles{pairs}">{tiles}</div></div>'
 
 
 def _tile(tile: Tile) -> str:
-    zooms = f"<div class=zooms>{''.join(map(_image, tile.zooms))}</div>" if tile.zooms else ""
-    return f"<div class=tile><span>{escape(tile.label)}</span>{_image(tile.picture)}{zooms}</div>"
+    zooms = f"<div class=zooms>{''.join(map(_html_image, tile.zooms))}</div>" if tile.zooms else ""
+    return f"<div class=tile><span>{escape(tile.label)}</span>{_html_image(tile.picture)}{zooms}</div>"
 
 
-def _image(picture: Picture) -> str:
+def _html_image(picture: Picture) -> str:
     content = base64.b64encode(picture.data).decode()
     return f'<img alt="{escape(picture.alt)}" src="data:{picture.media};base64,{content}">'
 
@@ -101,11 +173,64 @@ def _missing(document: Document) -> str:
     return f"<section id={_anchor('Left out')}><h2>Left out</h2>{intro}<ul class=missing>{items}</ul></section>"
 
 
-def _is_number(table: Table, column: int) -> bool:
-    return table.columns[column].digits is not None or any(
-        isinstance(row.cells[column], int | float) for row in table.rows
-    )
-
-
 def _anchor(title: str) -> str:
     return "".join(letter if letter.isalnum() else "-" for letter in title.lower())
+
+
+def as_markdown(document: Document, pictures: str = "figures") -> str:
+    """Return the report as Markdown.
+
+    Args:
+        document: The report.
+        pictures: Folder of the pictures, relative to the page.
+    """
+    parts = [f"# {document.title}", *(f"- {fact}" for fact in document.facts)]
+    for section in document.sections:
+        parts += ["", f"## {section.title}", *(["", section.intro] if section.intro else [])]
+        for block in section.blocks:
+            parts.append("")
+            if isinstance(block, Table):
+                parts.append(block.markdown())
+            elif isinstance(block, Figure):
+                parts += [f"**{block.title}**", "", _image(block.picture, pictures), "", block.caption]
+            else:
+                parts.append(_gallery(block, pictures))
+    if document.missing:
+        parts += ["", "## Left out", "", "What has no data is not shown:", ""]
+        parts += [f"- **{markdown_text(missing.what)}**: {markdown_text(missing.why)}" for missing in document.missing]
+    return "\n".join(parts) + "\n"
+
+
+def _gallery(gallery: Gallery, pictures: str) -> str:
+    parts = [f"**{gallery.title}**", "", gallery.caption]
+    for scene in gallery.scenes:
+        parts += ["", f"*{markdown_text(scene.title)}*", "", _scene(scene, pictures)]
+    return "\n".join(parts)
+
+
+def _scene(scene: Scene, pictures: str) -> str:
+    lines = [markdown_line([markdown_text(tile.label) for tile in scene.tiles]), "|" + "---|" * len(scene.tiles)]
+    lines.append(markdown_line([_image(tile.picture, pictures) for tile in scene.tiles]))
+    lines.append(markdown_line([" ".join(_image(zoom, pictures) for zoom in tile.zooms) for tile in scene.tiles]))
+    return "\n".join(lines)
+
+
+def _image(picture: Picture, folder: str) -> str:
+    return f"![{markdown_text(picture.alt)}]({folder}/{picture.name})"
+
+
+def write(document: Document, folder: Path) -> dict[str, Path]:
+    """Write ``report.html``, ``report.md``, ``tables/*.csv`` and ``figures/``, each file whole or not at all.
+
+    Returns:
+        The files by their names in the folder.
+
+    Raises:
+        DataError: if the folder cannot be written to.
+    """
+    content = {"report.html": as_html(document).encode(), "report.md": as_markdown(document).encode()}
+    content |= {f"tables/{table.name}.csv": table.csv().encode() for table in document.tables}
+    content |= {f"figures/{picture.name}": picture.data for picture in document.pictures}
+    for name, data in content.items():
+        write_bytes(folder / name, data)
+    return {name: folder / name for name in content}

@@ -1,4 +1,4 @@
-"""The same scenes through several models: pictures side by side, with the places where depth jumps enlarged."""
+"""What a report asks of the runs' networks: how large they are, and what they see in the same scenes, side by side."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from saunet.errors import ConfigError, positive
+from saunet.errors import ConfigError, SaunetError, positive
 from saunet.io.colormaps import colorize
 from saunet.io.images import as_rgb_bytes, read_image, resize
+from saunet.prediction.predictor import Predictor
 from saunet.prediction.sources import image_paths
-from saunet.reporting.document import Picture, Scene, Tile
+from saunet.reporting.page import Picture, Scene, Tile
+from saunet.runs.checkpoint import read_checkpoint
+from saunet.runs.folder import Run
+from saunet.tools.benchmark.measure import count_parameters
 
 MARKS = ((226, 52, 58), (0, 190, 220), (120, 200, 60))
 """Colors of the boxes, RGB."""
@@ -66,6 +70,44 @@ def read_views(scenes: Mapping[str, str | Sequence[str]], limit: int) -> list[Vi
         chosen = paths if places is None else [paths[int(place)] for place in places]
         views += [View(path, read_image(path), "/".join(path.parts[-4:]), condition) for path in chosen]
     return views
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A run's networks, looked at once and let go."""
+
+    parameters: tuple[int, int]
+    """Of the depth and the pose network."""
+    size: tuple[int, int]
+    """Height and width of its input in pixels."""
+    disparities: tuple[Float32[np.ndarray, "_ _"], ...]
+    """One for each view, at the image's size."""
+
+
+def look(run: Run, views: Sequence[View], device: str = "cpu", flip: bool = False) -> Seen | str:
+    """Build a run's networks, count their parameters and predict the views.
+
+    Args:
+        run: The run.
+        views: What to predict.
+        device: Where.
+        flip: Average with the prediction of the mirrored image.
+
+    Returns:
+        What was found, or one sentence why the run has no usable networks.
+    """
+    if run.checkpoint is None:
+        return run.error or "it has no checkpoint"
+    try:
+        checkpoint = read_checkpoint(run.checkpoint)
+        depth, pose = checkpoint.networks()
+        record = checkpoint.record
+        predictor = Predictor(depth, record.height, record.width, device, record.scale, flip)
+        disparities = tuple(predictor.predict(view.image, view.title).disparity for view in views)
+    except SaunetError as error:
+        return str(error)
+    size = (record.height, record.width)
+    return Seen((count_parameters(depth), count_parameters(pose)), size, disparities)
 
 
 def edge_boxes(

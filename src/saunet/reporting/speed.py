@@ -7,14 +7,13 @@ from pathlib import Path
 
 from saunet.errors import DataError
 from saunet.published import published
-from saunet.reporting.document import Column, Missing, Row, Table
 from saunet.reporting.groups import Groups, chosen, comparable
-from saunet.reporting.models import Seen
+from saunet.reporting.page import Missing
+from saunet.reporting.scenes import Seen
 from saunet.runs.files import read_json
 from saunet.runs.folder import Run
-
-Point = tuple[str, float, float]
-"""Name with how it was timed, accuracy, seconds an image."""
+from saunet.tables import Column, Row, Table
+from saunet.tables.drawing import Point
 
 
 def read_benchmark(folder: Path) -> list[dict[str, object]]:
@@ -50,7 +49,7 @@ def speed(
     """
     scores = chosen(runs)
     group, shared = Groups(scores.values()), comparable(runs)
-    points: dict[str, Point] = {}
+    points: dict[tuple[str, str], Point] = {}
     rows: dict[str, list[Row]] = {group(score): [] for score in scores.values()}
     alone: list[Row] = []
     missing: list[Missing] = []
@@ -70,8 +69,7 @@ def speed(
             cells = (name, how, size, accuracy, seconds * 1e3)
             rows[group(scores[name])].append(Row(cells, "measured", group(scores[name])))
             if batch == 1 and name in shared:
-                label = f"{name} ({kind})"
-                points[label] = (label, accuracy, seconds)
+                points[name, kind] = Point(name, accuracy, seconds, kind)
             else:
                 why = "its time is of several images at once" if batch > 1 else "its accuracy is of other images"
                 missing.append(Missing(f"Fig. 10, point of {name} ({how})", why))
@@ -82,8 +80,8 @@ def speed(
         Column("Method"),
         Column("Device"),
         Column("Size"),
-        Column("δ < 1.25", 3, 1),
-        Column("ms an image", 1),
+        Column("δ < 1.25", ".3f", 1),
+        Column("ms per image", ".1f"),
     )
     notes = ("Times of different devices do not compare; the paper's were taken on an AGX Orin.",)
     printed = [
@@ -95,6 +93,6 @@ def speed(
 
 
 def _timed(row: Mapping[str, object], network: Seen) -> bool:
-    """Tell whether a measurement is of a network at its own size."""
+    """Return whether a measurement is of a network at its own size."""
     size = "{}x{}".format(*network.size)
     return network.parameters[0] == row["depth_parameters"] and str(row["size"]).lower() == size

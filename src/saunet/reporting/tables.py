@@ -4,22 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from saunet.evaluation.result import ERROR_COLUMNS
 from saunet.published import published
-from saunet.reporting.document import Cell, Column, Missing, Row, Table
 from saunet.reporting.groups import Groups, chosen
+from saunet.reporting.page import Missing
 from saunet.runs.folder import Run, Score
 from saunet.runs.sweep import RATIO, differing, ratio, values
+from saunet.tables import Cell, Column, Row, Table
 
-ERRORS: tuple[Column, ...] = (
-    Column("Abs Rel", 3, -1),
-    Column("Sq Rel", 3, -1),
-    Column("RMSE", 3, -1),
-    Column("RMSE log", 3, -1),
-    Column("δ < 1.25", 3, 1),
-    Column("δ < 1.25²", 3, 1),
-    Column("δ < 1.25³", 3, 1),
-)
-"""The seven errors in the order of `saunet.metrics.functional.ERROR_NAMES`."""
 PRINTED = "Published: KITTI Eigen test split (697 images), 0–80 m, median-scaled"
 
 
@@ -46,7 +38,7 @@ def table1(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
         "Pattern: D = depth as supervision, M = monocular video, S = stereo pairs.",
         "Eigen's last two numbers are equal in the paper; Klodt's RMSE log is a dash there.",
     )
-    columns = (Column("Method"), Column("Pattern"), *ERRORS)
+    columns = (Column("Method"), Column("Pattern"), *ERROR_COLUMNS)
     missing = [Missing(f"Table 1, row of {name}", _no_score(runs[name])) for name in without]
     return Table("table1", "Table 1. Errors and accuracy", columns, tuple(rows), notes), missing
 
@@ -69,9 +61,9 @@ def explained_table(runs: Mapping[str, Run]) -> Table | None:
         Column("Method"),
         Column("Condition"),
         Column("Images"),
-        Column("Photometric error", 4),
-        Column("without warping", 4),
-        Column("Pixels explained", 3),
+        Column("Photometric error", ".4f"),
+        Column("without warping", ".4f"),
+        Column("Pixels explained", ".3f"),
     )
     notes = ("Photometric error: eqs. (8) to (10) after warping the neighboring frames by predicted depth and motion.",)
     return Table("conditions", "Data without ground truth, by condition", columns, tuple(rows), notes) if rows else None
@@ -88,7 +80,12 @@ def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table, list[Missing]]:
         Row((name, depth / 1e6, pose / 1e6 if pose else None, (depth + pose) / 1e6), "measured", "Counted here")
         for name, (depth, pose) in sizes.items()
     ]
-    columns = (Column("Method"), Column("Depth network", 1), Column("Pose network", 1), Column("Together", 1))
+    columns = (
+        Column("Method"),
+        Column("Depth network", ".1f"),
+        Column("Pose network", ".1f"),
+        Column("Together", ".1f"),
+    )
     notes = ("Millions of parameters; the paper's unit is “Mb”.",)
     missing = [] if sizes else [Missing("Table 2, our rows", "no run has a checkpoint")]
     return Table("table2", "Table 2. Parameters", columns, tuple(rows), notes), missing
@@ -108,7 +105,7 @@ def table3(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
     models = [(name, score) for name, score in ours if not score.trivial]
     group = Groups(score for _, score in models)
     kinds = {_networks(runs[name]) for name, _ in models}
-    columns = (Column("Method"), Column("STF-T"), Column("Attention"), *ERRORS)
+    columns = (Column("Method"), Column("STF-T"), Column("Attention"), *ERROR_COLUMNS)
     notes = ["The paper's first two rows are digit for digit Mono R18 and Mono R50 of its Table 1."]
     missing = []
     if len(kinds) > 1:
@@ -143,11 +140,11 @@ def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -
         *(Column(key) for key in keys),
         *((Column(RATIO),) if show_ratio else ()),
         Column("Epochs"),
-        Column("Loss", 4),
-        ERRORS[0],
-        ERRORS[2],
-        ERRORS[4],
-        Column("Minutes", 1),
+        Column("Loss", ".4f"),
+        ERROR_COLUMNS[0],
+        ERROR_COLUMNS[2],
+        ERROR_COLUMNS[4],
+        Column("Minutes", ".1f"),
     )
     scores = chosen(runs)
     group = Groups(scores.values())

@@ -119,6 +119,14 @@ class Table:
             found[-1][1].append(row)
         return found
 
+    def width(self) -> int:
+        """Return how many characters wide the table is on a terminal where nothing wraps, its title aside."""
+        from rich.console import Console
+
+        shown = self.rich()
+        shown.title = shown.caption = None
+        return Console(width=1000).measure(shown).maximum
+
     def rich(self) -> RichTable:
         """Return the table for a terminal, narrow enough for 80 columns where its texts are short."""
         from rich.box import HORIZONTALS
@@ -150,19 +158,23 @@ class Table:
     def markdown(self) -> str:
         """Return the table as Markdown; the sentence about a row follows its second cell."""
         bold, rest = _split_title(self.title)
-        lines = [f"**{_plain(bold)}**{_plain(rest)}", "", _line([_plain(column.label) for column in self.columns])]
+        lines = [
+            f"**{markdown_text(bold)}**{markdown_text(rest)}",
+            "",
+            markdown_line([markdown_text(column.label) for column in self.columns]),
+        ]
         lines.append("|" + "".join("---:|" if self.numeric(index) else "---|" for index in range(len(self.columns))))
         for group, rows in self.grouped():
             if group:
-                lines.append(_line([f"*{_plain(group)}*", *[""] * (len(self.columns) - 1)]))
+                lines.append(markdown_line([f"*{markdown_text(group)}*", *[""] * (len(self.columns) - 1)]))
             for row in rows:
-                cells = [_plain(self.text(row, index)) for index in range(len(row.cells))]
+                cells = [markdown_text(self.text(row, index)) for index in range(len(row.cells))]
                 bolds = [bool(cell and self._style(row, index)) for index, cell in enumerate(cells)]
                 cells = [f"**{cell}**" if bold else cell for cell, bold in zip(cells, bolds, strict=True)]
                 if row.note:
-                    cells[1] += f": {_plain(row.note)}"
-                lines.append(_line(cells))
-        notes = [f"{_plain(note)}  " for note in self.notes]
+                    cells[1] += f": {markdown_text(row.note)}"
+                lines.append(markdown_line(cells))
+        notes = [f"{markdown_text(note)}  " for note in self.notes]
         return "\n".join([*lines, *([""] if notes else []), *notes])
 
     def html(self) -> str:
@@ -242,10 +254,10 @@ def _split_title(title: str) -> tuple[str, str]:
     return head, colon + rest
 
 
-def _plain(text: str) -> str:
+def markdown_text(text: str) -> str:
     """Return text that cannot become markup in Markdown."""
     return text.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;")
 
 
-def _line(cells: Sequence[str]) -> str:
+def markdown_line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"

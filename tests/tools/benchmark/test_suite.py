@@ -20,8 +20,9 @@ from saunet.errors import ConfigError
 from saunet.models.depth import DepthNet
 from saunet.published import published
 from saunet.registry import decoders, encoders, poses
+from saunet.tables import show
 from saunet.tools.benchmark import Measurement, Networks, Plan, run_suite
-from saunet.tools.benchmark.report import draw_figure, size_table, speed_table, write_measurements
+from saunet.tools.benchmark.tool import BenchmarkOptions, draw_figure, size_table, speed_table, write_measurements
 
 
 class Tiny(nn.Module):
@@ -111,7 +112,7 @@ def test_impossible_plans_are_refused(changes: dict[str, Any], message: str) -> 
 
 def test_tables_stand_beside_the_paper(results: list[Measurement]) -> None:
     console = Console(width=160, record=True, file=io.StringIO())
-    console.print(size_table(results), speed_table(results))
+    show((size_table(results), speed_table(results)), console)
     text = console.export_text()
     assert "58.8 (SAU-Net)" in text
     assert text.count("sau_net") == 2 + 8
@@ -123,7 +124,7 @@ def test_no_number_is_cut(results: list[Measurement], width: int) -> None:
     other = dataclasses.replace(row, model="ours", size="320x1024", device="cuda", mode="compiled", batch_size=16)
     for rows in ([row], [row, other], [other, *results]):
         console = Console(width=width, record=True, file=io.StringIO())
-        console.print(size_table(rows), speed_table(rows, width))
+        show((size_table(rows), speed_table(rows, width)), console)
         text = console.export_text()
         assert "…" not in text
         for each in rows:
@@ -140,9 +141,9 @@ def test_no_number_is_cut(results: list[Measurement], width: int) -> None:
 
 def test_settings_that_all_share_are_said_once(results: list[Measurement]) -> None:
     console = Console(width=160, record=True, file=io.StringIO())
-    console.print(speed_table(results))
+    show([speed_table(results)], console)
     text = console.export_text()
-    assert "ms a call, cpu, eager;" in text
+    assert "ms per call, cpu, eager;" in text
     assert text.count("eager") == 1
     assert text.count("bf16") == 8
 
@@ -160,9 +161,7 @@ def test_picture(results: list[Measurement], tmp_path: Path) -> None:
     assert (tmp_path / "benchmark.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_picture_without_matplotlib_says_what_to_install(
-    results: list[Measurement], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_picture_without_matplotlib_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     original = builtins.__import__
 
     def without(name: str, *rest: Any, **more: Any) -> Any:
@@ -172,7 +171,7 @@ def test_picture_without_matplotlib_says_what_to_install(
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ConfigError, match=r"pip install 'saunet\[plot\]'"):
-        draw_figure(results, tmp_path / "x.png")
+        BenchmarkOptions(models={"ours": Networks(Tiny())}, figure=True)
 
 
 def test_sau_net_has_no_more_parameters_than_published() -> None:

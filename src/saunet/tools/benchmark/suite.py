@@ -26,22 +26,9 @@ class Networks:
     pose: nn.Module | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What to measure: every combination of the sequences.
-
-    Args:
-        sizes: Image sizes, ``"<height>x<width>"``.
-        devices: ``cpu``, ``cuda`` or any other that torch knows.
-        precisions: ``fp32``, ``bf16`` or ``fp16``: the format of weights and activations.
-        modes: ``eager``, ``compiled``.
-        batch_sizes: Images per call. Latency is that of the call, throughput is in images.
-        runs: Timed calls.
-        warmup: Calls before that.
-
-    Raises:
-        ConfigError: for an empty sequence, or a word, number or device that cannot work.
-    """
+    """What to measure: every combination of the sequences; see `BenchmarkOptions`."""
 
     sizes: Sequence[str] = ("192x640",)
     devices: Sequence[str] = ("cpu",)

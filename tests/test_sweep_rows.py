@@ -11,7 +11,7 @@ from hydra import compose
 from saunet.cli import app, words
 from saunet.config import config_dir, plain
 from saunet.errors import ConfigError
-from saunet.tools.benchmark.report import PAPER_METHODS
+from saunet.tools.benchmark.tool import PAPER_METHODS
 from saunet.training.tool import TrainOptions
 
 pytestmark = pytest.mark.usefixtures("hydra")

@@ -1,52 +1,139 @@
-"""From runs to a report: what each table and figure needs, and a list of what has no data."""
+"""`report`: one page of the paper's tables and figures with our runs beside them, or how runs differ."""
 
 from __future__ import annotations
 
 import re
+import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime, timezone
+from importlib.util import find_spec
+from pathlib import Path
+
+from rich.console import Console
 
 from saunet import __version__
-from saunet.errors import ConfigError, positive, require_matplotlib
+from saunet.errors import ConfigError, one_of, positive, usable_device
+from saunet.io.atomic import check_folder
 from saunet.published import published
 from saunet.reporting import figures, tables
-from saunet.reporting.document import Document, Figure, Gallery, Missing, Picture, Scene, Section, Table
+from saunet.reporting.compare import compared
 from saunet.reporting.groups import Groups, comparable
-from saunet.reporting.inputs import Inputs
-from saunet.reporting.models import Seen, look
-from saunet.reporting.scenes import View, read_views, scene
+from saunet.reporting.inputs import Inputs, collect
+from saunet.reporting.page import Document, Figure, Gallery, Missing, Picture, Scene, Section, write
+from saunet.reporting.scenes import Seen, View, look, read_views, scene
 from saunet.reporting.speed import speed
 from saunet.runs.folder import Run
-from saunet.runs.sweep import differing, labels, sweeps_ratio
+from saunet.runs.sweep import differing, labels, read_plan, sweeps_ratio
+from saunet.tables import Table, show
+from saunet.tables.drawing import Point, draw_speed, svg
 
 Named = dict[str, Run]
+Scenes = str | Sequence[str] | Mapping[str, str | Sequence[str]] | None
 
 
-@dataclass(frozen=True)
-class Options:
-    """How a report is made.
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions:
+    """What a report is made from, and how.
 
     Args:
+        runs: Folders of runs, sweeps, evaluations and benchmarks, folders that hold such folders, and checkpoints.
+        compare: Write no page, but say how the runs differ.
+        checkpoint: Which checkpoint of a run is meant, ``best`` or ``last``.
         title: Heading of the page.
-        labels: Names of the single runs, in order; made from what sets them apart if empty.
-        scenes: Images to show, by condition; see `saunet.reporting.scenes.read_views`.
+        labels: Names of the single runs, in order; by default made from what sets them apart.
+        scenes: Images to show: folders or patterns, or a mapping of such by condition.
         scenes_limit: Images of each condition at most.
         zooms: Enlarged parts of each scene.
-        figures: Draw curves; needs matplotlib.
-        device: Where scenes are predicted.
+        figures: Draw curves, if matplotlib is installed.
+        device: Where scenes are predicted; ``auto`` takes a GPU if there is one.
         flip: Average with the prediction of the mirrored image.
+        output_dir: Folder for the page, its Markdown, its tables and its pictures; None writes none.
+
+    Raises:
+        ConfigError: if an option cannot work.
     """
 
+    runs: tuple[str, ...] = ()
+    compare: bool = False
+    checkpoint: str = "best"
     title: str = "saunet report"
-    labels: Sequence[str] = ()
-    scenes: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
+    labels: tuple[str, ...] = ()
+    scenes: Scenes = None
     scenes_limit: int = 3
     zooms: int = 2
     figures: bool = True
-    device: str = "cpu"
+    device: str = "auto"
     flip: bool = False
+    output_dir: str | None = None
+
+    def __post_init__(self) -> None:
+        one_of("checkpoint", self.checkpoint, ("best", "last"))
+        positive("scenes_limit", self.scenes_limit)
+        positive("zooms", self.zooms, allow_zero=True)
+        _by_condition(self.scenes)
+
+
+@dataclass(frozen=True)
+class ReportResult:
+    """A report, or a comparison."""
+
+    document: Document | None = None
+    """The page; None for a comparison."""
+    tables: tuple[Table, ...] = ()
+    """Of a page or a comparison."""
+    left_out: tuple[str, ...] = ()
+    """One sentence for each thing that has no data."""
+    folder: Path | None = None
+    """Where the files were written."""
+
+    def show(self) -> None:
+        """Print a comparison, or where the page is and what it lacks."""
+        if self.document is None:
+            show(self.tables)
+        for sentence in self.left_out:
+            print(f"left out: {sentence}", file=sys.stdout if self.document is None else sys.stderr)
+        if self.folder is not None:
+            print(f"report: {self.folder / 'report.html'}")
+
+
+def report(options: ReportOptions) -> ReportResult:
+    """Make one page of tables, curves and pictures from finished runs, or say how runs differ.
+
+    Args:
+        options: What from, and how.
+
+    Raises:
+        ConfigError: if the labels do not fit the runs.
+        DataError: if a path holds no run, sweep, checkpoint, evaluation or benchmark, or a file cannot be read or
+            written.
+
+    Example:
+        >>> report(ReportOptions(runs=("outputs/train",), output_dir="page")).show()  # doctest: +SKIP
+    """
+    folder = Path(options.output_dir) if options.output_dir is not None and not options.compare else None
+    if folder is not None:
+        check_folder(folder)
+    inputs = collect(options.runs, options.checkpoint, read_plan, strangers=not options.compare)
+    if options.compare:
+        found, left_out = compared(inputs, options.labels)
+        return ReportResult(None, tuple(found), tuple(left_out))
+    with Console(stderr=True).status("reading") as status:
+        document = build(inputs, options, status.update)
+    if folder is not None:
+        write(document, folder)
+    left_out = [f"{missing.what}: {missing.why}" for missing in document.missing]
+    return ReportResult(document, tuple(document.tables), tuple(left_out), folder)
+
+
+def _by_condition(scenes: Scenes) -> dict[str, str | Sequence[str]]:
+    """Return the images to show by condition; a list or a single path has no condition of its own."""
+    if isinstance(scenes, Mapping):
+        return {str(key): value for key, value in scenes.items()}
+    if scenes is not None and not isinstance(scenes, str | Sequence):
+        raise ConfigError(f"scenes is {scenes!r}; give images by condition, such as scenes={{kitti: FOLDER}}")
+    return {"scenes": scenes} if scenes else {}
 
 
 @dataclass(frozen=True)
@@ -60,31 +147,25 @@ class _Group:
 
 
 def build(
-    inputs: Inputs, options: Options | None = None, progress: Callable[[str], None] = lambda text: None
+    inputs: Inputs, options: ReportOptions | None = None, progress: Callable[[str], None] = lambda text: None
 ) -> Document:
-    """Make a report.
-
-    Args:
-        inputs: What it is made from.
-        options: How.
-        progress: Called with what is done next.
+    """Make a report of what was read.
 
     Raises:
-        ConfigError: if an option cannot work, or matplotlib is missing.
+        ConfigError: if the labels do not fit the runs.
         DataError: if a scene or a benchmark cannot be read.
     """
-    options = options or Options()
-    positive("zooms", options.zooms, allow_zero=True)
-    if options.figures:
-        require_matplotlib("the figures of a report need", "figures=false")
-    views = read_views(options.scenes, options.scenes_limit)
+    options = options or ReportOptions()
+    device, drawable = str(usable_device(options.device)), find_spec("matplotlib") is not None
+    draw = options.figures and drawable
+    views = read_views(_by_condition(options.scenes), options.scenes_limit)
     groups = _groups(inputs, options.labels)
     everyone: Named = {name: run for group in groups for name, run in group.runs.items()}
     missing: list[Missing] = []
     seen: dict[str, Seen] = {}
     for name, run in everyone.items():
         progress(f"looking at {name}")
-        found = look(run, views, options.device, options.flip)
+        found = look(run, views, device, options.flip)
         if isinstance(found, Seen):
             seen[name] = found
         elif run.checkpoint is not None or run.error is None:
@@ -103,24 +184,25 @@ def build(
             "The paper’s numbers as published, and ours as measured by this installation.",
         ),
         Section("Networks", (table2, table3)),
-        Section("Runs", _runs(groups, options.figures, missing)),
+        Section("Runs", _runs(groups, draw, missing)),
     ]
-    if options.figures:
+    if draw:
         curves = [figure for group in groups for figure in _curves(group, missing)]
         sections += [Section("Training", curves, "Each point is a mean over neighboring steps.")] if curves else []
     else:
-        missing.append(Missing("Figs. 4, 5 and 10", "figures=false"))
+        why = "they need matplotlib: run `pip install 'saunet[plot]'`" if options.figures else "figures=false"
+        missing.append(Missing("Figs. 4, 5 and 10", why))
     galleries = [gallery for group in groups for gallery in _galleries(group, views, seen, options.zooms)]
     if galleries:
         sections.append(Section("Depth side by side", galleries, _READING))
     missing += _no_pictures(views, galleries)
     points, table10, no_speed = speed(inputs.benchmarks, shown, seen)
     if table10:
-        sections.append(Section("Accuracy and time", [*_speed(points, options.figures), table10]))
+        sections.append(Section("Accuracy and time", [*_speed(points, draw), table10]))
     missing += [*no_rows, *no_sizes, *no_ablation, *no_speed]
     missing.append(Missing("Published curves and pictures", "the paper prints them as images only"))
     if len(shown) < len(everyone):
-        why = "they are in the tables of their sweeps; saunet evaluate puts their checkpoints here too"
+        why = "they are in the tables of their sweeps; evaluate their checkpoints to have them here too"
         missing.append(Missing("Table 1, jobs of sweeps", why))
     return Document(options.title, _facts(everyone), tuple(sections), tuple(missing))
 
@@ -252,11 +334,15 @@ def _no_pictures(views: Sequence[View], galleries: Sequence[Gallery]) -> list[Mi
     return [Missing(f"Fig. {number}", reason) for number, reason in reasons.items() if number not in found]
 
 
-def _speed(points: Sequence[tuple[str, float, float]], draw: bool) -> list[Figure]:
+def _speed(points: Sequence[Point], draw: bool) -> list[Figure]:
     if not points or not draw:
         return []
-    printed = [(f"{one.method}, published ({one.device})", one.a1, one.seconds) for one in published().figure10]
-    picture = Picture("figure10.svg", figures.draw_speed(points, printed), "seconds an image against accuracy")
+    printed = [
+        Point(f"{one.method}, published ({one.device})", one.a1, one.seconds, published=True)
+        for one in published().figure10
+    ]
+    drawing = svg(draw_speed([*points, *printed], "accuracy, δ < 1.25"))
+    picture = Picture("figure10.svg", drawing, "seconds per image against accuracy")
     caption = (
         "Times of single images. One belongs to the runs whose network has the benchmark's parameters and size. "
         "Hollow: the only time that the paper gives in numbers, from another device and data set."

@@ -1,0 +1,217 @@
+"""`benchmark`: parameters, FLOPs, time and memory of networks, beside the paper's Table 2."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import torch
+
+from saunet.errors import ConfigError, positive, require_matplotlib, usable_device
+from saunet.io.atomic import check_folder, write_json
+from saunet.io.progress import bar
+from saunet.published import published
+from saunet.tables import Column, Row, Table, show, stdout
+from saunet.tables.drawing import Point, draw_speed, save
+from saunet.tools.benchmark.suite import Measurement, Networks, Plan, run_suite
+
+PAPER_METHODS: dict[str, str] = {
+    "mono_r18": "Mono R18",
+    "mono_r50": "Mono R50",
+    "packnet": "PackNet",
+    "sau_net": "SAU-Net",
+}
+"""What the paper calls our models."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkOptions(Plan):
+    """What `benchmark` measures: every combination of the sequences.
+
+    Args:
+        models: Networks by the name that they are shown under.
+        sizes: Image sizes, ``"<height>x<width>"``.
+        devices: ``cpu``, ``cuda`` or any other that torch knows; ``auto`` is a GPU if there is one.
+        precisions: ``fp32``, ``bf16`` or ``fp16``: the format of weights and activations.
+        modes: ``eager``, ``compiled``.
+        batch_sizes: Images per call. Latency is that of the call, throughput is in images.
+        runs: Timed calls.
+        warmup: Calls before that.
+        threads: Of torch on the CPU; as it is by default.
+        figure: Also draw time against accuracy; needs matplotlib.
+        abs_rel: Accuracy by model for the figure; the paper's where a model is not named.
+        output_dir: Folder for the results; None writes none.
+
+    Raises:
+        ConfigError: for an empty sequence, or a word, number or device that cannot work.
+    """
+
+    models: Mapping[str, Networks]
+    threads: int | None = None
+    figure: bool = False
+    abs_rel: Mapping[str, float] = field(default_factory=dict)
+    output_dir: str | None = None
+
+    def __post_init__(self) -> None:
+        Plan.__post_init__(self)
+        if not self.models:
+            raise ConfigError("models is empty, so nothing would be measured; give networks by their names")
+        if self.threads is not None:
+            positive("threads", self.threads)
+        if self.figure:
+            require_matplotlib("figure=true needs", "figure=false")
+
+
+@dataclass(frozen=True)
+class BenchmarkResult:
+    """What was measured."""
+
+    measurements: tuple[Measurement, ...]
+    folder: Path | None = None
+    """Where the files were written."""
+
+    def tables(self, width: int = 160) -> tuple[Table, Table]:
+        """Return the sizes, and times and memory in at most so many columns of text."""
+        return size_table(self.measurements), speed_table(self.measurements, width)
+
+    def show(self) -> None:
+        """Print the tables, and where the files are."""
+        console = stdout()
+        show(self.tables(console.width), console)
+        if self.folder is not None:
+            print(f"results: {self.folder}")
+
+
+def benchmark(options: BenchmarkOptions) -> BenchmarkResult:
+    """Measure networks, and write JSON and a picture.
+
+    Args:
+        options: What to measure, and how.
+
+    Raises:
+        ConfigError: if a size does not fit a model; nothing has been measured then.
+        DataError: if a file cannot be written.
+
+    Example:
+        >>> from torch import nn
+        >>> networks = Networks(nn.Conv2d(3, 1, 3, padding=1))
+        >>> options = BenchmarkOptions(models={"one layer": networks}, sizes=("32x64",), devices=("cpu",), runs=1)
+        >>> benchmark(options).measurements[0].depth_parameters
+        28
+    """
+    folder = Path(options.output_dir) if options.output_dir is not None else None
+    if folder is not None:
+        check_folder(folder)
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    plan = replace(options, devices=tuple(str(usable_device(name)) for name in options.devices))
+    with bar() as shown:
+        task = shown.add_task("")
+        results = run_suite(
+            options.models,
+            plan,
+            lambda text, done, total: shown.update(task, description=text, completed=done, total=total),
+        )
+    if folder is not None:
+        write_measurements(results, folder / "benchmark.json")
+        if options.figure:
+            draw_figure(results, folder / "benchmark.png", options.abs_rel)
+    return BenchmarkResult(tuple(results), folder)
+
+
+def size_table(results: Sequence[Measurement]) -> Table:
+    """Return parameters and FLOPs by model and image size, with the paper's Table 2 where it has the system."""
+    columns = (
+        *(Column(heading) for heading in ("model", "size")),
+        *(Column(f"{part} M", ".1f") for part in ("depth", "pose", "total")),
+        Column("paper M"),
+        Column("GFLOP", ".1f"),
+    )
+    printed = {row.method: row.megaparameters for row in published().table2}
+    rows = []
+    for row in {(row.model, row.size): row for row in results}.values():
+        method = PAPER_METHODS.get(row.model)
+        counts = (count / 1e6 for count in (row.depth_parameters, row.pose_parameters, row.total_parameters))
+        paper = f"{printed[method]} ({method})" if method else None
+        rows.append(Row((row.model, row.size, *counts, paper, row.flops / 1e9)))
+    title = "Size: M = 10^6 parameters; GFLOP of the depth network for one image"
+    return Table("sizes", title, columns, tuple(rows))
+
+
+def speed_table(results: Sequence[Measurement], width: int = 160) -> Table:
+    """Return time and memory of every measurement; times in milliseconds.
+
+    Settings that all measurements share are in the title. Where the rest does not fit into so many columns of text,
+    they stand in one column that wraps, so that no number is cut.
+    """
+    settings: dict[str, list[str]] = {
+        "model": [row.model for row in results],
+        "size": [row.size for row in results],
+        "device": [row.device for row in results],
+        "precision": [row.precision for row in results],
+        "mode": [row.mode for row in results],
+        "batch": [str(row.batch_size) for row in results],
+    }
+    shared = [name for name, values in settings.items() if len(set(values)) == 1 and name != "model"]
+    said = "".join(f", {'batch ' * (name == 'batch')}{settings.pop(name)[0]}" for name in shared)
+    numbers = (
+        *(Column(heading, ".1f") for heading in ("median", "p90")),
+        Column("warm-up", ".0f"),
+        Column("images/s", ".1f"),
+        Column("peak MB", ".0f"),
+        Column("of peak", ".0%"),
+    )
+    measured = [
+        (
+            *(1e3 * seconds for seconds in (row.median, row.p90, row.warmup)),
+            row.throughput,
+            None if row.memory is None else row.memory / 1e6,
+            row.ceiling_share,
+        )
+        for row in results
+    ]
+    title = f"Speed: ms per call{said}; fraction of the speed of one large matrix product"
+
+    def table(headings: Sequence[str], labels: Sequence[Sequence[str]]) -> Table:
+        rows = tuple(Row((*label, *values)) for label, values in zip(labels, measured, strict=True))
+        return Table("speed", title, (*map(Column, headings), *numbers), rows)
+
+    labels = list(zip(*settings.values(), strict=True))
+    wide = table(list(settings), labels)
+    return wide if wide.width() <= width else table([" ".join(settings)], [[" ".join(label)] for label in labels])
+
+
+def write_measurements(results: Sequence[Measurement], path: Path) -> None:
+    """Write the measurements with the machine they were made on."""
+    machine = {
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+    }
+    write_json(path, {"machine": machine, "results": [asdict(row) for row in results]})
+
+
+def draw_figure(results: Sequence[Measurement], path: Path, abs_rel: Mapping[str, float] | None = None) -> None:
+    """Draw time per image against accuracy; models of unknown accuracy stand beside.
+
+    Args:
+        results: Measurements. A color is a model, a marker a setting (size, device, precision, mode, batch).
+        path: Picture file to write.
+        abs_rel: Accuracy by model; the paper's Table 1 where a model is not named.
+    """
+    printed = {row.method: row.errors[0] for row in published().table1}
+    accuracy = {model: printed[method] for model, method in PAPER_METHODS.items()} | dict(abs_rel or {})
+    points = [
+        Point(
+            row.model,
+            accuracy.get(row.model),
+            row.median / row.batch_size,
+            f"{row.size}, {row.device} {row.precision} {row.mode}, batch {row.batch_size}",
+        )
+        for row in results
+    ]
+    save(draw_speed(points, "Abs Rel, KITTI Eigen (as published unless given)"), path)
