@@ -67,7 +67,7 @@ def test_a_run_with_a_folder_of_its_own_is_one_run_that_knows_itself(tool: Any, 
     [
         (("gone",), "there is nothing at gone"),
         ((), "runs is not set"),
-        (("scenes=3", "."), "no run, sweep"),
+        (("scenes=3", "."), "give images by condition"),
         (("titel=x",), "did you mean 'title'"),
     ],
 )
