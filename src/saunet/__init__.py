@@ -1,16 +1,111 @@
-"""saunet: self-supervised monocular depth, assembled from registered components."""
+"""saunet: self-supervised monocular depth, assembled from registered components.
+
+Each tool of the command line is an options class and a function here: `TrainOptions` and `train`. Names are
+imported when they are first used, so ``import saunet`` stays cheap.
+"""
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from saunet.errors import CheckpointError
-from saunet.registry import registry
+from saunet.errors import CheckpointError, ConfigError, DataError, SaunetError
+from saunet.registry import Spec, attentions, datamodules, decoders, encoders, objectives, poses, registry, terms
 from saunet.weights.locate import DEFAULT, shipped
 
+if TYPE_CHECKING:
+    from saunet.data.drive import Drive as Drive
+    from saunet.data.loading.module import DepthDataModule as DepthDataModule
+    from saunet.evaluation import EvaluateOptions as EvaluateOptions
+    from saunet.evaluation import OdometryOptions as OdometryOptions
+    from saunet.evaluation import evaluate as evaluate
+    from saunet.evaluation import odometry as odometry
+    from saunet.geometry.pose import invert_pose as invert_pose
+    from saunet.geometry.pose import pose_matrix as pose_matrix
+    from saunet.geometry.warp import backproject as backproject
+    from saunet.geometry.warp import project as project
+    from saunet.geometry.warp import synthesize as synthesize
+    from saunet.losses.functional import gradient_loss as gradient_loss
+    from saunet.losses.functional import photometric_error as photometric_error
+    from saunet.losses.functional import smoothness_loss as smoothness_loss
+    from saunet.losses.functional import ssim_loss as ssim_loss
+    from saunet.metrics.depth import DepthMetrics as DepthMetrics
+    from saunet.prediction.prediction import Prediction as Prediction
+    from saunet.prediction.predictor import Predictor as Predictor
+    from saunet.tools.calibrate.tool import CalibrateOptions as CalibrateOptions
+    from saunet.tools.calibrate.tool import calibrate as calibrate
+    from saunet.tools.doctor.tool import DoctorOptions as DoctorOptions
+    from saunet.tools.doctor.tool import doctor as doctor
+    from saunet.tools.prepare.tool import PrepareOptions as PrepareOptions
+    from saunet.tools.prepare.tool import prepare as prepare
+    from saunet.training.tool import ModelOptions as ModelOptions
+    from saunet.training.tool import TrainOptions as TrainOptions
+    from saunet.training.tool import train as train
+
 __version__ = "0.1.0"
-__all__ = ["__version__", "available", "build", "load"]
+
+_LAZY = {
+    "CalibrateOptions": "tools.calibrate.tool",
+    "DepthDataModule": "data.loading.module",
+    "DepthMetrics": "metrics.depth",
+    "DoctorOptions": "tools.doctor.tool",
+    "Drive": "data.drive",
+    "EvaluateOptions": "evaluation.tool",
+    "ModelOptions": "training.tool",
+    "OdometryOptions": "evaluation.tool_odometry",
+    "Prediction": "prediction.prediction",
+    "Predictor": "prediction.predictor",
+    "PrepareOptions": "tools.prepare.tool",
+    "TrainOptions": "training.tool",
+    "backproject": "geometry.warp",
+    "calibrate": "tools.calibrate.tool",
+    "doctor": "tools.doctor.tool",
+    "evaluate": "evaluation.tool",
+    "gradient_loss": "losses.functional",
+    "invert_pose": "geometry.pose",
+    "odometry": "evaluation.tool_odometry",
+    "photometric_error": "losses.functional",
+    "pose_matrix": "geometry.pose",
+    "prepare": "tools.prepare.tool",
+    "project": "geometry.warp",
+    "smoothness_loss": "losses.functional",
+    "ssim_loss": "losses.functional",
+    "synthesize": "geometry.warp",
+    "train": "training.tool",
+}
+"""Name -> the module that it is imported from when it is first used."""
+__all__ = [
+    "CheckpointError",
+    "ConfigError",
+    "DataError",
+    "SaunetError",
+    "Spec",
+    "__version__",
+    "attentions",
+    "available",
+    "build",
+    "datamodules",
+    "decoders",
+    "encoders",
+    "load",
+    "objectives",
+    "poses",
+    "terms",
+    *_LAZY,
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module 'saunet' has no attribute '{name}'")
+    value = getattr(importlib.import_module(f"saunet.{_LAZY[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
 
 
 def build(kind: str, name: str, /, **kwargs: Any) -> Any:

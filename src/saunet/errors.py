@@ -12,15 +12,35 @@ if TYPE_CHECKING:
 
 
 class SaunetError(Exception):
-    """An error that a user can act on; command-line tools print it as one sentence, without a traceback."""
+    """An error that a user can act on; command-line tools print it as one sentence, without a traceback.
+
+    Example:
+        >>> try:
+        ...     saunet.build("encoder", "resnet19")
+        ... except saunet.SaunetError as error:
+        ...     print(error)
+        unknown encoder 'resnet19'; did you mean 'resnet18'? available: ...
+    """
 
 
 class ConfigError(SaunetError, ValueError):
-    """A parameter, name or combination of parameters that cannot work."""
+    """A parameter, name or combination of parameters that cannot work.
+
+    Example:
+        >>> saunet.Spec.of("encoder", "resnet18", wieghts="imagenet")
+        Traceback (most recent call last):
+        saunet.errors.ConfigError: encoder 'resnet18' has no parameter 'wieghts'; did you mean 'weights'? ...
+    """
 
 
 class DataError(SaunetError, ValueError):
-    """A file or data set that is missing, broken or does not fit."""
+    """A file or data set that is missing, broken or does not fit.
+
+    Example:
+        >>> saunet.build("data", "kitti", root="/nowhere").setup()
+        Traceback (most recent call last):
+        saunet.errors.DataError: no data root at /nowhere...
+    """
 
 
 class UnreadableError(DataError):
@@ -28,7 +48,13 @@ class UnreadableError(DataError):
 
 
 class CheckpointError(SaunetError, ValueError):
-    """A checkpoint that cannot be read or does not belong to the model at hand."""
+    """A checkpoint that cannot be read or does not belong to the model at hand.
+
+    Example:
+        >>> saunet.load("nowhere.ckpt")
+        Traceback (most recent call last):
+        saunet.errors.CheckpointError: no ... nowhere.ckpt...
+    """
 
 
 def suggest(name: str, allowed: Iterable[str]) -> str:

@@ -54,6 +54,14 @@ class Registry:
         group: Hydra config group their nodes are stored in: ``"model/encoder"``; None keeps them out of the config.
         home: Package whose modules register the built-in components; imported on first use.
         late: Parameters that the caller supplies when the rest of the system is known (a decoder's ``features``).
+
+    Example:
+        A class of your own becomes a component, on the command line too where its module is one of ``plugins=``:
+
+        >>> @saunet.encoders.register("mine")  # doctest: +SKIP
+        ... class Mine(nn.Module): ...
+        >>> saunet.attentions.names()
+        ['cbam', 'eca', 'gct', 'none', 'se']
     """
 
     def __init__(self, kind: str, group: str | None, home: str, late: tuple[str, ...] = ()) -> None:
@@ -181,6 +189,11 @@ class Spec:
     Args:
         node: Plain containers: ``_target_`` and parameters; nested components are nodes too.
         name: The registered name, where it is known: several names can share a class.
+
+    Example:
+        >>> data = saunet.Spec.of("data", "synthetic_tiny", workers=0)
+        >>> data.get("workers"), data.changed(height=96).build().height
+        (0, 96)
     """
 
     node: Mapping[str, Any]

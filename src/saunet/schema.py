@@ -150,14 +150,15 @@ def node(
         path: Import path to build from; the target's own by default, None for options, which are not built by path.
     """
     preset = dict(preset or {})
-    said = _sentences(target)
-    fields = getattr(target, "__dataclass_fields__", {})
+    owners = [target, *_all_options(target)]
+    said = {name: each for owner in reversed(owners) for name, each in _sentences(owner).items()}
+    fields = {name: each for owner in owners for name, each in getattr(owner, "__dataclass_fields__", {}).items()}
     hidden = {name for name, field in fields.items() if not field.metadata.get("cli", True)}
     keys = []
     for name, parameter in parameters(target).items():
         if name in late or name in hidden:
             continue
-        default = _plain(preset.get(name, _default(target, parameter)))
+        default = _plain(preset.get(name, _default(fields.get(name), parameter)))
         nested = _component(parameter.annotation)
         kind, choices = _type(parameter.annotation)
         if nested is not None and name not in preset:
@@ -171,8 +172,15 @@ def node(
     return Node(target.__qualname__, own, summary(target), tuple(keys), bool(late))
 
 
-def _default(target: Callable[..., Any], parameter: inspect.Parameter) -> Any:
-    field = getattr(target, "__dataclass_fields__", {}).get(parameter.name)
+def _all_options(target: Callable[..., Any]) -> list[type]:
+    """Return the options classes that ``**kwargs`` stand for."""
+    function: Any = target.__init__ if inspect.isclass(target) else target
+    hints = typing.get_type_hints(function)
+    found = (_options(each, hints.get(name)) for name, each in inspect.signature(target).parameters.items())
+    return [each for each in found if each is not None]
+
+
+def _default(field: Any, parameter: inspect.Parameter) -> Any:
     if field is not None and field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return REQUIRED if parameter.default is inspect.Parameter.empty else parameter.default

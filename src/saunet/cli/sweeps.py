@@ -90,7 +90,7 @@ def check_job(config: Mapping[str, object], job: str) -> None:
         ConfigError: if it would write anywhere else, where the next job writes too, or start the sweep once more.
     """
     folder = config.get("output_dir")
-    if folder is not None:
+    if folder:  # an empty one is refused below
         given, own = Path(str(folder)).resolve(), Path(job).resolve()
         if own != given and own not in given.parents:
             raise ConfigError(

@@ -19,6 +19,13 @@ class Drive(ABC):
     Subclass it and implement `name`, `indices`, `image` and `intrinsics`. Everything else has a default that says
     "unknown" (None, False, an empty string); override what the data set knows. Frames are addressed by their index in
     the recording; indices ascend with time and may have gaps.
+
+    Example:
+        >>> data = saunet.build("data", "synthetic_tiny", workers=0)
+        >>> data.setup("fit")
+        >>> drive = data.datasets["train"].drives[0]
+        >>> isinstance(drive, saunet.Drive), drive.image(0).shape
+        (True, (64, 96, 3))
     """
 
     @property

@@ -103,6 +103,11 @@ class EvaluateOptions:
 
     Raises:
         ConfigError: if an option cannot work, or not beside another one.
+
+    Example:
+        >>> data = saunet.Spec.of("data", "synthetic_tiny")
+        >>> saunet.EvaluateOptions(data=data, checkpoint="best.ckpt").split
+        'test'
     """
 
     data: Spec

@@ -46,6 +46,11 @@ class OdometryOptions:
 
     Raises:
         ConfigError: if an option cannot work.
+
+    Example:
+        >>> data = saunet.Spec.of("data", "kitti_odometry", root="/data/kitti/odometry")
+        >>> saunet.OdometryOptions(checkpoint="best.ckpt", data=data).snippet
+        5
     """
 
     checkpoint: str
@@ -94,6 +99,9 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
     Args:
         options: What and how.
         progress: Called with the name of each sequence.
+
+    Returns:
+        The paths and their errors; `OdometryResult.show` prints them.
 
     Raises:
         ConfigError: if the model has no pose network, or it was not trained on neighboring frames.

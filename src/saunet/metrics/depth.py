@@ -24,6 +24,13 @@ class DepthMetrics(Metric):
 
     Raises:
         ConfigError: for an unknown protocol name.
+
+    Example:
+        >>> metrics = saunet.DepthMetrics("exact")
+        >>> depth = torch.rand(2, 1, 24, 32) + 1
+        >>> metrics.update(1 / depth, depth, torch.tensor([[24, 32], [24, 32]]))
+        >>> round(float(metrics.compute()["abs_rel"]), 5)
+        0.0
     """
 
     is_differentiable = False

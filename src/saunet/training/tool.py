@@ -60,7 +60,20 @@ _TRUSTED = ("lightning.", "torch.", "saunet.")
 
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions:
-    """Networks: depth (encoder and decoder) and pose."""
+    """Networks: depth (encoder and decoder) and pose.
+
+    Args:
+        encoder: Depth encoder.
+        decoder: Depth decoder.
+        pose: Pose network; None for training on stereo pairs alone.
+        min_depth: Smallest depth that the network can say, meters up to scale.
+        max_depth: Largest depth.
+
+    Example:
+        >>> parts = {"encoder": "resnet18", "decoder": "unet", "pose": "posecnn"}
+        >>> saunet.ModelOptions(**{kind: saunet.Spec.of(kind, name) for kind, name in parts.items()}).max_depth
+        100.0
+    """
 
     encoder: Spec
     decoder: Spec
@@ -93,6 +106,19 @@ class TrainOptions:
 
     Raises:
         ConfigError: for values with which no training can run.
+
+    Example:
+        >>> parts = {"encoder": "resnet18", "decoder": "unet", "pose": "posecnn"}
+        >>> model = {kind: saunet.Spec.of(kind, name) for kind, name in parts.items()}
+        >>> options = saunet.TrainOptions(
+        ...     data=saunet.Spec.of("data", "synthetic_tiny", workers=0),
+        ...     model=saunet.ModelOptions(**model),
+        ...     objective=saunet.Spec.of("objective", "saunet"),
+        ...     output_dir="run",
+        ...     trainer={"max_epochs": 2},
+        ... )
+        >>> options.optim.lr
+        0.0001
     """
 
     data: Spec
@@ -213,7 +239,7 @@ class TrainResult:
 def train(
     options: TrainOptions,
     *,
-    choices: Mapping[str, str] | None = None,
+    choices: Mapping[str, str | None] | None = None,
     overrides: Sequence[str] = (),
     describe: Callable[[Exception], str | None] = lambda error: None,
 ) -> TrainResult:
@@ -227,6 +253,13 @@ def train(
 
     Raises:
         SaunetError: if the options do not fit together, or the data or checkpoints cannot be used. Nothing is written.
+
+    Returns:
+        Where the results are, the best checkpoint, the model and the data.
+
+    Example:
+        >>> result = saunet.train(options)  # doctest: +SKIP
+        >>> saunet.load(result.best).predict(image).show()  # doctest: +SKIP
     """
     folder = Path(options.output_dir)
     if not (options.resume or options.overwrite):

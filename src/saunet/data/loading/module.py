@@ -46,6 +46,11 @@ class DepthDataModule(LightningDataModule):
     Raises:
         ConfigError: if a parameter is out of range.
         DataError: if the manifest or the cache cannot be read.
+
+    Example:
+        >>> data = saunet.build("data", "synthetic_tiny", workers=0)
+        >>> isinstance(data, saunet.DepthDataModule), data.protocol
+        (True, 'exact')
     """
 
     neighbors: Sequence[str] = ("train", "val")

@@ -1,0 +1,99 @@
+"""Components of the user's own: a file beside the work trains, evaluates and is asked for by name."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from saunet import plugins
+from saunet.errors import ConfigError
+from saunet.registry import Registry
+
+MINE = '''
+"""An encoder of my own."""
+
+from torch import Tensor, nn
+
+from saunet.registry import encoders
+from saunet.types import FeatureSpec
+
+
+@encoders.register("mine")
+class Mine(nn.Module):
+    """Two strided convolutions.
+
+    Args:
+        width: Channels.
+    """
+
+    def __init__(self, width: int = 8) -> None:
+        super().__init__()
+        self.features = (FeatureSpec(width, 2), FeatureSpec(width, 4))
+        self.size_divisor = 4
+        self.stages = nn.ModuleList(
+            [nn.Conv2d(3, width, 3, stride=2, padding=1), nn.Conv2d(width, width, 3, stride=2, padding=1)]
+        )
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Return features at 1/2 and 1/4."""
+        features = []
+        for stage in self.stages:
+            image = stage(image).relu()
+            features.append(image)
+        return features
+'''
+QUICK = ("experiment=smoke", "model/encoder=mine", "model.encoder.width=4", "model/decoder=unet", "model/pose=posecnn")
+
+
+def _saunet(*words: str, folder: Path, code: int = 0) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "saunet", *words], cwd=folder, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert done.returncode == code, done.stderr[-3000:]
+    return done.stdout + done.stderr
+
+
+def test_an_encoder_in_a_file_trains_evaluates_and_is_asked_for(tmp_path: Path) -> None:
+    (tmp_path / "my_parts.py").write_text(MINE)
+    _saunet("train", "plugins=[my_parts]", *QUICK, "hydra.run.dir=run", folder=tmp_path)
+    evaluate = ("evaluate", "run", "data=synthetic_tiny", "data.workers=0", "baselines=false")
+    assert "plugins=[my_parts]" in _saunet(*evaluate, folder=tmp_path, code=1)
+    assert "model" in _saunet(*evaluate, "plugins=my_parts.py", folder=tmp_path)
+
+
+def test_help_and_unknown_names_know_it(tmp_path: Path) -> None:
+    (tmp_path / "my_parts.py").write_text(MINE)
+    said = _saunet("train", "plugins=[my_parts]", *QUICK, "--help", folder=tmp_path)
+    assert "model.encoder.width: int = 8  Channels." in said
+    assert "unknown model/encoder 'mine'" in _saunet("train", *QUICK, folder=tmp_path, code=1)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("1 / 0\n", "cannot be imported: ZeroDivisionError"),
+        (None, "no file at"),
+    ],
+)
+def test_a_plugin_that_fails_is_one_sentence(tmp_path: Path, content: str | None, words: str) -> None:
+    file = tmp_path / "broken_plugin.py"
+    if content is not None:
+        file.write_text(content)
+    with pytest.raises(ConfigError, match=words):
+        plugins.load([str(file)])
+
+
+def test_a_file_named_like_another_module_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "json.py").write_text("")
+    with pytest.raises(ConfigError, match=r"the name of .*json\.py is taken by"):
+        plugins.load([str(tmp_path / "json.py")])
+
+
+def test_a_taken_name_is_one_sentence() -> None:
+    registry = Registry("widget", None, "saunet.geometry")
+    registry.register("x")(plugins.loaded)
+    with pytest.raises(ConfigError, match="'x' is already registered by"):
+        registry.register("x")(plugins.loaded)
