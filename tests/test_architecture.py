@@ -26,10 +26,11 @@ ALLOWED: dict[str, set[str]] = {
     "metrics": {"errors", "types", "geometry"},
     "data": {"errors", "registry", "schema", "types", "io", "fingerprint", "geometry", "synthetic"},
     "synthetic": {"errors", "io", "data"},
-    "runs": {"errors", "io", "registry", "metrics", "models", "__version__"},
+    "runs": {"plugins", "errors", "io", "registry", "metrics", "models", "__version__"},
     "weights": {"errors", "io", "runs"},
     "scale": {"errors", "types", "io", "geometry", "runs"},
     "training": {
+        "plugins",
         "errors",
         "registry",
         "types",

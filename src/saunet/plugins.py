@@ -107,4 +107,6 @@ def asked_for(path: str, names: Iterable[str] = ()) -> str:
     needed = [name for name in names if name not in _loaded] or [path.rpartition(".")[0]]
     if needed[0].split(".")[0] == "saunet":
         return "see `saunet components` for what is available"
-    return f"it needs the plugin '{needed[0]}': add plugins=[{','.join(needed)}], or import it first in Python"
+    return (
+        f"it needs the plugin '{needed[0]}'; if you trust it, add plugins=[{','.join(needed)}] or import it in Python"
+    )

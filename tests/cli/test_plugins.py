@@ -23,7 +23,7 @@ from saunet.types import FeatureSpec
 
 @encoders.register("mine")
 class Mine(nn.Module):
-    """Two strided convolutions.
+    """Four strided convolutions.
 
     Args:
         width: Channels.
@@ -31,14 +31,12 @@ class Mine(nn.Module):
 
     def __init__(self, width: int = 8) -> None:
         super().__init__()
-        self.features = (FeatureSpec(width, 2), FeatureSpec(width, 4))
-        self.size_divisor = 4
-        self.stages = nn.ModuleList(
-            [nn.Conv2d(3, width, 3, stride=2, padding=1), nn.Conv2d(width, width, 3, stride=2, padding=1)]
-        )
+        self.features = tuple(FeatureSpec(width, 2**level) for level in (1, 2, 3, 4))
+        self.size_divisor = 16
+        self.stages = nn.ModuleList(nn.Conv2d(3 if level == 0 else width, width, 3, 2, 1) for level in range(4))
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """Return features at 1/2 and 1/4."""
+        """Return features at 1/2 to 1/16."""
         features = []
         for stage in self.stages:
             image = stage(image).relu()

@@ -10,19 +10,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from saunet import __version__
+from saunet import __version__, plugins
 from saunet.errors import CheckpointError
-from saunet.registry import attentions, decoders, encoders, poses
+from saunet.registry import find
 
 FORMAT = 1
 """Version of the record's layout; raised when an older reader would misunderstand a newer file."""
 
-_SLOTS = {
-    "encoder": (encoders,),
-    "decoder": (decoders,),
-    "pose": (poses,),
-}
-_NESTED = (encoders, decoders, attentions, poses)
+_SLOTS = {"encoder": ("encoder",), "decoder": ("decoder",), "pose": ("pose",)}
+_NESTED = ("encoder", "decoder", "attention", "pose")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +50,7 @@ class ModelRecord:
         scale: Factor to meters, where known.
         data: Facts about the training data, free-form.
         version: saunet version that wrote it.
+        plugins: Modules outside saunet that register its components.
     """
 
     encoder: Mapping[str, Any]
@@ -67,6 +64,7 @@ class ModelRecord:
     scale: Scale | None = None
     data: Mapping[str, Any] = field(default_factory=dict)
     version: str = __version__
+    plugins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0 < self.min_depth < self.max_depth < math.inf:
@@ -93,6 +91,7 @@ class ModelRecord:
             "offsets": list(self.offsets),
             "scale": asdict(self.scale) if self.scale else None,
             "data": _plain(self.data),
+            **({"plugins": list(self.plugins)} if self.plugins else {}),
         }
 
     @classmethod
@@ -122,6 +121,7 @@ class ModelRecord:
             scale=Scale(_get(scale, "factor", int | float), _get(scale, "source", str)) if scale is not None else None,
             data=_get(plain, "data", Mapping),
             version=_get(plain, "version", str),
+            plugins=tuple(map(str, _get({"plugins": [], **plain}, "plugins", list))),
         )
 
     def check_same_training(self, plain: Mapping[str, Any]) -> None:
@@ -153,12 +153,11 @@ class ModelRecord:
             if node is not None and "_target_" not in node:
                 raise CheckpointError(f"the recorded {slot} has no '_target_', so nothing is built")
             for depth, target in enumerate(_targets(node)):
-                allowed = {entry.path for kind in (kinds if depth == 0 else _NESTED) for entry in kind}
-                if target not in allowed:
+                if find(target, kinds if depth == 0 else _NESTED) is None:
                     what = slot if depth == 0 else "part of a model"
                     raise CheckpointError(
                         f"the recorded {slot} asks for '{target}', which is not a registered {what}, "
-                        "so nothing is built; import the module that registers it first, if you trust the file"
+                        f"so nothing is built; {plugins.asked_for(target, self.plugins)}"
                     )
 
 

@@ -14,6 +14,7 @@ from lightning import Callback, Trainer, seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.loggers import Logger
 
+from saunet import plugins
 from saunet.data.loading.module import DepthDataModule
 from saunet.errors import ConfigError, SaunetError, divisible, in_range, one_of, positive, suggest
 from saunet.metrics.depth import DepthMetrics
@@ -342,6 +343,7 @@ def assemble(options: TrainOptions, data: DepthDataModule, pretrained: bool = Tr
         offsets=tuple(data.offsets),
         scale=Scale(1.0, "stereo training") if data.stereo else None,
         data={"name": options.name, **options.data.node},
+        plugins=plugins.loaded(),
     )
     depth, pose_network = build_networks(record, pretrained)
     divisible(data.height, data.width, depth.size_divisor, what="data.height x data.width", by="the encoder's stride")
