@@ -43,7 +43,7 @@ ALLOWED: dict[str, set[str]] = {
         "runs",
         "weights",
     },
-    "prediction": {"errors", "types", "io", "metrics", "models", "runs", "weights", "exporting"},
+    "prediction": {"errors", "types", "io", "data", "metrics", "models", "runs", "scale", "weights", "exporting"},
     "exporting": {"errors", "io", "metrics", "models", "prediction", "runs", "weights"},
     "evaluation": {
         "errors",

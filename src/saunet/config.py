@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from saunet.errors import ConfigError
 from saunet.registry import REGISTRIES
-from saunet.roots import ROOTS, ModelConfig, ScaleConfig
+from saunet.roots import ROOTS, ModelConfig
 
 
 def config_dir() -> Path:
@@ -37,7 +37,7 @@ def register_configs(kinds: Collection[str] = tuple(REGISTRIES)) -> None:
 
     store = ConfigStore.instance()
     for root in ROOTS:
-        if root in (ModelConfig, ScaleConfig):  # parts of roots
+        if root is ModelConfig:  # part of roots
             continue
         store.store(name=f"{root.__name__.removesuffix('Config').lower()}_schema", node=root)
     tools = {tool.config or name: name for name, tool in app.TOOLS.items() if tool.options}

@@ -19,62 +19,6 @@ class ModelConfig:
     max_depth: float = 100.0
 
 
-SCALE_METHODS = ("auto", "none", "stored", "camera_height", "speed", "stereo")
-"""``auto``: the factor stored in the checkpoint, where there is one; the last three measure it."""
-
-
-@dataclass
-class ScaleConfig:
-    """How depth becomes meters without ground truth; see docs/scale.md."""
-
-    method: str = "auto"
-    camera_height: float | None = None
-    speeds: str | None = None
-    fps: float | None = None
-    partner: str | None = None
-    baseline: float | None = None
-    frames: int = 100
-    store: bool = False
-
-
-@dataclass
-class PredictConfig:
-    """Root of ``saunet predict``."""
-
-    checkpoint: str = "street"
-    input: str = MISSING
-    output: str = MISSING
-    outputs: list[str] | None = None
-    colormap: str = "magma"
-    camera: list[float] | None = None
-    rectify: str | None = None
-    max_depth: float | None = None
-    max_frames: int | None = None
-    fps: float | None = None
-    layout: str = "auto"
-    memory: float = 0.95
-    codec: str = "h264"
-    flip: bool = False
-    keep_aspect: bool = False
-    scale: ScaleConfig = field(default_factory=ScaleConfig)
-    overwrite: bool = False
-    batch_size: int = 1
-    device: str = "auto"
-
-
-@dataclass
-class ExportConfig:
-    """Root of ``saunet export``."""
-
-    checkpoint: str = MISSING
-    output: str = MISSING
-    formats: list[str] = field(default_factory=lambda: ["onnx", "program", "safetensors"])
-    images: str | None = None
-    batch: str = "auto"
-    evaluation: str | None = None
-    overwrite: bool = False
-
-
 @dataclass
 class BenchmarkConfig:
     """Root of ``saunet benchmark``: ``model`` alone, or each of ``models`` (names of choices of ``model``)."""
@@ -113,11 +57,8 @@ class ReportConfig:
 
 
 ROOTS = (
-    PredictConfig,
-    ExportConfig,
     BenchmarkConfig,
     ReportConfig,
     ModelConfig,
-    ScaleConfig,
 )
 """The typed roots, and what lies directly below them."""

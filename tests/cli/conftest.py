@@ -17,13 +17,11 @@ from saunet import config
 from saunet.cli import app
 from saunet.cli._app import run
 from saunet.cli.benchmark import benchmark
-from saunet.cli.predict import predict
 from saunet.synthetic import SyntheticDrive
 from saunet.synthetic.kitti_writer import write_raw
 
 TASKS = {
     "benchmark": benchmark,
-    "predict": predict,
 }
 
 

@@ -205,13 +205,13 @@ def test_prediction_sees_what_training_saw(tool: Tool, smoke_run: Path, tmp_path
     camera = CameraFile(Path(), K, (160, 320), (-0.2, 0.05, 0.0, 0.0), crop=(0.25, 0.0, 0.0, 0.0))
     write_camera(tmp_path / "camera.yaml", camera)
     arguments = (f"checkpoint={smoke_run / 'checkpoints' / 'best.ckpt'}", "input=in", "output=out")
-    outcome = tool("predict", *arguments, "outputs=[npy,ply]", "rectify=camera.yaml")
+    outcome = tool("predict", *arguments, "outputs=[npy,ply]", "undistort=camera.yaml")
     assert outcome.code == 0, outcome.err
     straight = Lens(camera, 160, 320)(read_image(tmp_path / "in" / "a.png"))
     expected = saunet.load(smoke_run / "checkpoints" / "best.ckpt").predict(straight).depth
     np.testing.assert_allclose(np.load(tmp_path / "out" / "a_depth.npy"), expected, rtol=1e-4)
     assert expected.shape == (120, 320)
     assert (tmp_path / "out" / "a_points.ply").is_file()
-    tool("predict", *arguments, "outputs=[npy]").says("made with another straightened")
-    tool("predict", *arguments, "rectify=camera.yaml", "camera=[1,2,3,4]").says("camera and rectify are both set")
-    tool("predict", *arguments, "rectify=gone.yaml").says("no camera file at gone.yaml")
+    tool("predict", *arguments, "outputs=[npy]").says("made with another undistorted")
+    tool("predict", *arguments, "undistort=camera.yaml", "camera=[1,2,3,4]").says("camera and undistort are both set")
+    tool("predict", *arguments, "undistort=gone.yaml").says("no camera file at gone.yaml")

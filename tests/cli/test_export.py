@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import pytest
 
 import saunet
-from saunet.cli import export as tool_module
+from saunet.cli import app
 
 
 @pytest.fixture
@@ -21,10 +20,9 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> Call
     monkeypatch.chdir(tmp_path)
 
     def run(*overrides: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["saunet export", *overrides])
         code = 0
         try:
-            tool_module.main()
+            app.run("export", overrides)
         except SystemExit as exit_:
             code = int(exit_.code or 0)
         captured = capsys.readouterr()

@@ -14,17 +14,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 import saunet
-from saunet.cli._scale import scale_predictor
 from saunet.data.video.camera_file import CameraFile, write_camera
 from saunet.errors import CheckpointError, ConfigError
 from saunet.evaluation.tool import EvaluateOptions, _scaled
 from saunet.geometry.pose import pose_matrix
-from saunet.prediction.pipeline import ImagePredictor
+from saunet.prediction.pointcloud import Camera
+from saunet.prediction.prediction import ImagePredictor
+from saunet.prediction.scaling import apply_scale as scale_predictor
 from saunet.registry import Spec
-from saunet.roots import PredictConfig
 from saunet.runs.checkpoint import read_checkpoint, store_scale
 from saunet.runs.record import Scale
 from saunet.scale.options import ScaleOptions
@@ -70,13 +69,18 @@ def recording(street: SyntheticDrive, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def configured(recording: Path, street: SyntheticDrive, **scale: Any) -> Any:
+def measure(
+    recording: Path,
+    street: SyntheticDrive,
+    predictor: ImagePredictor,
+    source: Any = None,
+    camera: Any = "true",
+    **scale: Any,
+) -> None:
     K = street.intrinsics()
-    cfg = OmegaConf.structured(PredictConfig)
-    cfg.input, cfg.output, cfg.checkpoint = str(recording / "left"), str(recording / "out"), "unused.ckpt"
-    cfg.camera = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
-    cfg.scale = OmegaConf.merge(cfg.scale, scale)
-    return cfg
+    known = Camera(K, 64, 192) if camera else None
+    folder = recording / "out"
+    scale_predictor(ScaleOptions(**scale), predictor, source or str(recording / "left"), known, folder, "unused.ckpt")
 
 
 @pytest.mark.parametrize(
@@ -92,10 +96,13 @@ def test_predict_finds_the_unknown_factor(
     if "partner" in scale:
         scale = {**scale, "partner": str(recording / scale["partner"])}
     predictor = TrueDepth(street)
-    scale_predictor(configured(recording, street, **scale), predictor)
+    measure(recording, street, predictor, **scale)
     assert predictor.scale is not None
     assert predictor.scale.factor == pytest.approx(1 / UNKNOWN, rel=tolerance)
-    assert "middle half" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "middle half" in said
+    assert "known to about" in said
+    assert "measure on more frames" in said
     report = json.loads((recording / "out" / "scale.json").read_text())
     assert report["factor"] == predictor.scale.factor
     assert report["frames"] == 3
@@ -115,35 +122,36 @@ def test_predict_finds_the_unknown_factor(
         ({"method": "auto", "store": True}, r"scale.store=true stores what is measured and scale.method is 'auto'"),
         ({"method": "none", "frames": 0}, r"scale.frames is 0"),
         ({"method": "speed", "fps": 0.0}, r"scale.fps is 0.0"),
+        (
+            {"camera_height": 1.65},
+            r"scale.camera_height is set and scale.method is 'auto'.*scale.method=camera_h",
+        ),
+        ({"method": "speed", "baseline": 0.5}, r"scale.baseline is set and scale.method is 'speed'"),
     ],
 )
 def test_what_is_missing_is_one_sentence(
     recording: Path, street: SyntheticDrive, scale: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message) as raised:
-        scale_predictor(configured(recording, street, **scale), TrueDepth(street))
+        measure(recording, street, TrueDepth(street), **scale)
     assert "\n" not in str(raised.value)
 
 
 def test_camera_height_needs_the_camera(recording: Path, street: SyntheticDrive) -> None:
-    cfg = configured(recording, street, method="camera_height", camera_height=1.65)
-    cfg.camera = None
     with pytest.raises(ConfigError, match="needs camera: fx,fy,cx,cy in pixels of the images"):
-        scale_predictor(cfg, TrueDepth(street))
+        measure(recording, street, TrueDepth(street), camera=None, method="camera_height", camera_height=1.65)
 
 
 def test_a_live_camera_is_not_measured(recording: Path, street: SyntheticDrive) -> None:
-    cfg = configured(recording, street, method="camera_height", camera_height=1.65)
-    cfg.input = "0"
     with pytest.raises(ConfigError, match="a live camera cannot be looked at beforehand"):
-        scale_predictor(cfg, TrueDepth(street))
+        measure(recording, street, TrueDepth(street), source="0", method="camera_height", camera_height=1.65)
 
 
 def test_stored_scale_is_used_or_left_out(recording: Path, street: SyntheticDrive) -> None:
     for method, expected in (("auto", 2.0), ("stored", 2.0), ("none", None)):
         predictor = TrueDepth(street)
         predictor.scale = Scale(2.0, "speed")
-        scale_predictor(configured(recording, street, method=method), predictor)
+        measure(recording, street, predictor, method=method)
         assert (predictor.scale and predictor.scale.factor) == expected
 
 

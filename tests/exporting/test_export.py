@@ -19,12 +19,13 @@ from torch import Tensor
 
 import saunet
 from saunet.errors import CheckpointError, ConfigError, DataError
-from saunet.exporting import export, exporters
+from saunet.exporting import exporters
+from saunet.exporting import tool as module
 from saunet.exporting.card import fingerprint
-from saunet.exporting.export import export_model
 from saunet.exporting.exporters import export_onnx, export_program
 from saunet.exporting.onnx import OnnxPredictor, open_session
 from saunet.exporting.parity import Parity
+from saunet.exporting.tool import ExportOptions, export
 from saunet.io.images import write_image
 from saunet.models.depth import DepthNet
 from saunet.prediction.predictor import Predictor
@@ -36,6 +37,11 @@ Node = Callable[..., dict[str, Any]]
 onnx = pytest.importorskip("onnx", reason="ONNX export needs saunet[export]")
 pytest.importorskip("onnxscript", reason="ONNX export needs saunet[export]")
 pytest.importorskip("onnxruntime", reason="ONNX export needs saunet[export]")
+
+
+def exported_files(checkpoint: Path, output: Path, formats: Any = None, **more: Any) -> list[Parity]:
+    chosen = {} if formats is None else {"formats": formats}
+    return list(export(ExportOptions(checkpoint=checkpoint, output=output, **chosen, **more)).reports)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +77,7 @@ def exported(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
         "images": 697,
     }
     (folder / "metrics.json").write_text(json.dumps({"protocols": [], "results": [row]}))
-    reports = export_model(checkpoint, folder / "model", images=folder / "road.png", evaluation=folder)
+    reports = exported_files(checkpoint, folder / "model", images=folder / "road.png", evaluation=folder)
     return folder / "model", reports
 
 
@@ -128,14 +134,16 @@ def test_predicting_from_onnx_does_not_import_torch(exported: tuple[Path, list[P
     write_image(tmp_path / "in" / "x.png", np.zeros((20, 30, 3), np.uint8))
     code = (
         "import sys, saunet\n"
-        "from saunet.prediction.files import predict_files\n"
+        "from saunet.prediction import PredictOptions, predict\n"
         "outputs = ('color', 'png16', 'npy', 'ply')\n"
-        "predict_files(saunet.load(sys.argv[1]), sys.argv[2], sys.argv[3], outputs, camera=(30, 30, 15, 10))\n"
+        "options = PredictOptions(checkpoint=sys.argv[1], input=sys.argv[2], output=sys.argv[3], outputs=outputs, "
+        "camera=(30, 30, 15, 10))\n"
+        "predict(options, saunet.load(sys.argv[1]))\n"
         "print([name for name in ('torch', 'lightning', 'onnx') if name in sys.modules])"
     )
     arguments = [str(exported[0] / "model.onnx"), str(tmp_path / "in"), str(tmp_path / "out")]
     result = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
+    assert result.stdout.splitlines()[-1] == "[]"
     assert (tmp_path / "out" / "x_disparity.png").exists()
 
 
@@ -170,15 +178,27 @@ def test_flip_averaging_is_that_of_the_network(
     assert flipping.fingerprint != saunet.load(exported[0] / "model.onnx").fingerprint
 
 
+def test_older_opset(checkpoint: Path, tmp_path: Path) -> None:
+    import onnx
+
+    (report,) = exported_files(checkpoint, tmp_path, ["onnx"], opset=18)
+    assert report.difference < 1e-5
+    made = onnx.load(tmp_path / "model.onnx")
+    assert [(each.domain, each.version) for each in made.opset_import] == [("", 18)]
+    assert made.ir_version == 8
+    with pytest.raises(ConfigError, match="opset is '19', allowed: 18, 20"):
+        exported_files(checkpoint, tmp_path, ["onnx"], opset=19)
+
+
 def test_a_folder_with_another_export_is_not_mixed(
     exported: tuple[Path, list[Parity]], checkpoint: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(exported[0], tmp_path / "out")
     with pytest.raises(ConfigError, match=r"holds config\.json already; choose another output folder"):
-        export_model(checkpoint, tmp_path / "out", ["safetensors"])
+        exported_files(checkpoint, tmp_path / "out", ["safetensors"])
     with pytest.raises(ConfigError, match="holds the model itself"):
-        export_model(tmp_path / "out", tmp_path / "out", ["safetensors"], overwrite=True)
-    export_model(exported[0], tmp_path / "out", ["safetensors"], overwrite=True)
+        exported_files(tmp_path / "out", tmp_path / "out", ["safetensors"], overwrite=True)
+    exported_files(exported[0], tmp_path / "out", ["safetensors"], overwrite=True)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "README.md", "config.json", "model.safetensors", "report.json",
     ]  # fmt: skip
@@ -188,9 +208,9 @@ def test_a_folder_with_another_export_is_not_mixed(
 def test_a_file_that_gives_nan_is_not_written(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(export._RUNNERS, "program", lambda path, record: lambda image: image[:, :1] * np.float32("nan"))
+    monkeypatch.setitem(module._RUNNERS, "program", lambda path, record: lambda image: image[:, :1] * np.float32("nan"))
     with pytest.raises(CheckpointError, match=r"model\.pt2 gives NaN where .*so it is not written"):
-        export_model(checkpoint, tmp_path / "out", ["program"])
+        exported_files(checkpoint, tmp_path / "out", ["program"])
     assert list((tmp_path / "out").iterdir()) == []
 
 
@@ -199,14 +219,14 @@ def test_settings_that_the_folder_cannot_hold(checkpoint: Path, tmp_path: Path) 
     content["saunet"]["data"]["far"] = float("inf")
     atomic_save(content, tmp_path / "far.ckpt")
     with pytest.raises(ConfigError, match=r"config\.json cannot hold the model's settings .*give finite numbers"):
-        export_model(tmp_path / "far.ckpt", tmp_path / "out", ["safetensors"])
+        exported_files(tmp_path / "far.ckpt", tmp_path / "out", ["safetensors"])
     assert not (tmp_path / "out").exists()
 
 
 def test_a_file_that_differs_is_not_written(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(export._RUNNERS, "program", lambda path, record: lambda image: image[:, :1] * 0 + 1)
+    monkeypatch.setitem(module._RUNNERS, "program", lambda path, record: lambda image: image[:, :1] * 0 + 1)
     with pytest.raises(CheckpointError, match=r"model\.pt2 differs from the network by .* so it is not written"):
-        export_model(checkpoint, tmp_path / "out", ["program"])
+        exported_files(checkpoint, tmp_path / "out", ["program"])
     assert list((tmp_path / "out").iterdir()) == []
 
 
@@ -230,7 +250,7 @@ def test_full_disk(checkpoint: Path, tmp_path: Path, name: str) -> None:
     code = (
         "import resource, signal, sys, torch\n"
         "from saunet.errors import DataError\n"
-        "from saunet.exporting.export import export_model\n"
+        "from saunet.exporting import ExportOptions, export\n"
         "def compiled(program, package_path):\n"
         "    torch.export.save(program, package_path)\n"
         "torch._inductor.aoti_compile_and_package = compiled\n"
@@ -238,7 +258,7 @@ def test_full_disk(checkpoint: Path, tmp_path: Path, name: str) -> None:
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
         "try:\n"
-        "    export_model(sys.argv[1], sys.argv[2], [sys.argv[3]])\n"
+        "    export(ExportOptions(checkpoint=sys.argv[1], output=sys.argv[2], formats=[sys.argv[3]]))\n"
         "except DataError as error:\n    print(error)\n"
     )
     arguments = [sys.executable, "-c", code, str(checkpoint), str(tmp_path / "out"), name]
@@ -296,7 +316,7 @@ def test_every_pair_exports_to_onnx(
 def test_compiled_package(checkpoint: Path, tmp_path: Path) -> None:
     if shutil.which("g++") is None:
         pytest.skip("AOTInductor needs a C++ compiler")
-    (report,) = export_model(checkpoint, tmp_path / "out", ["compiled"], batch="one")
+    (report,) = exported_files(checkpoint, tmp_path / "out", ["compiled"], batch="one")
     assert report.file == "model.aoti.pt2"
     assert report.difference < 1e-5
     image = torch.rand(1, 3, 32, 64)
@@ -309,13 +329,13 @@ def test_refused(
     network: DepthNet, record: ModelRecord, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(ConfigError, match="formats is 'onx'; did you mean 'onnx'"):
-        export_model(checkpoint, tmp_path, ["onx"])
+        exported_files(checkpoint, tmp_path, ["onx"])
     with pytest.raises(CheckpointError, match="no checkpoint at"):
-        export_model(tmp_path / "absent.ckpt", tmp_path)
+        exported_files(tmp_path / "absent.ckpt", tmp_path)
     with pytest.raises(ConfigError, match="formats is empty"):
-        export_model(checkpoint, tmp_path, [])
+        exported_files(checkpoint, tmp_path, [])
     with pytest.raises(DataError, match=r"cannot read .*metrics\.json: No such file"):
-        export_model(checkpoint, tmp_path, evaluation=tmp_path)
+        exported_files(checkpoint, tmp_path, evaluation=tmp_path)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match="needs the package onnx; run: pip install"):
         export_onnx(network, record, tmp_path / "x.onnx")

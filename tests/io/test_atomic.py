@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import math
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from saunet.errors import ConfigError, DataError
-from saunet.io.atomic import check_folder, replacing, write_bytes, write_json
+from saunet.io.atomic import check_folder, remove_partial_files, replacing, write_bytes, write_json
 
 
 def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -83,3 +85,23 @@ def test_a_folder_is_looked_at_and_not_made(tmp_path: Path) -> None:
         (tmp_path / "closed").mkdir(mode=0o500)
         with pytest.raises(ConfigError, match="no right to write to"):
             check_folder(tmp_path / "closed" / "x", ConfigError)
+
+
+def test_files_of_killed_processes_are_removed_and_no_others(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys\n"
+        "from saunet.io.atomic import replacing\n"
+        "with replacing(sys.argv[1]) as temporary:\n"
+        "    temporary.write_text('half')\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    (tmp_path / "deep").mkdir()
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "deep" / "a.png")], check=False)
+    (left,) = (tmp_path / "deep").iterdir()
+    (tmp_path / ".notes.1.partial.txt").touch()  # somebody else's
+    with replacing(tmp_path / "b.png") as ours:
+        ours.touch()
+        assert remove_partial_files(tmp_path) == [left]
+        assert ours.is_file()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".notes.1.partial.txt", "b.png", "deep"]
+    assert not left.exists()

@@ -259,3 +259,25 @@ def test_training_and_prediction_see_the_same_pixels(tmp_path: Path, size: tuple
     trained = dataset[0]["frames"][0].numpy()
     used = network_input(read_image(tmp_path / "x.png"), *size)
     assert np.array_equal(trained.astype(np.float32) / np.float32(255), used)
+
+
+def test_ten_and_twelve_bits_are_scaled_by_the_bits_in_use(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Machine vision cameras store them in 16-bit PNG; a dark frame among them is scaled like the others."""
+    ramp = np.linspace(0, 255, 60).astype(np.uint8)[None].repeat(20, 0)
+    for bits in (10, 12, 16):
+        full = np.round(ramp * ((2**bits - 1) / 255)).astype(np.uint16)
+        write_image(tmp_path / str(bits) / "0.png", full)
+        write_image(tmp_path / str(bits) / "1.png", (full // 8).astype(np.uint16))
+        for name, wanted in (("1.png", ramp / 8), ("0.png", ramp)):
+            assert np.abs(read_image(tmp_path / str(bits) / name)[..., 1].astype(float) - wanted).max() <= 1
+    said = [record.getMessage() for record in caplog.records]
+    assert [f"use {bits} bits" in text for bits, text in zip((10, 12), said, strict=True)] == [True, True]
+    twelve = np.dstack([ramp] * 3).astype(np.uint16) * 16
+    assert np.abs(as_rgb_bytes(twelve)[..., 0].astype(int) - ramp).max() <= 1
+
+
+def test_times_in_names_are_in_order() -> None:
+    """Seconds as Python writes them; without their decimals' zeros they are not in the order of whole numbers."""
+    times = ["1403636579.5", "1403636579.55", "1403636579.6", "1403636579.763555", "1403636580"]
+    assert sorted((f"{time}.png" for time in times[::-1]), key=natural_order) == [f"{time}.png" for time in times]
+    assert sorted(["shot_2.10.png", "shot_2.9.png"], key=natural_order) == ["shot_2.9.png", "shot_2.10.png"]

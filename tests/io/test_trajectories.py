@@ -91,3 +91,10 @@ def test_a_comment_is_no_frame_of_a_kitti_file(tmp_path):
     path.write_text(f"{row}# {row}{row}")
     with pytest.raises(DataError, match="line 2: expected 12 finite numbers"):
         read_kitti(path)
+
+
+def test_tum_wants_true_times(tmp_path):
+    for times in ([0.0, 1.0, 1.0], [0.0, 2.0, 1.0], [0.0, 1.0, np.nan]):
+        with pytest.raises(DataError, match="do not ascend"):
+            write_tum(tmp_path / "a.tum", poses(3), np.array(times))
+    assert list(tmp_path.iterdir()) == []

@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from predicting import run
 
-from saunet.errors import ConfigError, DataError
+from saunet.errors import ConfigError, SaunetError
 from saunet.io.colormaps import RunningRange, colorize
 from saunet.io.images import read_image, write_image
-from saunet.io.video import CameraReader, VideoReader, VideoWriter
+from saunet.io.video import CameraReader, VideoFrame, VideoReader, VideoWriter
 from saunet.prediction.odometer import Odometer
 from saunet.prediction.predictor import Predictor
-from saunet.prediction.video import predict_clip
 from saunet.prediction.viewer import ViewerWriter
 
 Picture = NDArray[np.uint8]
@@ -33,6 +33,10 @@ def clip(count: int) -> Iterator[Picture]:
     for index in range(count):
         row = (127 + 100 * np.sin((x + 4 * index) / 12)).astype(np.uint8)
         yield np.ascontiguousarray(np.broadcast_to(row[None, :, None], (48, 96, 3)))
+
+
+def timed(pictures: Iterator[Picture]) -> Iterator[VideoFrame]:
+    return (VideoFrame(number, number / 20, picture) for number, picture in enumerate(pictures))
 
 
 @pytest.fixture
@@ -57,13 +61,19 @@ def names(folder: Path) -> list[str]:
 def test_everything_at_once(predictor: Predictor, video: Path, tmp_path: Path, odometer: Odometer) -> None:
     before = video.read_bytes()
     out = tmp_path / "out"
-    summary = predict_clip(predictor, video, out, ALL, camera=[90.0], odometer=odometer, batch_size=2)
+    summary = run(predictor, video, out, ALL, camera=[90.0], odometer=odometer, batch_size=2)
     assert (summary.frames, summary.missing) == (5, 0)
     endings = ("_depth.npy", "_depth.png", "_disparity.png", "_points.ply")
     per_frame = [f"drive/{index:06d}{ending}" for index in range(5) for ending in endings]
-    whole = ["drive_disparity.mp4", "drive_points.html", "drive_trajectory.png", "drive_trajectory.txt"]
+    whole = [
+        "drive_disparity.mp4",
+        "drive_points.html",
+        "drive_trajectory.png",
+        "drive_trajectory.tum",
+        "drive_trajectory.txt",
+    ]
     assert names(out) == sorted(per_frame + whole)
-    assert {str(path) for path in summary.paths} == {str(out / name) for name in (*whole, "drive")}
+    assert {str(path) for path in summary.clips} == {str(out / name) for name in (*whole, "drive")}
     assert video.read_bytes() == before
     with VideoReader(out / "drive_disparity.mp4") as reader:
         assert reader.declared == 5
@@ -82,12 +92,12 @@ def test_everything_at_once(predictor: Predictor, video: Path, tmp_path: Path, o
 
 def test_results_are_not_replaced_unasked(predictor: Predictor, video: Path, tmp_path: Path) -> None:
     for outputs, name in ((("mp4",), "drive_disparity.mp4"), (("npy",), "drive")):
-        predict_clip(predictor, video, tmp_path / "out", outputs, max_frames=2)
+        run(predictor, video, tmp_path / "out", outputs, max_frames=2)
         with pytest.raises(ConfigError, match=f"{name} exists; choose another output folder, or set overwrite=true"):
-            predict_clip(predictor, video, tmp_path / "out", outputs)
-        assert predict_clip(predictor, video, tmp_path / "out", outputs, overwrite=True).frames == 5
+            run(predictor, video, tmp_path / "out", outputs)
+        assert run(predictor, video, tmp_path / "out", outputs, overwrite=True).frames == 5
     (tmp_path / "out" / "drive" / "notes_of_mine.txt").touch()
-    predict_clip(predictor, video, tmp_path / "out", ["png16"], overwrite=True, max_frames=1)
+    run(predictor, video, tmp_path / "out", ["png16"], overwrite=True, max_frames=1)
     assert names(tmp_path / "out" / "drive") == ["000000_depth.png", "notes_of_mine.txt"]
 
 
@@ -95,13 +105,11 @@ def test_folder_whose_results_lie_inside(predictor: Predictor, tmp_path: Path) -
     for index, frame in enumerate(clip(3)):
         write_image(tmp_path / "in" / f"{index}.png", frame)
     for _ in range(2):
-        summary = predict_clip(
-            predictor, tmp_path / "in", tmp_path / "in" / "depth", ["html"], camera=[90], overwrite=True
-        )
+        summary = run(predictor, tmp_path / "in", tmp_path / "in" / "depth", ["html"], camera=[90], overwrite=True)
         assert summary.frames == 3
         write_image(tmp_path / "in" / "depth" / "x.png", next(clip(1)))
     with pytest.raises(ConfigError, match="holds the originals"):
-        predict_clip(predictor, tmp_path / "in", tmp_path / "in", ["mp4"])
+        run(predictor, tmp_path / "in", tmp_path / "in", ["mp4"])
 
 
 def test_interrupt_and_failure_keep_finished_frames_and_nothing_half(predictor: Predictor, tmp_path: Path) -> None:
@@ -112,7 +120,7 @@ def test_interrupt_and_failure_keep_finished_frames_and_nothing_half(predictor: 
     for error in (KeyboardInterrupt, RuntimeError):
         out = tmp_path / error.__name__
         with pytest.raises(error):
-            predict_clip(predictor, frames(error), out, ["mp4", "html", "png16"], camera=[90])
+            run(predictor, frames(error), out, ["mp4", "html", "png16"], camera=[90])
         assert names(out) == ["frames/000000_depth.png", "frames/000001_depth.png"]
         assert cv2.imread(str(out / "frames" / "000001_depth.png"), cv2.IMREAD_UNCHANGED).dtype == np.uint16
 
@@ -122,20 +130,21 @@ def test_interrupting_a_camera_completes_everything(
 ) -> None:
     class Camera(CameraReader):
         def __init__(self, source: int) -> None:
-            self.fps, self.declared = 20.0, None
+            self.fps, self.height, self.width = 20.0, 48, 96
 
-        def __iter__(self) -> Iterator[Picture]:
-            yield from clip(4)
+        def frames(self, fps: Any = None) -> Iterator[VideoFrame]:
+            yield from timed(clip(4))
             raise KeyboardInterrupt
 
         def close(self) -> None:
             """Nothing to release."""
 
-    monkeypatch.setattr("saunet.prediction.clips.CameraReader", Camera)
-    summary = predict_clip(predictor, 0, tmp_path, ("mp4", "html", "trajectory"), camera=[90], odometer=odometer)
+    monkeypatch.setattr("saunet.prediction.sources.CameraReader", Camera)
+    summary = run(predictor, 0, tmp_path, ("mp4", "html", "trajectory"), camera=[90], odometer=odometer)
     assert summary.frames == 4
     assert names(tmp_path) == [
-        "camera0_disparity.mp4", "camera0_points.html", "camera0_trajectory.png", "camera0_trajectory.txt",
+        "camera0_disparity.mp4", "camera0_points.html", "camera0_trajectory.png", "camera0_trajectory.tum",
+        "camera0_trajectory.txt",
     ]  # fmt: skip
 
 
@@ -143,10 +152,10 @@ class RunningCamera(CameraReader):
     """Gives frames until somebody stops it."""
 
     def __init__(self, source: int) -> None:
-        self.fps, self.declared = 20.0, None
+        self.fps, self.height, self.width = 20.0, 48, 96
 
-    def __iter__(self) -> Iterator[Picture]:
-        return itertools.cycle(list(clip(4)))
+    def frames(self, fps: Any = None) -> Iterator[VideoFrame]:
+        return timed(itertools.cycle(list(clip(4))))
 
     def close(self) -> None:
         """Nothing to release."""
@@ -170,7 +179,7 @@ def ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type, str, lis
 
         monkeypatch.setattr(owner, method, pressed)
 
-    monkeypatch.setattr("saunet.prediction.clips.CameraReader", RunningCamera)
+    monkeypatch.setattr("saunet.prediction.sources.CameraReader", RunningCamera)
     yield press
     signal.signal(signal.SIGINT, before)
 
@@ -189,7 +198,7 @@ def test_ctrl_c_in_the_middle_of_a_frame_keeps_the_recording(
 ) -> None:
     ctrl_c(owner, method, [3])
     outputs = ("mp4", "html", "trajectory", "npy")
-    summary = predict_clip(predictor, 0, tmp_path, outputs, camera=[90], odometer=odometer)
+    summary = run(predictor, 0, tmp_path, outputs, camera=[90], odometer=odometer)
     assert summary.frames == 3
     with VideoReader(tmp_path / "camera0_disparity.mp4") as reader:
         assert len(list(reader)) == 3
@@ -204,14 +213,14 @@ def test_ctrl_c_pressed_twice_discards_the_recording(
     ctrl_c(ViewerWriter, "add", [2])
     ctrl_c(ViewerWriter, "add", [2])  # around the first
     with pytest.raises(KeyboardInterrupt):
-        predict_clip(predictor, 0, tmp_path, ("mp4", "html"), camera=[90])
+        run(predictor, 0, tmp_path, ("mp4", "html"), camera=[90])
     assert names(tmp_path) == []
 
 
 def test_refused(predictor: Predictor, video: Path, tmp_path: Path) -> None:
     def refused(outputs: list[str], **more: Any) -> str:
-        with pytest.raises((ConfigError, DataError)) as error:
-            predict_clip(predictor, video, tmp_path / "out", outputs, **more)
+        with pytest.raises(SaunetError) as error:
+            run(predictor, video, tmp_path / "out", outputs, **more)
         assert not (tmp_path / "out").exists()
         return str(error.value)
 
@@ -219,7 +228,7 @@ def test_refused(predictor: Predictor, video: Path, tmp_path: Path) -> None:
     assert "outputs is empty" in refused([])
     for output in ("ply", "html"):
         assert f"'{output}', which needs the camera's true intrinsics" in refused([output])
-    assert "needs a model with a pose network" in refused(["trajectory"])
+    assert "no checkpoint at" in refused(["trajectory"])
     assert "colormap is 'jet'" in refused(["mp4"], colormap="jet")
     assert "batch_size is 0" in refused(["mp4"], batch_size=0)
 
@@ -243,7 +252,7 @@ def test_memory_stays_flat_over_ten_thousand_frames(predictor: Predictor, tmp_pa
 
     tracemalloc.start()
     try:
-        summary = predict_clip(predictor, frames(), tmp_path, ("mp4", "trajectory"), odometer=odometer, batch_size=4)
+        summary = run(predictor, frames(), tmp_path, ("mp4", "trajectory"), odometer=odometer, batch_size=4)
     finally:
         tracemalloc.stop()
     assert summary.frames == 10_000

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from predicting import run
 
 from saunet.errors import ConfigError, DataError
-from saunet.io.colormaps import png16_to_depth
 from saunet.io.images import read_image, write_image
 from saunet.models.depth import DepthNet
-from saunet.prediction.files import MANIFEST, predict_files
+from saunet.prediction.files import MANIFEST
 from saunet.prediction.pointcloud import Camera
 from saunet.prediction.predictor import Predictor
 from saunet.prediction.sources import find_sources
@@ -31,12 +31,13 @@ def digest(folder: Path) -> dict[str, str]:
 
 def test_folder_with_all_outputs(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
     before = digest(folder)
-    summary = predict_files(predictor, folder, tmp_path / "out", ("color", "png16", "npy"), batch_size=2)
+    summary = run(predictor, folder, tmp_path / "out", ("color", "png16", "npy"), batch_size=2)
     stems = ["a", "b", "deep/c"]
     kinds = ["_depth.npy", "_depth.png", "_disparity.png"]
     assert names(tmp_path / "out") == sorted([stem + kind for stem in stems for kind in kinds] + [MANIFEST])
     assert len(summary.written) == 9
-    assert (summary.skipped, summary.failures) == (0, ())
+    assert (summary.skipped, summary.failures, summary.exit_code) == (0, (), 0)
+    assert "before" not in str(summary)
     assert digest(folder) == before
     depth = np.load(tmp_path / "out" / "deep" / "c_depth.npy")
     assert np.allclose(depth, predictor.predict(folder / "deep" / "c.png").depth, rtol=1e-5)
@@ -44,31 +45,31 @@ def test_folder_with_all_outputs(predictor: Predictor, folder: Path, tmp_path: P
 
     stored = cv2.imread(str(tmp_path / "out" / "deep" / "c_depth.png"), cv2.IMREAD_UNCHANGED)
     assert stored.dtype == np.uint16
-    assert np.abs(png16_to_depth(stored) - depth).max() <= 0.5 / 256 + 1e-5
+    assert np.abs(stored / 256 - depth).max() <= 0.5 / 256 + 1e-5
     assert read_image(tmp_path / "out" / "a_disparity.png").shape == (40, 90, 3)
 
 
 def test_second_run_skips_and_third_goes_on(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    predict_files(predictor, folder, out)
+    run(predictor, folder, out)
     before = digest(out)
-    again = predict_files(predictor, folder, out)
+    again = run(predictor, folder, out)
     assert (again.written, again.skipped) == ((), 3)
     (out / "a_depth.png").unlink()
-    more = predict_files(predictor, folder, out)
+    more = run(predictor, folder, out)
     assert [path.name for path in more.written] == ["a_depth.png"]
     assert digest(out) == before
-    assert len(predict_files(predictor, folder, out, overwrite=True).written) == 6
+    assert len(run(predictor, folder, out, overwrite=True).written) == 6
 
 
 def test_changed_image_is_predicted_again(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
-    predict_files(predictor, folder, tmp_path / "out")
+    run(predictor, folder, tmp_path / "out")
     write_image(folder / "a.png", np.zeros((8, 8, 3), np.uint8))
     import os
 
     future = (tmp_path / "out" / "a_depth.png").stat().st_mtime + 10
     os.utime(folder / "a.png", (future, future))
-    assert len(predict_files(predictor, folder, tmp_path / "out").written) == 2
+    assert len(run(predictor, folder, tmp_path / "out").written) == 2
 
 
 def test_interrupt_leaves_whole_files_and_resumes(
@@ -85,21 +86,21 @@ def test_interrupt_leaves_whole_files_and_resumes(
 
     monkeypatch.setattr(predictor, "predict_batch", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        predict_files(predictor, folder, out)
+        run(predictor, folder, out)
     assert names(out) == ["a_depth.png", "a_disparity.png", "b_depth.png", "b_disparity.png", MANIFEST]
-    assert predict_files(predictor, folder, out).skipped == 2
+    assert run(predictor, folder, out).skipped == 2
     assert len(names(out)) == 7
 
 
 def test_broken_images_are_reported_and_the_rest_is_done(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
     (folder / "0_broken.png").write_bytes(b"nothing")
     (folder / "z_empty.jpg").touch()
-    summary = predict_files(predictor, folder, tmp_path / "out", batch_size=2)
+    summary = run(predictor, folder, tmp_path / "out", batch_size=2)
     assert len(summary.written) == 6
     assert len(summary.failures) == 2
     assert "0_broken.png is not an image" in summary.failures[0]
     with pytest.raises(DataError, match=r"0_broken\.png is not an image"):
-        predict_files(predictor, folder / "0_broken.png", tmp_path / "other")
+        run(predictor, folder / "0_broken.png", tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
 
@@ -108,9 +109,9 @@ def test_camera_numbers_belong_to_the_first_image_that_can_be_read(
 ) -> None:
     (folder / "0_broken.png").write_bytes(b"nothing")
     numbers = (80.0, 80.0, 44.5, 19.5)
-    assert len(predict_files(predictor, folder, tmp_path / "out", ["ply"], camera=numbers).written) == 3
+    assert len(run(predictor, folder, tmp_path / "out", ["ply"], camera=numbers).written) == 3
     with pytest.raises(DataError, match=r"0_broken\.png is not an image"):
-        predict_files(predictor, folder / "0_broken.png", tmp_path / "other", ["ply"], camera=numbers)
+        run(predictor, folder / "0_broken.png", tmp_path / "other", ["ply"], camera=numbers)
     assert not (tmp_path / "other").exists()
 
 
@@ -123,10 +124,10 @@ def test_frames_come_in_the_order_of_their_numbers(picture: NDArray[np.uint8], t
 
 
 def test_single_image_glob_and_several(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
-    assert len(predict_files(predictor, folder / "a.png", tmp_path / "1").written) == 2
-    assert len(predict_files(predictor, str(folder / "**" / "*.png"), tmp_path / "2").written) == 4
+    assert len(run(predictor, folder / "a.png", tmp_path / "1").written) == 2
+    assert len(run(predictor, str(folder / "**" / "*.png"), tmp_path / "2").written) == 4
     assert (tmp_path / "2" / "deep" / "c_depth.png").exists()
-    both = predict_files(predictor, [folder / "a.png", str(folder / "*.jpg")], tmp_path / "3", ["npy"])
+    both = run(predictor, [folder / "a.png", str(folder / "*.jpg")], tmp_path / "3", ["npy"])
     assert [path.name for path in both.written] == ["a_depth.npy", "b_depth.npy"]
 
 
@@ -134,31 +135,31 @@ def test_same_name_with_two_endings(
     predictor: Predictor, folder: Path, tmp_path: Path, picture: NDArray[np.uint8]
 ) -> None:
     write_image(folder / "a.jpg", picture)
-    predict_files(predictor, folder, tmp_path / "out", ["color"])
+    run(predictor, folder, tmp_path / "out", ["color"])
     assert "a_jpg_disparity.png" in names(tmp_path / "out")
     assert "a_png_disparity.png" in names(tmp_path / "out")
 
 
 def test_output_below_the_input_is_not_read_back(predictor: Predictor, folder: Path) -> None:
-    predict_files(predictor, folder, folder / "depth")
-    assert predict_files(predictor, folder, folder / "depth").skipped == 3
+    run(predictor, folder, folder / "depth")
+    assert run(predictor, folder, folder / "depth").skipped == 3
 
 
 def test_point_clouds(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
     camera = Camera.from_numbers((80.0, 80.0, 44.5, 19.5), 40, 90)
     with pytest.raises(ConfigError, match="'ply', which needs the camera's true intrinsics"):
-        predict_files(predictor, folder, tmp_path / "out", ["ply"])
-    summary = predict_files(predictor, folder / "a.png", tmp_path / "out", ["ply"], camera=camera)
+        run(predictor, folder, tmp_path / "out", ["ply"])
+    summary = run(predictor, folder / "a.png", tmp_path / "out", ["ply"], camera=camera)
     assert [path.name for path in summary.written] == ["a_points.ply"]
     assert b"comment unit: relative" in summary.written[0].read_bytes()
-    numbers = predict_files(predictor, folder, tmp_path / "2", ["ply"], camera=(80.0, 80.0, 44.5, 19.5))
+    numbers = run(predictor, folder, tmp_path / "2", ["ply"], camera=(80.0, 80.0, 44.5, 19.5))
     assert numbers.written[0].read_bytes() == summary.written[0].read_bytes()
     with pytest.raises(ConfigError, match="intrinsics have 3 numbers"):
-        predict_files(predictor, folder, tmp_path / "3", ["ply"], camera=(80.0, 80.0, 44.5))
+        run(predictor, folder, tmp_path / "3", ["ply"], camera=(80.0, 80.0, 44.5))
     assert not (tmp_path / "3").exists()
     other = Camera.from_numbers((90.0, 80.0, 44.5, 19.5), 40, 90)
     with pytest.raises(ConfigError, match="made with another camera"):
-        predict_files(predictor, folder / "a.png", tmp_path / "out", ["ply"], camera=other)
+        run(predictor, folder / "a.png", tmp_path / "out", ["ply"], camera=other)
 
 
 class TestRefused:
@@ -167,7 +168,7 @@ class TestRefused:
         link.symlink_to(folder)
         for output in (folder, link):
             with pytest.raises(ConfigError, match="holds the originals"):
-                predict_files(predictor, str(folder / "*.png"), output)
+                run(predictor, str(folder / "*.png"), output)
         assert names(folder) == ["a.png", "b.jpg", "deep/c.png"]
 
     def test_output_folder_that_is_the_input_folder(self, predictor: Predictor, folder: Path) -> None:
@@ -176,7 +177,7 @@ class TestRefused:
             (folder / original).unlink()
         for given in (folder, str(folder / "*" / "*.png"), [folder / "deep", folder]):
             with pytest.raises(ConfigError, match=r"holds the originals \(.*c\.png\); choose another, such as .*depth"):
-                predict_files(predictor, given, folder)
+                run(predictor, given, folder)
         assert names(folder) == ["deep/c.png"]
 
     def test_results_that_would_lie_beside_an_original(
@@ -185,11 +186,11 @@ class TestRefused:
         for name in ("a/x.png", "a/a/y.png"):
             write_image(tmp_path / name, picture)
         with pytest.raises(ConfigError, match="holds the originals"):
-            predict_files(predictor, tmp_path / "a", tmp_path)
+            run(predictor, tmp_path / "a", tmp_path)
 
     def test_output_that_is_a_file(self, predictor: Predictor, folder: Path) -> None:
         with pytest.raises(ConfigError, match=r"a\.png is a file"):
-            predict_files(predictor, folder, folder / "a.png")
+            run(predictor, folder, folder / "a.png")
 
     def test_inputs(self, predictor: Predictor, tmp_path: Path) -> None:
         (tmp_path / "empty").mkdir()
@@ -200,7 +201,7 @@ class TestRefused:
             ([], "no input given"),
         ]:
             with pytest.raises(DataError, match=message):
-                predict_files(predictor, given, tmp_path / "out")
+                run(predictor, given, tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
     def test_two_images_for_one_result(self, folder: Path, tmp_path: Path, picture: NDArray[np.uint8]) -> None:
@@ -209,38 +210,38 @@ class TestRefused:
             find_sources([folder, tmp_path / "second"], tmp_path / "out")
 
     def test_outputs_and_colormap(self, predictor: Predictor, folder: Path, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="outputs is 'color'; did you mean 'color'"):
-            predict_files(predictor, folder, tmp_path / "out", ["color"])
+        with pytest.raises(ConfigError, match="outputs is 'colour'; did you mean 'color'"):
+            run(predictor, folder, tmp_path / "out", ["colour"])
         with pytest.raises(ConfigError, match="outputs is empty"):
-            predict_files(predictor, folder, tmp_path / "out", [])
+            run(predictor, folder, tmp_path / "out", [])
         with pytest.raises(ConfigError, match="colormap is 'jet'"):
-            predict_files(predictor, folder, tmp_path / "out", colormap="jet")
+            run(predictor, folder, tmp_path / "out", colormap="jet")
 
     @pytest.mark.parametrize("max_depth", [0.0, float("inf")])
     def test_farthest_depth(self, predictor: Predictor, folder: Path, tmp_path: Path, max_depth: float) -> None:
         with pytest.raises(ConfigError, match="max_depth is"):
-            predict_files(predictor, folder, tmp_path / "out", max_depth=max_depth)
+            run(predictor, folder, tmp_path / "out", max_depth=max_depth)
         assert not (tmp_path / "out").exists()
 
     def test_results_of_another_model(
         self, predictor: Predictor, network: DepthNet, folder: Path, tmp_path: Path
     ) -> None:
-        predict_files(predictor, folder, tmp_path / "out")
+        run(predictor, folder, tmp_path / "out")
         other = Predictor(network, 32, 64, flip=True)
         with pytest.raises(ConfigError, match="made with another model; choose another output folder"):
-            predict_files(other, folder, tmp_path / "out")
+            run(other, folder, tmp_path / "out")
         with pytest.raises(ConfigError, match="made with another colormap"):
-            predict_files(predictor, folder, tmp_path / "out", colormap="turbo")
-        predict_files(other, folder, tmp_path / "out", overwrite=True)
+            run(predictor, folder, tmp_path / "out", colormap="turbo")
+        run(other, folder, tmp_path / "out", overwrite=True)
         assert json.loads((tmp_path / "out" / MANIFEST).read_text())["model"] == other.fingerprint
 
     def test_damaged_manifest(self, predictor: Predictor, folder: Path, tmp_path: Path) -> None:
         (tmp_path / "out").mkdir()
         (tmp_path / "out" / MANIFEST).write_text("{")
         with pytest.raises(DataError, match=r"predictions\.json cannot be read"):
-            predict_files(predictor, folder, tmp_path / "out")
+            run(predictor, folder, tmp_path / "out")
 
     def test_folder_that_cannot_be_written(self, predictor: Predictor, folder: Path, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
         with pytest.raises(DataError, match="cannot write"):
-            predict_files(predictor, folder, tmp_path / "file" / "out")
+            run(predictor, folder, tmp_path / "file" / "out")

@@ -10,12 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from predicting import run
 
 from saunet.io.images import read_depth, read_image
 from saunet.io.video import VideoReader, VideoWriter
 from saunet.models.depth import DepthNet
 from saunet.prediction.odometer import Odometer
-from saunet.prediction.video import predict_clip
 
 DRIVE = Path("raw") / "2011_09_26" / "2011_09_26_drive_9005_sync" / "image_02" / "data"
 CAMERA = (721.5377, 721.5377, 608.5593, 171.854)
@@ -35,7 +35,7 @@ def video(kitti_mini: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def results(video: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Everything that `predict_clip` writes, by small untrained networks."""
+    """Everything that `predict` writes, by small untrained networks."""
     import torch
 
     from saunet.prediction.predictor import Predictor
@@ -46,9 +46,7 @@ def results(video: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results")
     outputs = ("mp4", "png16", "ply", "html", "trajectory")
     odometer = Odometer(poses.build("posecnn"), 64, 192)
-    summary = predict_clip(
-        Predictor(network, 64, 192), video, folder, outputs, camera=CAMERA, odometer=odometer, batch_size=4
-    )
+    summary = run(Predictor(network, 64, 192), video, folder, outputs, camera=CAMERA, odometer=odometer, batch_size=4)
     assert (summary.frames, summary.missing) == (48, 0)
     return folder
 

@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from predicting import run as predict_into
 
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import read_image, write_image
 from saunet.io.video import VideoReader
-from saunet.prediction.files import predict_files
-from saunet.prediction.pipeline import ImagePredictor
+from saunet.prediction.prediction import ImagePredictor
 from saunet.prediction.predictor import Predictor
-from saunet.prediction.recording import RecordingSummary, predict_recording
-from saunet.prediction.video import predict_clip
+from saunet.prediction.tool import PredictResult
 
 OUTPUTS = ("color", "npy", "mp4", "html")
 
@@ -46,9 +45,9 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.fixture
-def run(predictor: Predictor, frames: Path, tmp_path: Path) -> Callable[..., RecordingSummary]:
-    def now(outputs: Any = OUTPUTS, **more: Any) -> RecordingSummary:
-        return predict_recording(predictor, frames, tmp_path / "out", outputs, camera=[90], batch_size=2, **more)
+def run(predictor: Predictor, frames: Path, tmp_path: Path) -> Callable[..., PredictResult]:
+    def now(outputs: Any = OUTPUTS, **more: Any) -> PredictResult:
+        return predict_into(predictor, frames, tmp_path / "out", outputs, camera=[90], batch_size=2, **more)
 
     return now
 
@@ -58,13 +57,13 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def test_one_pass_gives_what_two_gave(
-    run: Callable[..., RecordingSummary], predictor: Predictor, frames: Path, tmp_path: Path, seen: list[int]
+    run: Callable[..., PredictResult], predictor: Predictor, frames: Path, tmp_path: Path, seen: list[int]
 ) -> None:
     summary = run()
     assert seen == [2, 2]
-    assert (summary.frames, len(summary.images.written), summary.images.skipped) == (4, 8, 0)
-    predict_files(predictor, frames, tmp_path / "two", ("color", "npy"), batch_size=2)
-    predict_clip(predictor, frames, tmp_path / "two", ("mp4", "html"), camera=[90], batch_size=2)
+    assert (summary.frames, len(summary.written), summary.skipped) == (4, 8, 0)
+    predict_into(predictor, frames, tmp_path / "two", ("color", "npy"), batch_size=2)
+    predict_into(predictor, frames, tmp_path / "two", ("mp4", "html"), camera=[90], batch_size=2, overwrite=True)
     found, wanted = content(tmp_path / "out"), content(tmp_path / "two")
     assert found.keys() == wanted.keys()
     for name in found.keys() - {"predictions.json", "drive_disparity.mp4"}:  # an mp4 may hold the time of day
@@ -77,13 +76,13 @@ def test_one_pass_gives_what_two_gave(
 
 
 def test_what_is_finished_is_skipped_and_the_rest_made(
-    run: Callable[..., RecordingSummary], frames: Path, tmp_path: Path, seen: list[int]
+    run: Callable[..., PredictResult], frames: Path, tmp_path: Path, seen: list[int]
 ) -> None:
     first = run()
     before = content(tmp_path / "out")
     seen.clear()
     again = run()
-    assert (seen, again.paths, again.skipped, again.images.skipped) == ([], (), first.paths, 4)
+    assert (seen, again.clips, again.finished, again.skipped) == ([], (), first.clips, 4)
     assert content(tmp_path / "out") == before
     (tmp_path / "out" / "frame_2_depth.npy").unlink()
     run()
@@ -92,47 +91,48 @@ def test_what_is_finished_is_skipped_and_the_rest_made(
     seen.clear()
     third = run()
     assert seen == [2, 2]
-    assert [path.name for path in third.paths] == ["drive_points.html"]
-    assert third.images.written == ()
+    assert [path.name for path in third.clips] == ["drive_points.html"]
+    assert third.written == ()
     assert content(tmp_path / "out").keys() == before.keys()
-    assert run(["mp4"]).skipped == (tmp_path / "out" / "drive_disparity.mp4",)
+    assert run(["mp4"]).finished == (tmp_path / "out" / "drive_disparity.mp4",)
 
 
 def test_clip_is_made_again_of_new_images(
-    run: Callable[..., RecordingSummary], frames: Path, tmp_path: Path, picture: NDArray[np.uint8]
+    run: Callable[..., PredictResult], frames: Path, tmp_path: Path, picture: NDArray[np.uint8]
 ) -> None:
-    made = run(["mp4"]).paths[0]
+    made = run(["mp4"]).clips[0]
     write_image(frames / "frame_11.png", picture)
     old = made.stat().st_mtime - 1000
     os.utime(frames / "frame_11.png", (old, old))  # copied with its date
-    assert run(["mp4"]).paths == (made,)
+    assert run(["mp4"]).clips == (made,)
     with VideoReader(made) as reader:
         assert reader.declared == 5
     later = made.stat().st_mtime + 1000
     os.utime(frames / "frame_3.png", (later, later))
-    assert run(["mp4"]).paths == (made,)
+    assert run(["mp4"]).clips == (made,)
 
 
 def test_what_others_made_is_not_replaced_unasked(
-    run: Callable[..., RecordingSummary], predictor: Predictor, frames: Path, tmp_path: Path
+    run: Callable[..., PredictResult], predictor: Predictor, frames: Path, tmp_path: Path
 ) -> None:
-    made = run(["mp4"]).paths[0]
+    made = run(["mp4"]).clips[0]
     before = made.read_bytes()
-    for setting in ({"layout": "beside"}, {"fps": 30}, {"memory": 0.5}, {"codec": "vp09"}):
+    for setting in ({"layout": "beside"}, {"fps": 30}, {"range_smoothing": 0.5}, {"codec": "vp09"}):
         with pytest.raises(ConfigError, match=r"drive_disparity\.mp4 exists; .* set overwrite=true"):
             run(["mp4"], **setting)
     with pytest.raises(ConfigError, match="holds predictions made with another colormap"):
         run(["mp4"], colormap="turbo")
     assert made.read_bytes() == before
-    assert run(["mp4"], fps=30, overwrite=True).paths == (made,)
-    assert run(["mp4"], fps=30).skipped == (made,)
-    predict_clip(predictor, frames, tmp_path / "other", ["mp4"])
+    assert run(["mp4"], fps=30, overwrite=True).clips == (made,)
+    assert run(["mp4"], fps=30).finished == (made,)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "drive_disparity.mp4").touch()
     with pytest.raises(ConfigError, match=r"drive_disparity\.mp4 exists"):
-        predict_recording(predictor, frames, tmp_path / "other", ["mp4"])
+        predict_into(predictor, frames, tmp_path / "other", ["mp4"])
 
 
 def test_broken_image_costs_the_clip_and_no_other_image(
-    run: Callable[..., RecordingSummary], frames: Path, tmp_path: Path, seen: list[int]
+    run: Callable[..., PredictResult], frames: Path, tmp_path: Path, seen: list[int]
 ) -> None:
     (frames / "frame_2.png").write_bytes(b"")
     with pytest.raises(
@@ -148,7 +148,7 @@ def test_broken_image_costs_the_clip_and_no_other_image(
 
 
 def test_interrupt_keeps_single_files_and_the_next_run_goes_on(
-    run: Callable[..., RecordingSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Callable[..., PredictResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original = ImagePredictor.predict_batch
     runs: list[int] = []
@@ -166,11 +166,11 @@ def test_interrupt_keeps_single_files_and_the_next_run_goes_on(
         "frame_1_depth.npy", "frame_1_disparity.png", "frame_2_depth.npy", "frame_2_disparity.png", "predictions.json",
     ]  # fmt: skip
     summary = run()
-    assert len(summary.images.written) == 4
-    assert len(summary.paths) == 2
+    assert len(summary.written) == 4
+    assert len(summary.clips) == 2
 
 
-def test_first_images_only(run: Callable[..., RecordingSummary], tmp_path: Path) -> None:
+def test_first_images_only(run: Callable[..., PredictResult], tmp_path: Path) -> None:
     assert run(max_frames=3).frames == 3
     assert read_image(tmp_path / "out" / "frame_3_disparity.png").shape == (40, 90, 3)
     assert not (tmp_path / "out" / "frame_10_disparity.png").exists()

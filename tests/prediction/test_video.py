@@ -12,15 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from predicting import run
 from videos import write_video
 
 from saunet.errors import ConfigError, DataError
 from saunet.io.colormaps import RunningRange
 from saunet.io.images import write_image
-from saunet.io.video import CameraReader, VideoReader, VideoWriter
+from saunet.io.video import CameraReader, VideoFrame, VideoReader, VideoWriter
 from saunet.prediction.predictor import Predictor
 from saunet.prediction.sinks import compose
-from saunet.prediction.video import render_video
+from saunet.prediction.sources import find_sources
 
 Picture = NDArray[np.uint8]
 
@@ -42,21 +43,19 @@ def video(tmp_path: Path) -> Path:
 
 def test_side_by_side_from_file(predictor: Predictor, video: Path, tmp_path: Path) -> None:
     before = video.read_bytes()
-    summary = render_video(predictor, video, tmp_path / "new" / "out.mp4")
+    summary = run(predictor, video, tmp_path / "new")
     assert (summary.frames, summary.missing) == (9, 0)
-    with VideoReader(summary.path) as reader:
+    with VideoReader(summary.clips[0]) as reader:
         assert (reader.height, reader.width) == (2 * (48 + 14), 96)
         assert len(list(reader)) == 9
     assert video.read_bytes() == before
-    assert [path.name for path in (tmp_path / "new").iterdir()] == ["out.mp4"]
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["in_disparity.mp4"]
 
 
 def test_side_by_side_from_frames(predictor: Predictor, tmp_path: Path) -> None:
-    summary = render_video(
-        predictor, clip(5), tmp_path / "out.mp4", fps=7, layout="beside", labels=False, colormap="turbo", max_frames=4
-    )
-    with VideoReader(summary.path) as reader:
-        assert (reader.height, reader.width, reader.declared) == (48, 192, 4)
+    summary = run(predictor, clip(5), tmp_path, fps=7, layout="beside", colormap="turbo", max_frames=4)
+    with VideoReader(summary.clips[0]) as reader:
+        assert (reader.height, reader.width, reader.declared) == (48 + 14, 192, 4)
         assert reader.fps == pytest.approx(7, rel=1e-3)
 
 
@@ -79,27 +78,28 @@ def test_colors_are_stable_over_a_clip() -> None:
     for _ in range(200):
         last = limits.update(ramp)
     assert last == pytest.approx(first, rel=1e-4)
-    with pytest.raises(ConfigError, match="memory is 1"):
+    with pytest.raises(ConfigError, match="range_smoothing is 1"):
         RunningRange(1.0)
 
 
 def test_folder_of_images_and_truncated_ones(predictor: Predictor, tmp_path: Path) -> None:
     for index, frame in enumerate(clip(3)):
         write_image(tmp_path / "in" / f"{index}.png", frame)
-    for source in (tmp_path / "in", str(tmp_path / "in" / "*.png")):
-        assert render_video(predictor, source, tmp_path / "out.mp4").frames == 3
+    for index, source in enumerate((tmp_path / "in", str(tmp_path / "in" / "*.png"))):
+        assert run(predictor, source, tmp_path / str(index), ["mp4"]).frames == 3
     (tmp_path / "in" / "1.png").write_bytes(b"")
-    (tmp_path / "out.mp4").unlink()
     with pytest.raises(DataError, match=r"1\.png is empty"):
-        render_video(predictor, tmp_path / "in", tmp_path / "out.mp4")
-    assert not (tmp_path / "out.mp4").exists()
+        run(predictor, tmp_path / "in", tmp_path / "out", ["mp4"])
+    assert not list((tmp_path / "out").glob("*"))
 
 
 def test_truncated_stream_gives_what_is_there_and_says_so(predictor: Predictor, tmp_path: Path) -> None:
     path = write_video(tmp_path / "x.avi", 20, codec="mjpeg")
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
-    summary = render_video(predictor, path, tmp_path / "out.mp4")
+    summary = run(predictor, path, tmp_path / "out")
     assert 5 < summary.frames < 15
+    assert summary.exit_code == 1
+    assert "truncated" in summary.failures[0]
     assert summary.frames + summary.missing == 20
 
 
@@ -116,7 +116,7 @@ def test_memory_stays_flat_over_a_long_clip(predictor: Predictor, tmp_path: Path
 
     if not Path("/proc/self/statm").exists():
         pytest.skip("no /proc to read the memory in use from")
-    assert render_video(predictor, frames(), tmp_path / "out.mp4").frames == 10_000
+    assert run(predictor, frames(), tmp_path).frames == 10_000
     assert used[-1] - used[0] < 10, f"MB in use every 1000 frames: {used}"
 
 
@@ -125,10 +125,10 @@ class FakeCamera(CameraReader):
 
     def __init__(self, source: int) -> None:
         assert source == 0
-        self.fps, self.declared = 20.0, None
+        self.fps, self.height, self.width = 20.0, 48, 96
 
-    def __iter__(self) -> Iterator[Picture]:
-        yield from clip(3)
+    def frames(self, fps: float | int | None = None) -> Iterator[VideoFrame]:
+        yield from (VideoFrame(number, number / 20, picture) for number, picture in enumerate(clip(3)))
         raise KeyboardInterrupt
 
     def close(self) -> None:
@@ -139,9 +139,9 @@ class TestUnfinished:
     def test_interrupting_a_camera_finishes_its_video(
         self, predictor: Predictor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("saunet.prediction.clips.CameraReader", FakeCamera)
-        assert render_video(predictor, 0, tmp_path / "out.mp4").frames == 3
-        with VideoReader(tmp_path / "out.mp4") as reader:
+        monkeypatch.setattr("saunet.prediction.sources.CameraReader", FakeCamera)
+        assert run(predictor, "0", tmp_path).frames == 3
+        with VideoReader(tmp_path / "camera0_disparity.mp4") as reader:
             assert reader.declared == 3
 
     def test_error_and_interrupt_leave_nothing(self, predictor: Predictor, tmp_path: Path) -> None:
@@ -151,19 +151,20 @@ class TestUnfinished:
 
         for error in (KeyboardInterrupt, RuntimeError):
             with pytest.raises(error):
-                render_video(predictor, frames(error), tmp_path / "out.mp4")
+                run(predictor, frames(error), tmp_path)
             assert list(tmp_path.iterdir()) == []
 
     def test_older_file_survives_a_failure(self, predictor: Predictor, video: Path) -> None:
         before = video.read_bytes()
+        older = video.rename(video.with_name("frames_disparity.mp4"))
         with pytest.raises(DataError, match="frame 1 is"):
-            render_video(predictor, [np.zeros((32, 32, 3), np.uint8), np.zeros((16, 32, 3), np.uint8)], video)
-        assert video.read_bytes() == before
-        assert [path.name for path in video.parent.iterdir()] == ["in.mp4"]
+            run(predictor, [np.zeros((side, 32, 3), np.uint8) for side in (32, 16)], older.parent, overwrite=True)
+        assert older.read_bytes() == before
+        assert list(older.parent.iterdir()) == [older]
 
     def test_no_frame_given(self, predictor: Predictor, tmp_path: Path) -> None:
-        with pytest.raises(DataError, match=r"no frame was given, so .*out\.mp4 was not written"):
-            render_video(predictor, [], tmp_path / "out.mp4")
+        with pytest.raises(DataError, match=r"no frame was given, so .*frames_disparity\.mp4 was not written"):
+            run(predictor, iter([]), tmp_path)
         assert list(tmp_path.iterdir()) == []
 
     def test_full_disk(self, tmp_path: Path) -> None:
@@ -188,18 +189,36 @@ class TestUnfinished:
         assert list(tmp_path.iterdir()) == []
 
 
+def test_times_are_kept(predictor: Predictor, tmp_path: Path) -> None:
+    """A phone's video at 20, then 10 frames per second, cut out of a longer one."""
+    true = [0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 1.0]
+    path = write_video(tmp_path / "phone.mp4", 8, times=true)
+    made = run(predictor, path, tmp_path / "out").clips[0]
+    assert [frame.time for frame in VideoReader(made).frames()] == pytest.approx(true, abs=1e-3)
+    slow = run(predictor, path, tmp_path / "out", fps=5, overwrite=True).clips[0]
+    assert [frame.time for frame in VideoReader(slow).frames()] == pytest.approx(np.arange(8) / 5, abs=1e-3)
+
+
+def test_what_is_no_frame_of_the_user_is_not_read(predictor: Predictor, tmp_path: Path) -> None:
+    """Resource forks of macOS, thumbnails of a NAS, checkpoints of notebooks; and folders behind links are read."""
+    for index, name in enumerate(
+        ("a/0.png", "a/@eaDir/0.png/THUMB.jpg", "a/.ipynb_checkpoints/0.png", "elsewhere/1.png")
+    ):
+        write_image(tmp_path / name, next(clip(1 + index)))
+    (tmp_path / "a" / "._0.png").write_bytes(b"\0\5\x16\7")
+    (tmp_path / "a" / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "back").symlink_to(tmp_path / "a")
+    assert [source.stem for source in find_sources(tmp_path / "a", tmp_path / "out")] == ["0", "link/1"]
+
+
 class TestRefused:
     def test_output(self, predictor: Predictor, video: Path, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="is the source; choose another name"):
-            render_video(predictor, video, video)
-        with pytest.raises(ConfigError, match=r"the suffix of x\.gif is '\.gif', allowed: \.mp4"):
-            render_video(predictor, video, tmp_path / "x.gif")
         (tmp_path / "file").touch()
         with pytest.raises(DataError, match="cannot write"):
-            render_video(predictor, video, tmp_path / "file" / "x.mp4")
+            run(predictor, video, tmp_path / "file")
 
     def test_words_and_numbers(self, predictor: Predictor, video: Path, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="layout is 'side'"):
-            render_video(predictor, video, tmp_path / "x.mp4", layout="side")
-        with pytest.raises(ConfigError, match="fps is 0"):
-            render_video(predictor, video, tmp_path / "x.mp4", fps=0.0)
+        for name, value in (("layout", "side"), ("fps", 0.0), ("codec", "avc1"), ("range_smoothing", 1.0)):
+            with pytest.raises(ConfigError, match=f"{name} is '?{value}"):
+                run(predictor, video, tmp_path / "x", **{name: value})  # type: ignore[arg-type]
+        assert not (tmp_path / "x").exists()

@@ -7,7 +7,7 @@ import itertools
 import json
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,17 @@ import pytest
 from saunet.errors import ConfigError, DataError
 from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import Prediction
-from saunet.prediction.viewer import write_viewer
+from saunet.prediction.viewer import ViewerWriter
 from saunet.runs.record import Scale
 
 CAMERA = Camera.from_numbers((120.0, 120.0, 79.5, 29.5), 60, 160)
+
+
+def write_viewer(path: Path, predictions: Iterable[Prediction], camera: Camera, **more: Any) -> int:
+    with ViewerWriter(path, camera, **more) as writer:
+        for prediction in predictions:
+            writer.add(prediction)
+    return writer.count
 
 
 def clip(count: int = 3) -> Iterator[Prediction]:

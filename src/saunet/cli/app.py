@@ -68,8 +68,13 @@ TOOLS: dict[str, Tool] = {
     ),
     "predict": Tool(
         "depth of an image, a folder, a video or a camera, as pictures, points and videos",
-        function="saunet.cli.predict:main",
-        examples=("predict checkpoint=last.ckpt input=road.png output=out",),
+        "saunet.prediction.tool:PredictOptions",
+        "saunet.prediction.tool:predict",
+        (
+            "predict road.png output=out",
+            "predict drive.mp4 checkpoint=last.ckpt output=out outputs=[mp4,html] camera=[90]",
+        ),
+        positional="input",
     ),
     "evaluate": Tool(
         "score a checkpoint, or predictions made elsewhere",
@@ -87,8 +92,10 @@ TOOLS: dict[str, Tool] = {
     ),
     "export": Tool(
         "write a checkpoint as files to deploy or share, each checked against the network",
-        function="saunet.cli.export:main",
-        examples=("export checkpoint=last.ckpt output=exported",),
+        "saunet.exporting.tool:ExportOptions",
+        "saunet.exporting.tool:export",
+        ("export last.ckpt output=exported",),
+        positional="checkpoint",
     ),
     "report": Tool(
         "one page of tables, curves and pictures from finished runs; how runs differ",

@@ -14,7 +14,7 @@ from saunet.evaluation.tool import evaluate_network
 from saunet.io.images import write_image
 from saunet.prediction.panel import depth_panel
 from saunet.prediction.predictor import Predictor
-from saunet.prediction.video import render_video
+from saunet.prediction.tool import PredictOptions, predict
 from saunet.tables import show
 from saunet.training.tool import TrainOptions, train
 
@@ -60,4 +60,10 @@ def draw(predictor: Predictor, drive: Drive, folder: Path) -> None:
         prediction = predictor.predict(drive.image(frame))
         panels.append(depth_panel(prediction.image, prediction.disparity, drive.depth(frame), tile_width=384))
     write_image(folder / "depth.png", np.concatenate(panels, axis=1))
-    render_video(predictor, (drive.image(frame) for frame in frames), folder / "depth.mp4")
+    options = PredictOptions(
+        checkpoint=folder / "checkpoints" / "best.ckpt",
+        input=(drive.image(frame) for frame in frames),
+        output=folder,
+        overwrite=True,
+    )
+    predict(options, predictor).clips[0].replace(folder / "depth.mp4")

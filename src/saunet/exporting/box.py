@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, ConfigError, SaunetError
 from saunet.exporting.card import describe_node, quality_lines
-from saunet.exporting.export import named_state, public_record, random_images, read_metrics, real_images
+from saunet.exporting.tool import named_state, public_record, random_images, read_metrics, real_images
 from saunet.io.atomic import replacing, write_bytes, write_json
 from saunet.models.depth import DepthNet
 from saunet.prediction.prediction import unit_of

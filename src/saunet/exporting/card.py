@@ -19,14 +19,7 @@ def model_card(
     metrics: Mapping[str, Any] | None = None,
     splits: Mapping[str, str] | None = None,
 ) -> str:
-    """Return the card as Markdown.
-
-    Args:
-        record: The model's record.
-        reports: How the exported files compare with the original.
-        metrics: Content of an evaluation's ``metrics.json``.
-        splits: Fingerprints of the frames of each split.
-    """
+    """Return the card as Markdown."""
     parts = {"encoder": record.encoder, "decoder": record.decoder, "pose": record.pose}
     data = record.to_plain()["data"]
     lines = [

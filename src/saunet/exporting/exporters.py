@@ -8,6 +8,7 @@ import io
 import json
 import logging
 import shutil
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -29,17 +30,17 @@ from saunet.runs.record import ModelRecord
 BATCHES: tuple[str, ...] = ("auto", "any", "one")
 """``any``: any number of images at once. ``one``: exactly one. ``auto``: any where the network allows it, else one."""
 Batch = Literal["any", "one"]
+OPSETS: tuple[int, ...] = (18, 20)
+"""Of ONNX: 20 by default; 18 for older runtimes (TensorRT before 10, JetPack before 6.1, onnxruntime from 1.14)."""
+_IR_VERSIONS = {18: 8, 20: 10}
+"""The file format's version that runtimes of an opset's time read."""
 
 _LARGEST_BATCH = 256
 _TRACING_ERRORS = (UserError, RuntimeError, ValueError)
 
 
 class FinestDisparity(nn.Module):
-    """A depth network that returns only its full-resolution disparity: what is exported.
-
-    Args:
-        network: The depth network.
-    """
+    """A depth network that returns only its full-resolution disparity: what is exported."""
 
     def __init__(self, network: DepthNet) -> None:
         super().__init__()
@@ -50,21 +51,10 @@ class FinestDisparity(nn.Module):
         return self.network(image).disparity[0]  # type: ignore[no-any-return]
 
 
-def export_onnx(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> Batch:
-    """Write a depth network as ONNX, with its record inside, so that one file is enough to predict from.
-
-    Args:
-        network: The network.
-        record: Its record; gives the input size and goes into the file.
-        path: The file to write.
-        batch: How many images it takes at once; see `BATCHES`.
-
-    Returns:
-        How many images the file takes at once.
-
-    Raises:
-        ConfigError: if the packages are missing, or the network cannot be exported this way.
-    """
+def export_onnx(
+    network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto", opset: int = OPSETS[-1]
+) -> Batch:
+    """Write a depth network as ONNX, with its record inside, so that one file is enough to predict from."""
     for package in ("onnx", "onnxscript"):
         if importlib.util.find_spec(package) is None:
             raise ConfigError(f"ONNX export needs the package {package}; run: pip install 'saunet[export]'")
@@ -74,11 +64,15 @@ def export_onnx(network: DepthNet, record: ModelRecord, path: str | Path, batch:
     try:
         with _quiet():
             exported: Any = torch.onnx.export(
-                program, input_names=[INPUT], output_names=[OUTPUT], dynamo=True, verbose=False
+                program, input_names=[INPUT], output_names=[OUTPUT], opset_version=opset, dynamo=True, verbose=False
             )
     except torch.onnx.OnnxExporterError as reason:
         names = f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
         raise ConfigError(f"{names} cannot be exported to ONNX; export the format 'program'") from reason
+    if exported.model.opset_imports[""] != opset:
+        names = f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
+        raise ConfigError(f"{names} has operations that opset {opset} does not have; export with opset={OPSETS[-1]}")
+    exported.model.ir_version = _IR_VERSIONS[opset]
     exported.model.metadata_props[METADATA] = json.dumps(record.to_plain())
     exported.save(str(path))
     return takes
@@ -89,12 +83,11 @@ def export_program(network: DepthNet, record: ModelRecord, path: str | Path, bat
 
     See `export_onnx` for the arguments.
 
-    Raises:
-        ConfigError: if the network cannot be exported this way.
     """
     program, takes = _program(network, record, batch)
     content = io.BytesIO()  # torch's own writer, on a full disk, cannot even be closed and ends the process
-    torch.export.save(program, content, extra_files={METADATA: json.dumps(record.to_plain())})
+    with _quiet():
+        torch.export.save(program, content, extra_files={METADATA: json.dumps(record.to_plain())})
     Path(path).write_bytes(content.getbuffer())
     return takes
 
@@ -105,15 +98,13 @@ def export_compiled(network: DepthNet, record: ModelRecord, path: str | Path, ba
     ``torch._inductor.aoti_load_package(path)(image)`` runs it, and so does C++ with libtorch, without Python. See
     `export_onnx` for the arguments.
 
-    Raises:
-        ConfigError: if there is no C++ compiler, or the network cannot be compiled this way.
     """
     if shutil.which("g++") is None and shutil.which("clang++") is None and shutil.which("cl") is None:
         raise ConfigError("the format 'compiled' needs a C++ compiler and found none; install g++, or leave it out")
     program, takes = _program(network, record, batch)
     content = io.BytesIO()
     try:
-        with torch.no_grad():
+        with torch.no_grad(), _quiet():
             torch._inductor.aoti_compile_and_package(program, package_path=content)
     except RuntimeError as reason:
         raise ConfigError(f"compiling failed: {str(reason).strip().splitlines()[0]}; export 'program'") from reason
@@ -142,7 +133,8 @@ def run_onnx(path: Path) -> Run:
 
 def run_program(path: Path) -> Run:
     """Return a torch.export program as a function of arrays."""
-    return _run_module(torch.export.load(path).module())
+    with _quiet():
+        return _run_module(torch.export.load(path).module())
 
 
 def run_compiled(path: Path) -> Run:
@@ -186,13 +178,16 @@ def _trace(module: nn.Module, image: Tensor, dynamic: bool) -> torch.export.Expo
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the exporter's notes about packages that saunet does not use."""
+    """Silence notes of torch's exporters that no user can act on."""
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.ERROR)
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=r".*LeafSpec", category=FutureWarning)
+            warnings.filterwarnings("ignore", message="No complete tensor found")  # of views: the one returned is whole
+            yield
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)

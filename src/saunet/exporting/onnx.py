@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from saunet.errors import CheckpointError, ConfigError
 from saunet.io.plain import parse_json
-from saunet.prediction.pipeline import ImagePredictor
+from saunet.prediction.prediction import ImagePredictor
 from saunet.runs.record import ModelRecord
 
 INPUT, OUTPUT = "image", "disparity"
@@ -23,7 +23,7 @@ class OnnxPredictor(ImagePredictor):
     """Predicts depth with an exported network; the counterpart of `saunet.prediction.Predictor`.
 
     Args:
-        path: A ``model.onnx`` written by `saunet.exporting.export.export_model`.
+        path: A ``model.onnx`` written by `saunet.exporting.export`.
         device: ``"cpu"`` or ``"cuda"`` (with onnxruntime-gpu).
         threads: Threads to use; 0 lets onnxruntime choose.
         flip: Average with the prediction of the mirrored image (twice the time, a little less error).
@@ -87,18 +87,7 @@ def flip_blend(
 
 
 def open_session(path: Path, device: str = "cpu", threads: int = 0, spinning: bool = True) -> Any:
-    """Open an ONNX file with onnxruntime.
-
-    Args:
-        path: The file.
-        device: ``cpu`` or ``cuda``, with or without a number.
-        threads: Of the CPU; 0 lets onnxruntime choose.
-        spinning: Let threads that wait for work keep their cores busy, for a while also after a run.
-
-    Raises:
-        CheckpointError: if the file is missing or broken.
-        ConfigError: if onnxruntime is missing or does not support the device.
-    """
+    """Open an ONNX file with onnxruntime."""
     try:
         import onnxruntime
     except ImportError as missing:

@@ -46,18 +46,7 @@ def compare(
     batch: str = "one",
     megabytes: float = 0.0,
 ) -> Parity:
-    """Compare an exported file with the original, one image at a time, and where it takes any number, all at once too.
-
-    Args:
-        file: Its name, for the report.
-        eager: The original.
-        exported: The exported file.
-        random: Inputs, each 1 x 3 x h x w.
-        real: Further inputs, made of real images.
-        span: Largest minus smallest disparity that the network can give.
-        batch: How many images the file takes at once.
-        megabytes: Size of the file, for the report.
-    """
+    """Compare an exported file with the original on single images and, where it takes any number, on all at once."""
     inputs = [*random, *real]
     if batch == "any":
         inputs.append(np.concatenate(inputs[-4:]))
@@ -73,27 +62,13 @@ def compare(
 def timed(
     reports: Sequence[Parity], eager: Run, exported: Sequence[Run], image: NDArray[np.float32], repeats: int = 11
 ) -> list[Parity]:
-    """Return the comparisons with times: of the original, which is the same in all, and of each file.
-
-    Args:
-        reports: The comparisons.
-        eager: The original.
-        exported: The exported file of each comparison.
-        image: The input, 1 x 3 x h x w.
-        repeats: Calls of each that count.
-    """
+    """Return the comparisons with times: of the original, which is the same in all, and of each file."""
     first, *others = milliseconds([eager, *exported], image, repeats)
     return [replace(report, eager_ms=first, exported_ms=own) for report, own in zip(reports, others, strict=True)]
 
 
 def milliseconds(runs: Sequence[Run], image: NDArray[np.float32], repeats: int = 11) -> list[float]:
-    """Return the median milliseconds of calls of each, taken in turn, after two that do not count.
-
-    Args:
-        runs: What is called.
-        image: What it is called with, 1 x 3 x h x w.
-        repeats: Calls that count.
-    """
+    """Return the median milliseconds of calls of each, taken in turn, after two that do not count."""
     times = np.zeros((repeats + 2, len(runs)))
     for row in times:
         for index, run in enumerate(runs):

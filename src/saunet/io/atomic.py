@@ -3,12 +3,39 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
+import platform
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 from saunet.errors import DataError, SaunetError
+
+_HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
+_PARTIAL = re.compile(rf"\..*\.{_HOST}\.(\d+)\.partial(\.\w+)?")
+
+
+def remove_partial_files(folder: str | Path) -> list[Path]:
+    """Remove what `replacing` left below a folder in processes of this machine that were killed; return what it was."""
+    found = ((path, _PARTIAL.fullmatch(path.name)) for path in Path(folder).rglob(".*.partial*"))
+    gone = [path for path, name in found if name and path.is_file() and not process_lives(int(name[1]))]
+    for path in gone:
+        with contextlib.suppress(OSError):
+            path.unlink()
+    return gone
+
+
+def process_lives(pid: int) -> bool:
+    """Return whether a process of this machine exists."""
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it exists and belongs to someone else
+        return True
+    return True
 
 
 @contextlib.contextmanager
@@ -18,18 +45,9 @@ def replacing(path: str | Path, error: type[SaunetError] = DataError) -> Iterato
     The temporary name keeps the suffix, for writers that choose a format by it. Missing parent folders are made. Nobody
     ever reads half a file, even after Ctrl-C, a full disk or a power cut (data reach the disk before the name does).
 
-    Args:
-        path: The file to write.
-        error: What to raise when the system refuses.
-
-    Yields:
-        The path to write to, in the same folder.
-
-    Raises:
-        SaunetError: of class ``error``, naming the file and the system's reason, if it cannot be written.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem[:100]}.{os.getpid()}.partial{path.suffix}")
+    temporary = path.with_name(f".{path.stem[:100]}.{_HOST}.{os.getpid()}.partial{path.suffix}")
     try:
         if path.is_dir():
             raise error(f"cannot write {path}: a folder has this name; choose another name")
@@ -48,15 +66,7 @@ def replacing(path: str | Path, error: type[SaunetError] = DataError) -> Iterato
 
 
 def check_folder(folder: str | Path, error: type[SaunetError] = DataError) -> None:
-    """Check that files can be written to a folder, which need not exist, before anything long is started.
-
-    Args:
-        folder: The folder; nothing is made.
-        error: What to raise otherwise.
-
-    Raises:
-        SaunetError: of class ``error``, if a file is in the way or the rights are missing.
-    """
+    """Check that files can be written to a folder, which need not exist, before anything long is started."""
     place = Path(folder).absolute()
     while not os.path.lexists(place):
         place = place.parent
@@ -67,27 +77,13 @@ def check_folder(folder: str | Path, error: type[SaunetError] = DataError) -> No
 
 
 def write_bytes(path: str | Path, data: bytes, error: type[SaunetError] = DataError) -> None:
-    """Write ``data`` to ``path``, whole or not at all.
-
-    Raises:
-        SaunetError: of class ``error``, if the system refuses.
-    """
+    """Write ``data`` to ``path``, whole or not at all."""
     with replacing(path, error) as temporary:
         temporary.write_bytes(data)
 
 
 def write_json(path: str | Path, content: object, error: type[SaunetError] = DataError, indent: int | None = 2) -> None:
-    """Write plain data to ``path`` as JSON in UTF-8, whole or not at all.
-
-    Args:
-        path: The file to write.
-        content: Dictionaries, lists, text, numbers, booleans and None.
-        error: What to raise when it cannot be written.
-        indent: Spaces a level; None puts everything on one line.
-
-    Raises:
-        SaunetError: of class ``error``, if the system refuses, or a number is NaN or infinite, which JSON cannot say.
-    """
+    """Write plain data to ``path`` as JSON in UTF-8, whole or not at all."""
     try:
         text = json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=False)
     except ValueError as reason:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Shaped, UInt8, UInt16
+from jaxtyping import Bool, Float, UInt8, UInt16
 
 from saunet.errors import ConfigError, in_range, one_of
 
@@ -21,11 +21,7 @@ _DEPTH_STEPS_PER_METRE = 256
 
 
 def value_range(values: Float[np.ndarray, "..."], low: float = 0.5, high: float = 98.0) -> tuple[float, float]:
-    """Return the percentiles ``low`` and ``high`` of the finite values: a range that a few outliers cannot stretch.
-
-    Returns:
-        Two different numbers, also for a constant map; (0, 1) where nothing is finite.
-    """
+    """Return the percentiles ``low`` and ``high`` of the finite values: a range that a few outliers cannot stretch."""
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return 0.0, 1.0
@@ -34,22 +30,18 @@ def value_range(values: Float[np.ndarray, "..."], low: float = 0.5, high: float 
 
 
 class RunningRange:
-    """Color limits that follow a clip slowly: an exponential mean of each frame's range.
+    """Color limits that follow a clip slowly: an exponential mean of each frame's range."""
 
-    Args:
-        memory: Weight of the past in [0, 1); 0 takes each frame's own range.
-    """
-
-    def __init__(self, memory: float = 0.95) -> None:
-        self.memory = in_range("memory", memory, 0.0, 0.999999)
+    def __init__(self, smoothing: float | int = 0.95) -> None:
+        self.smoothing = in_range("range_smoothing", smoothing, 0.0, 0.999999)
         self._limits: tuple[float, float] | None = None
 
     def update(self, values: Float[np.ndarray, "h w"]) -> tuple[float, float]:
         """Return the limits after seeing one more frame; the first frame sets them."""
         low, high = value_range(values)
         if self._limits is not None:
-            low = self.memory * self._limits[0] + (1 - self.memory) * low
-            high = self.memory * self._limits[1] + (1 - self.memory) * high
+            low = self.smoothing * self._limits[0] + (1 - self.smoothing) * low
+            high = self.smoothing * self._limits[1] + (1 - self.smoothing) * high
         self._limits = (low, high)
         return self._limits
 
@@ -60,17 +52,7 @@ def colorize(
     colormap: str = "magma",
     mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Paint a map of numbers; disparity comes out bright where it is near.
-
-    Args:
-        values: What to paint. Values that are not finite come out black.
-        limits: Values of the darkest and the brightest color; the map's own `value_range` by default.
-        colormap: Color map.
-        mask: Where given, everything outside comes out black.
-
-    Raises:
-        ConfigError: if the limits are not ascending or the colormap is unknown.
-    """
+    """Paint a map of numbers; disparity comes out bright where it is near."""
     one_of("colormap", colormap, COLORMAPS)
     shown = np.isfinite(values) if mask is None else np.isfinite(values) & mask
     if limits is None:
@@ -96,8 +78,3 @@ def depth_to_png16(depth: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]
     valid = np.isfinite(depth) & (depth > 0)
     steps = np.round(np.where(valid, depth, 0).astype(np.float64) * _DEPTH_STEPS_PER_METRE)
     return np.where(valid, np.clip(steps, 1, 65535), 0).astype(np.uint16)
-
-
-def png16_to_depth(values: Shaped[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Return depth in meters from KITTI's 16-bit integers, 0 where unknown."""
-    return values.astype(np.float32) / np.float32(_DEPTH_STEPS_PER_METRE)

@@ -6,8 +6,11 @@ written whole. There is one reader and one resize, so that a model sees in use w
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import re
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +26,17 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".
 """File name endings that are taken for images when a folder is read."""
 
 
-def natural_order(name: str | Path) -> tuple[list[tuple[int, int, str]], str]:
+_NUMBER = re.compile(r"(\d{9,}\.\d+|\d+)", re.ASCII)
+"""A number in a name; with decimals only where they are those of a time, in seconds since 1970."""
+
+
+def natural_order(name: str | Path) -> tuple[list[tuple[int, int | Fraction, str]], str]:
     """Return the key that sorts names of files by the numbers in them: ``frame_2`` before ``frame_10``."""
     text = str(name)
-    parts = [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", text)]
+    parts: list[tuple[int, int | Fraction, str]] = [
+        (0, Fraction(part) if "." in part else int(part), "") if index % 2 else (1, 0, part)
+        for index, part in enumerate(_NUMBER.split(text))
+    ]
     return parts, text  # frame_1 and frame_01 are equal as numbers
 
 
@@ -58,11 +68,7 @@ def frame_order(names: Sequence[str]) -> list[int]:
 
 
 def read_bytes(path: str | Path) -> UInt8[np.ndarray, " n"]:
-    """Return the content of a file that should not be empty.
-
-    Raises:
-        DataError: if it is missing, a folder, empty or not readable.
-    """
+    """Return the content of a file that should not be empty."""
     path = Path(path)
     try:
         data = np.fromfile(path, np.uint8)  # also for images: imread cannot open every unicode path on every system
@@ -80,22 +86,17 @@ def read_bytes(path: str | Path) -> UInt8[np.ndarray, " n"]:
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     """Read an image file as RGB bytes.
 
-    Gray images get three equal channels, 16-bit ones are scaled so that white stays white, transparency is dropped,
-    and the camera's EXIF rotation is applied.
+    Gray images get three equal channels, 16-bit ones are scaled by the bits that the images of their folder use (16, 12
+    or 10), so that white stays white, transparency is dropped, and the camera's EXIF rotation is applied.
 
-    Raises:
-        DataError: naming the file, if it is missing, empty, truncated, broken or not an image.
     """
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    return as_rgb_bytes(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), str(path))
+    image = _decode(path, _COLOR)
+    bits = 8 if image.dtype == np.uint8 else max(_folder_bits(Path(path)), _bits(image))
+    return as_rgb_bytes(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), str(path), bits)
 
 
 def read_depth(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """Return a depth map stored as KITTI does: 16-bit PNG, 256 a meter, 0 where unknown.
-
-    Raises:
-        DataError: if it is missing, broken or not a 16-bit image.
-    """
+    """Return a depth map stored as KITTI does: 16-bit PNG, 256 a meter, 0 where unknown."""
     stored = _decode(path, cv2.IMREAD_UNCHANGED)
     if stored.dtype != np.uint16 or stored.ndim != 2:
         raise DataError(
@@ -105,11 +106,7 @@ def read_depth(path: str | Path) -> Float32[np.ndarray, "h w"]:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Return (height, width) of an image as `read_image` gives it; a PNG is not decoded for that, unless it is turned.
-
-    Raises:
-        DataError: if it is missing, empty or not an image.
-    """
+    """Return (height, width) of an image as `read_image` gives it, without decoding a PNG that is not rotated."""
     data = read_bytes(path).tobytes()
     # A PNG's EXIF rotation may stand before or after the picture.
     if data[:8] == b"\x89PNG\r\n\x1a\n" and data[12:16] == b"IHDR" and len(data) >= 24 and b"eXIf" not in data:
@@ -118,19 +115,18 @@ def image_size(path: str | Path) -> tuple[int, int]:
     return shape[0], shape[1]
 
 
-def as_rgb_bytes(image: Shaped[np.ndarray, "..."], name: str = "the image") -> UInt8[np.ndarray, "h w 3"]:
-    """Return an image array as h x w x 3 bytes: gray is repeated, a fourth channel dropped, 16 bits scaled down.
-
-    Raises:
-        DataError: for another shape, an empty image, or numbers that are neither 8 nor 16 bits.
-    """
+def as_rgb_bytes(
+    image: Shaped[np.ndarray, "..."], name: str = "the image", bits: int | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return an image array as h x w x 3 bytes: gray is repeated, a fourth channel dropped, 16 bits scaled down."""
     if image.ndim == 2:
         image = image[:, :, None]
     if image.ndim != 3 or image.shape[2] not in (1, 3, 4) or image.size == 0:
         raise DataError(f"{name} has shape {image.shape}; it must be h x w, h x w x 1, h x w x 3 (RGB) or h x w x 4")
     image = image[:, :, :3] if image.shape[2] > 1 else np.repeat(image, 3, axis=2)
     if image.dtype == np.uint16:
-        image = np.round(image / 257.0).astype(np.uint8)
+        white = 2 ** (bits or _bits(image)) - 1
+        image = np.round(image / (white / 255.0)).clip(0, 255).astype(np.uint8)
     if image.dtype != np.uint8:
         raise DataError(
             f"{name} has numbers of type {image.dtype}; it must be 8-bit or 16-bit unsigned (0 to 255 or 65535)"
@@ -138,15 +134,41 @@ def as_rgb_bytes(image: Shaped[np.ndarray, "..."], name: str = "the image") -> U
     return np.ascontiguousarray(image)
 
 
+_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+_SAMPLED = 8  # images of a folder that are looked at for the bits in use
+_known_bits: dict[Path, int] = {}
+
+
+def _bits(image: NDArray[Any]) -> int:
+    """Return how many of 16 bits an image uses: sensors of 10 or 12 bits leave the upper ones 0."""
+    brightest = int(image.max()) if image.dtype == np.uint16 and image.size else 0
+    return 10 if 0 < brightest < 2**10 else 12 if 0 < brightest < 2**12 else 16
+
+
+def _folder_bits(path: Path) -> int:
+    """Return the bits that a folder's 16-bit images use, by some of them, so that all are scaled alike; say it once."""
+    folder = path.resolve().parent
+    if folder not in _known_bits:
+        beside = sorted((p for p in folder.iterdir() if p.suffix.lower() == path.suffix.lower()), key=natural_order)
+        found = [10]
+        for index in np.unique(np.linspace(0, len(beside) - 1, _SAMPLED).astype(int)):
+            with contextlib.suppress(DataError):
+                image = _decode(beside[index], _COLOR)
+                found += [_bits(image)] if image.dtype == np.uint16 else []
+        _known_bits[folder] = bits = max(found)
+        if bits < 16:
+            logging.getLogger(__name__).warning(
+                "%s: 16-bit images that use %d bits, as sensors of %d bits have them; %d is white in them",
+                folder, bits, bits, 2**bits - 1,
+            )  # fmt: skip
+    return _known_bits[folder]
+
+
 def resize(array: NDArray[Any], height: int, width: int) -> NDArray[Any]:
     """Resize h x w or h x w x c, averaging areas when it shrinks and interpolating linearly when it grows.
 
     Pixel u moves to (u + 0.5) * s - 0.5. An array that has the size already is returned itself.
 
-    Args:
-        array: h x w or h x w x c, of a type that OpenCV resizes.
-        height: New height.
-        width: New width.
     """
     if array.shape[:2] == (height, width):
         return array
@@ -170,12 +192,7 @@ def encode_jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int = 95) -> bytes:
 
 
 def write_image(path: str | Path, image: Shaped[np.ndarray, "..."]) -> None:
-    """Write RGB or gray bytes, or 16-bit gray, in the format of the path's suffix, whole or not at all.
-
-    Raises:
-        ConfigError: if the suffix is not that of an image format.
-        DataError: if the format cannot hold the numbers or the system refuses to write.
-    """
+    """Write RGB or gray bytes, or 16-bit gray, in the format of the path's suffix, whole or not at all."""
     path = Path(path)
     one_of(f"the suffix of {path.name}", path.suffix.lower(), sorted(IMAGE_SUFFIXES))
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image

@@ -17,13 +17,7 @@ from rich.progress import (
 
 
 def bar(show: bool = True, unit: str = "", taken: bool = False) -> Progress:
-    """Return a progress bar with counts and the time left; silent where nobody looks (a file, a pipe).
-
-    Args:
-        show: False keeps it silent everywhere.
-        unit: What is counted, such as ``images``.
-        taken: Show the time taken so far too.
-    """
+    """Return a progress bar with counts and the time left; silent where nobody looks (a file, a pipe)."""
     console = Console(stderr=True)
     columns: list[ProgressColumn] = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
     if unit:

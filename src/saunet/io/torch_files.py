@@ -12,15 +12,7 @@ from saunet.errors import CheckpointError
 
 
 def read_plain(path: Path, what: str) -> Any:
-    """Return what a file holds, on the CPU: plain containers, numbers, text and tensors.
-
-    Args:
-        path: The file.
-        what: What it ought to be, with its article, for the message.
-
-    Raises:
-        CheckpointError: if the file cannot be read, is broken or of another kind, or holds pickled objects.
-    """
+    """Return what a file holds, on the CPU: plain containers, numbers, text and tensors."""
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except MemoryError:

@@ -14,37 +14,22 @@ from saunet.io.atomic import write_bytes
 
 
 def write_kitti(path: Path, T_world_cam: Float64[ndarray, "n 4 4"]) -> None:
-    """Write a trajectory as KITTI does: a line a frame, the upper 3 x 4 of the camera-to-world matrix row by row.
-
-    Raises:
-        DataError: if the file cannot be written.
-    """
+    """Write a trajectory as KITTI does: a line a frame, the upper 3 x 4 of the camera-to-world matrix row by row."""
     _write(path, T_world_cam[:, :3].reshape(-1, 12))
 
 
 def write_tum(path: Path, T_world_cam: Float64[ndarray, "n 4 4"], times: Float64[ndarray, " t"]) -> None:
-    """Write a trajectory as TUM does: ``time x y z qx qy qz qw`` a line.
-
-    Args:
-        path: The file.
-        T_world_cam: Camera-to-world poses.
-        times: Seconds.
-
-    Raises:
-        DataError: if there is not one time a pose, or the file cannot be written.
-    """
+    """Write a trajectory as TUM does: ``time x y z qx qy qz qw`` a line."""
     if len(times) != len(T_world_cam):
         raise DataError(f"{len(T_world_cam)} poses come with {len(times)} times; give one for each")
+    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise DataError(f"the times for {path} do not ascend; TUM files have the true time of each pose, in seconds")
     quaternions = Rotation.from_matrix(T_world_cam[:, :3, :3]).as_quat()
     _write(path, np.column_stack((times, T_world_cam[:, :3, 3], quaternions)))
 
 
 def read_kitti(path: Path) -> Float64[ndarray, "n 4 4"]:
-    """Read camera-to-world poses from a KITTI pose file.
-
-    Raises:
-        DataError: if the file is missing, holds no pose, or a line is not twelve numbers; names the line.
-    """
+    """Read camera-to-world poses from a KITTI pose file."""
     table = _read(path, 12, "a 3 x 4 pose, row by row")
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3] = table.reshape(-1, 3, 4)
@@ -52,11 +37,7 @@ def read_kitti(path: Path) -> Float64[ndarray, "n 4 4"]:
 
 
 def read_tum(path: Path) -> tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, " n"]]:
-    """Read camera-to-world poses and their times from a TUM trajectory.
-
-    Raises:
-        DataError: if the file is missing, holds no pose, or a line is not eight numbers with a proper quaternion.
-    """
+    """Read camera-to-world poses and their times from a TUM trajectory."""
     table = _read(path, 8, "time x y z qx qy qz qw", comments=True)
     if not np.linalg.norm(table[:, 4:], axis=1).all():
         raise DataError(f"{path} holds a quaternion of length 0; each must be a rotation")

@@ -106,6 +106,11 @@ class VideoReader:
     def __iter__(self) -> Iterator[Picture]:
         return (frame.image for frame in self.frames())
 
+    @property
+    def timed(self) -> bool:
+        """Whether frames have times."""
+        return self._timed or self.fps is not None
+
     def frames(self, fps: float | int | None = None) -> Iterator[VideoFrame]:
         """Yield frames with their times.
 
@@ -131,11 +136,7 @@ class VideoReader:
             yield VideoFrame(number, seconds, image)
 
     def at(self, seconds: float | int) -> tuple[float, Picture]:
-        """Return the frame that is shown at a time (seconds since the first frame), and the time at which it began.
-
-        Raises:
-            DataError: if the video has no times, or shows nothing at that time.
-        """
+        """Return the frame that is shown at a time (seconds since the first frame), and the time at which it began."""
         if not self._timed:
             raise DataError(f"{self.name} is a bare stream without times; convert it to mp4 to read it by time")
         wanted = seconds + self._origin + 1e-6
@@ -264,16 +265,9 @@ class VideoReader:
 
 
 class CameraReader:
-    """Frames of a camera that is connected, until somebody stops it; times are those of arrival.
+    """Frames of a camera that is connected, until somebody stops it; times are those of arrival."""
 
-    Args:
-        number: Of the camera, from 0.
-
-    Raises:
-        DataError: if it gives no picture.
-    """
-
-    declared = None
+    declared, timed = None, True
     missing = damaged = plain = 0
 
     def __init__(self, number: int) -> None:
@@ -334,14 +328,6 @@ class VideoWriter:
 
     Use it as a context manager; leaving it by an error discards the file.
 
-    Args:
-        path: The file to write, ending in ``.mp4``.
-        fps: Frames per second, for frames without a time.
-        codec: One of `CODECS`.
-
-    Raises:
-        ConfigError: for another ending or codec, or a frame rate that is not positive.
-        DataError: if the system refuses to write, or the written file does not contain every frame (a full disk).
     """
 
     def __init__(self, path: str | Path, fps: float | int, codec: str = "h264") -> None:
@@ -358,12 +344,7 @@ class VideoWriter:
         return self
 
     def write(self, frame: Picture, seconds: float | int | None = None) -> None:
-        """Append a frame, shown from ``seconds`` on; all have the size of the first, made even as codecs need it.
-
-        Raises:
-            DataError: if a frame has another size.
-            ConfigError: if this PyAV lacks the codec.
-        """
+        """Append a frame, shown from ``seconds`` on; all have the size of the first, made even as codecs need it."""
         if self._container is None:
             self._size = (frame.shape[0], frame.shape[1])
             self._start()
@@ -414,7 +395,9 @@ class VideoWriter:
                 self._check()
         except Exception as reason:
             problem = problem or reason
-        self._replacing.__exit__(type(problem) if problem else None, problem, problem and problem.__traceback__)
+        self._replacing.__exit__(
+            type(problem) if problem else None, problem, problem.__traceback__ if problem else None
+        )
         if problem is not None and problem is not error:
             raise problem
 
@@ -434,7 +417,9 @@ class _Deinterlacer:
     """FFmpeg's yadif: one frame out for each one in; frames that are not interlaced pass unchanged."""
 
     def __init__(self, stream: Any) -> None:
-        self._stream, self._graph, self._key = stream, None, None
+        self._stream = stream
+        self._graph: Any = None
+        self._key: object = None
 
     def push(self, frame: Any) -> Iterator[Any]:
         """Take a frame, None at the end, and yield those that are ready."""

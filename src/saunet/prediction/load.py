@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from saunet.errors import CheckpointError, ConfigError
-from saunet.prediction.pipeline import ImagePredictor
+from saunet.prediction.prediction import ImagePredictor
 from saunet.weights.locate import locate
 
 

@@ -24,16 +24,6 @@ class Odometer:
 
     A network that sees both neighbors gives two motions at once, so it is asked at every second frame only.
 
-    Args:
-        pose: A pose network, which knows the offsets of its sources.
-        height: Height of its input in pixels.
-        width: Width of its input in pixels.
-        scale: Factor to meters; None leaves the trajectory in the unknown unit of the depth.
-        device: Where to run.
-        batch_size: Frames that the network is asked at together.
-
-    Raises:
-        ConfigError: if the network was not trained on neighboring frames.
     """
 
     def __init__(
@@ -67,18 +57,7 @@ class Odometer:
     def from_model(
         cls, path: str | Path, scale: Scale | None = None, device: str = "cpu", batch_size: int = 1
     ) -> Odometer:
-        """Load the pose network of a checkpoint or exported folder; nothing in it is run.
-
-        Args:
-            path: The checkpoint or folder.
-            scale: Factor to meters; the model's own by default.
-            device: Where to run.
-            batch_size: Frames that the network is asked at together.
-
-        Raises:
-            ConfigError: if it has none, or the network was not trained on neighboring frames.
-            CheckpointError: if it cannot be read.
-        """
+        """Load the pose network of a checkpoint or exported folder; nothing in it is run."""
         if Path(path).suffix.lower() == ".onnx":
             raise ConfigError(f"{path} has no pose network, which a path needs; give the checkpoint")
         model = read_model(path)
@@ -103,12 +82,7 @@ class Odometer:
             self._next += self._stride
 
     def trajectory(self) -> Float64[np.ndarray, "n 4 4"]:
-        """Return the camera-to-world pose of every frame so far; the world is the first camera.
-
-        Raises:
-            DataError: if there are fewer than two frames.
-            CheckpointError: if the network's output is not finite.
-        """
+        """Return the camera-to-world pose of every frame so far; the world is the first camera."""
         if self._count < 2:
             raise DataError(f"a path needs at least 2 frames, got {self._count}")
         last = self._count - 1
@@ -152,20 +126,7 @@ class Odometer:
 
 
 def follow(odometer: Odometer, drive: Any, progress: bool = True) -> Float64[np.ndarray, "n 4 4"]:
-    """Follow the camera through all frames of a recording.
-
-    Args:
-        odometer: The network; it may have followed other recordings before.
-        drive: A `saunet.data.drive.Drive`.
-        progress: Show a progress bar on a terminal or in a notebook.
-
-    Returns:
-        ``T_world_cam`` of each frame; the world is the first camera.
-
-    Raises:
-        DataError: if there are fewer than two frames, or some are missing in between.
-        CheckpointError: if the network's output is not finite.
-    """
+    """Return ``T_world_cam`` of each frame of a recording; the world is the first camera."""
     numbers = list(drive.indices)
     gaps = [a for a, b in itertools.pairwise(numbers) if b != a + 1]
     if gaps:

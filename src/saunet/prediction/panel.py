@@ -20,17 +20,7 @@ _INK, _PAPER = (245, 245, 245), (24, 24, 24)
 def panel(
     tiles: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], columns: int = 1, tile_width: int = 640, gap: int = 4
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Arrange named RGB pictures in a grid, row by row, each under its name.
-
-    Args:
-        tiles: Pictures by name. All are scaled to ``tile_width`` and to the aspect ratio of the first.
-        columns: Pictures a row.
-        tile_width: Width of each picture in pixels.
-        gap: Pixels between pictures.
-
-    Raises:
-        ConfigError: if there is no picture or a size is not positive.
-    """
+    """Arrange named RGB pictures in a grid, row by row, each under its name."""
     if not tiles:
         raise ConfigError("a panel needs at least one picture, got none")
     positive("columns", columns)
@@ -66,14 +56,6 @@ def depth_panel(
     The prediction is scaled to the truth by the ratio of medians before the comparison, as in evaluation, and both are
     painted with the truth's colors.
 
-    Args:
-        image: RGB.
-        disparity: Prediction, at the image's size or another.
-        truth: Depth in meters, 0 where unknown; sparse LiDAR points are drawn larger than they are.
-        columns: Pictures a row.
-        tile_width: Width of each picture in pixels.
-        colormap: Color map of disparity.
-        note: Added to the prediction's name.
     """
     height, width = image.shape[:2]
     tiles = {"input": image}

@@ -54,16 +54,7 @@ class Camera:
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float | int], height: int, width: int) -> Camera:
-        """Read ``fx, fy, cx, cy``, the nine numbers of K, row by row, or one: the horizontal field of view in degrees.
-
-        Args:
-            numbers: Four, nine or one of them.
-            height: Of the image that they belong to, in pixels.
-            width: Of that image, in pixels.
-
-        Raises:
-            ConfigError: for another count, or if K cannot be a camera's.
-        """
+        """Read ``fx, fy, cx, cy``, the nine numbers of K by rows, or one: the horizontal field of view in degrees."""
         values = [float(number) for number in numbers]
         if len(values) == 1:
             return cls.from_field_of_view(values[0], height, width)
@@ -79,13 +70,7 @@ class Camera:
 
     @classmethod
     def from_field_of_view(cls, degrees: float, height: int, width: int) -> Camera:
-        """Assume square pixels, a centerd axis and this horizontal field of view: a guess, for want of calibration.
-
-        Args:
-            degrees: From the left to the right border of the image.
-            height: Of the image, in pixels.
-            width: Of the image, in pixels.
-        """
+        """Assume square pixels, a centered axis and this horizontal field of view: a guess, for want of calibration."""
         in_range("field of view", degrees, 1.0, 179.0)
         focal = width / (2 * np.tan(np.radians(degrees) / 2))
         return cls.from_numbers((focal, focal, (width - 1) / 2, (height - 1) / 2), height, width)
@@ -106,16 +91,8 @@ def point_cloud(
 ) -> PointCloud:
     """Return a prediction's pixels as points in space, colored by the image.
 
-    Args:
-        prediction: Depth with its image.
-        camera: The camera; it is scaled to the image where its size differs.
-        max_depth: Leave out what is farther, in the unit of depth; the sky mostly.
-        stride: Take every stride-th pixel in both directions.
-        edge: Leave out pixels around which depth changes by more than this share: they would float between near and far
-            surfaces. 0 keeps all.
-
-    Raises:
-        ConfigError: for settings out of range.
+    Left out are those farther than ``max_depth``, in the unit of depth, and those around which depth changes by more
+    than the fraction ``edge``: they would float between near and far surfaces.
     """
     positive("stride", stride)
     positive("edge", edge, allow_zero=True)
@@ -135,12 +112,7 @@ def point_cloud(
 
 
 def write_ply(path: str | Path, cloud: PointCloud) -> None:
-    """Write a binary PLY file, whole or not at all; MeshLab, CloudCompare and Open3D read it.
-
-    Raises:
-        ConfigError: if the name does not end in ``.ply``.
-        DataError: if the system refuses to write.
-    """
+    """Write a binary PLY file, whole or not at all; MeshLab, CloudCompare and Open3D read it."""
     path = Path(path)
     if path.suffix.lower() != ".ply":
         raise ConfigError(f"the point cloud {path} must end in .ply")

@@ -1,15 +1,28 @@
-"""What a prediction is: depth at the image's own size, and whether it is meters."""
+"""From any image to depth at its own size: what a prediction is, and all of predicting but the network; no torch."""
 
 from __future__ import annotations
 
+import abc
+import io
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
+from numpy.typing import NDArray
 
+from saunet.errors import CheckpointError, DataError, divisible, positive
+from saunet.io.atomic import write_bytes
 from saunet.io.colormaps import colorize
+from saunet.io.images import as_rgb_bytes, network_input, read_image, write_image
 from saunet.runs.record import Scale
+
+ImageLike = Any
+"""A path, an h x w x 3 RGB array (bytes; gray, RGBA and 16-bit work too), or a 3 x h x w tensor (bytes or [0, 1])."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +57,15 @@ class Prediction:
         """Return the disparity as an RGB picture, bright where it is near; see `saunet.io.colormaps.colorize`."""
         return colorize(self.disparity, limits, colormap)
 
+    def save(self, path: str | Path) -> None:
+        """Write the depth as float32 (``.npy``), or the disparity in colors (``.png``, ``.jpg`` and other pictures)."""
+        if Path(path).suffix.lower() == ".npy":
+            buffer = io.BytesIO()
+            np.save(buffer, self.depth)
+            write_bytes(path, buffer.getvalue())
+        else:
+            write_image(path, self.color())
+
     def _repr_png_(self) -> bytes:
         """Show image and disparity where a notebook displays the prediction."""
         pair = np.concatenate([self.image, self.color()], axis=0)
@@ -53,3 +75,130 @@ class Prediction:
 def unit_of(scale: Scale | None) -> str:
     """Return in words what one unit of depth is, given the scale that was applied."""
     return f"meters (scale from {scale.source})" if scale else "relative (meters times one unknown factor)"
+
+
+class ImagePredictor(abc.ABC):
+    """Predicts depth for images of any size: resized in, restored out.
+
+    Args:
+        height: Height of the network's input in pixels.
+        width: Width of the network's input in pixels.
+        scale: Factor to meters; None leaves depth relative.
+        keep_aspect: Feed each image at its own aspect ratio, with about height x width pixels, not exactly that size.
+        size_divisor: What the network's input sides must be multiples of.
+
+    Attributes:
+        undistort: Applied to every image first; predictions are of the image that it returns.
+        undistorted_by: Which camera that is for; None without.
+    """
+
+    undistort: Callable[[UInt8[np.ndarray, "_ _ 3"]], UInt8[np.ndarray, "_ _ 3"]] | None = None
+    undistorted_by: str | None = None
+
+    def __init__(
+        self, height: int, width: int, scale: Scale | None = None, keep_aspect: bool = False, size_divisor: int = 1
+    ) -> None:
+        positive("height", height)
+        positive("width", width)
+        divisible(height, width, size_divisor, what="network input")
+        self.height, self.width, self.scale = height, width, scale
+        self.keep_aspect, self.size_divisor = keep_aspect, size_divisor
+
+    @abc.abstractmethod
+    def disparity(self, images: Float32[np.ndarray, "b 3 h w"]) -> Float32[np.ndarray, "b h w"]:
+        """Run the network: RGB in [0, 1] to disparity at the same size, before any scale."""
+
+    @property
+    @abc.abstractmethod
+    def fingerprint(self) -> str:
+        """A short text that changes with the weights and with everything that changes results."""
+
+    @property
+    def unit(self) -> str:
+        """What one unit of predicted depth is, for people."""
+        return unit_of(self.scale)
+
+    def predict(self, image: ImageLike, name: str | None = None) -> Prediction:
+        """Predict the depth of one image.
+
+        Args:
+            image: A path, an h x w x 3 RGB array of bytes, or a 3 x h x w tensor (bytes, or floats in [0, 1]).
+            name: What to call it; the path by default.
+
+        Raises:
+            DataError: if the image cannot be read or has a shape or type that is not an image's.
+            CheckpointError: if the network's output is not finite.
+        """
+        return self.predict_batch([image], [name] if name is not None else None)[0]
+
+    def predict_batch(self, images: Sequence[ImageLike], names: Sequence[str] | None = None) -> list[Prediction]:
+        """Predict several images in as few runs of the network as their sizes allow; see `predict`.
+
+        Returns:
+            One prediction an image, in order, each at its image's own size.
+        """
+        arrays = [as_image(image) for image in images]
+        if self.undistort is not None:
+            arrays = [self.undistort(array) for array in arrays]
+        titles = names or [str(image) if isinstance(image, str | Path) else "image" for image in images]
+        groups: dict[tuple[int, int], list[int]] = {}
+        for index, array in enumerate(arrays):
+            groups.setdefault(self.input_size(*array.shape[:2]), []).append(index)
+        results: dict[int, Prediction] = {}
+        for size, members in groups.items():
+            batch = np.stack([network_input(arrays[index], *size) for index in members])
+            for index, disparity in zip(members, self.disparity(batch), strict=True):
+                results[index] = self._restore(disparity, arrays[index], titles[index])
+        return [results[index] for index in range(len(arrays))]
+
+    def input_size(self, height: int, width: int) -> tuple[int, int]:
+        """Return the (height, width) at which an image of this size is fed to the network."""
+        if not self.keep_aspect:
+            return self.height, self.width
+        zoom = math.sqrt(self.height * self.width / (height * width))
+        step = self.size_divisor
+        longest = 4 * max(self.height, self.width)  # a 1 x 1000 image must not become a kilometer of pixels
+        return (
+            min(longest, max(step, step * round(height * zoom / step))),
+            min(longest, max(step, step * round(width * zoom / step))),
+        )
+
+    def _restore(
+        self, disparity: Float32[np.ndarray, "_ _"], image: UInt8[np.ndarray, "h w 3"], name: str
+    ) -> Prediction:
+        if not np.isfinite(disparity).all():
+            raise CheckpointError(
+                f"the network's output for {name} is not finite; the weights are damaged or training diverged"
+            )
+        # Linear interpolation in disparity: the network's own quantity, and the one in which planes are linear.
+        full = cv2.resize(disparity, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
+        full = full.reshape(image.shape[:2]).astype(np.float32)
+        factor = np.float32(self.scale.factor if self.scale else 1.0)
+        return Prediction(factor / full, full / factor, image, self.scale, name)
+
+
+def as_image(image: ImageLike) -> UInt8[np.ndarray, "h w 3"]:
+    """Return RGB bytes from a path, an array or a tensor."""
+    if isinstance(image, str | Path):
+        return read_image(image)
+    if hasattr(image, "detach"):
+        return _from_tensor(image.detach().cpu().numpy())
+    if isinstance(image, np.ndarray):
+        if image.ndim == 3 and image.shape[0] == 3 and image.shape[2] not in (1, 3, 4):
+            raise DataError(
+                f"the image array has shape {image.shape}; arrays are h x w x 3, use image.transpose(1, 2, 0)"
+            )
+        return as_rgb_bytes(image, "the image array")
+    raise DataError(f"an image is a path, an array or a tensor, got {type(image).__name__}")
+
+
+def _from_tensor(values: NDArray[Any]) -> UInt8[np.ndarray, "h w 3"]:
+    if values.ndim != 3 or values.shape[0] != 3:
+        raise DataError(f"the image tensor has shape {tuple(values.shape)}; tensors are 3 x h x w, one image a tensor")
+    if values.dtype.kind == "f":
+        if values.size and not (values.min() >= 0 and values.max() <= 1):
+            raise DataError(
+                f"the image tensor has values from {values.min():g} to {values.max():g}; floats must lie in [0, 1]"
+            )
+        values = np.round(values * 255).astype(np.uint8)
+    return as_rgb_bytes(values.transpose(1, 2, 0), "the image tensor")

@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from saunet.errors import usable_device
 from saunet.metrics.functional import flip_blend
 from saunet.models.depth import DepthNet
-from saunet.prediction.pipeline import ImagePredictor
+from saunet.prediction.prediction import ImagePredictor
 from saunet.runs.record import Scale
 from saunet.weights.files import read_model
 

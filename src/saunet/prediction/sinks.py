@@ -1,4 +1,4 @@
-"""What a clip's predictions go into, one frame at a time: a video, files a frame, a page, a trajectory."""
+"""What predictions go into, one frame at a time: files a frame, a video, a page, a trajectory."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ import numpy as np
 from jaxtyping import UInt8
 
 from saunet.errors import one_of
-from saunet.io.colormaps import COLORMAPS, colorize
+from saunet.io.colormaps import colorize
 from saunet.io.video import VideoWriter
-from saunet.prediction.files import ENDINGS, Style, write_output
+from saunet.prediction.files import ENDINGS, Manifest, Style, unfinished, write_output
 from saunet.prediction.panel import fit, label
 from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import Prediction
+from saunet.prediction.sources import Frame
 from saunet.prediction.viewer import ViewerWriter
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class Sink(abc.ABC):
     """What it writes, or the folder that it writes into."""
 
     @abc.abstractmethod
-    def add(self, result: Prediction, limits: tuple[float, float]) -> None:
+    def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
         """Take one more frame, and the color limits of the clip so far."""
 
     def __enter__(self) -> Sink:
@@ -48,82 +49,22 @@ class Sink(abc.ABC):
         """Complete or discard."""
 
 
-class VideoSink(Sink):
-    """A side-by-side video; see `saunet.prediction.video.render_video`.
+class ImageFilesSink(Sink):
+    """Files of each image beside each other, each in its own colors; those that are finished stay."""
 
-    Args:
-        path: The mp4 to write.
-        fps: Frames per second.
-        layout: How image and disparity are arranged, one of ``LAYOUTS``.
-        colormap: Colors of the disparity, one of ``COLORMAPS``.
-        labels: Write what is shown into the picture.
-        codec: One of `saunet.io.video.CODECS`.
+    def __init__(self, folder: Path, outputs: Sequence[str], style: Style, manifest: Manifest, overwrite: bool) -> None:
+        self.paths, self.outputs, self.written = (folder,), tuple(outputs), list[Path]()
+        self._style, self._manifest, self._overwrite = style, manifest, overwrite
 
-    Raises:
-        ConfigError: for a layout, colormap or codec that does not exist.
-    """
+    def wanted(self, frame: Frame) -> Sequence[str]:
+        """Return the outputs of a frame that have to be written."""
+        return self.outputs if self._overwrite else unfinished(frame, self.paths[0], self.outputs)
 
-    def __init__(
-        self,
-        path: Path,
-        fps: float | int,
-        layout: str = "auto",
-        colormap: str = "magma",
-        labels: bool = True,
-        codec: str = "h264",
-    ) -> None:
-        self._layout = one_of("layout", layout, LAYOUTS)
-        self._colormap = one_of("colormap", colormap, COLORMAPS)
-        self._writer, self._labels, self.paths = VideoWriter(path, fps, codec), labels, (path,)
-
-    def __enter__(self) -> VideoSink:
-        self._writer.__enter__()
-        return self
-
-    def add(self, result: Prediction, limits: tuple[float, float]) -> None:
-        """Append a frame."""
-        name = f"disparity ({'1/meter' if result.metric else 'relative'})" if self._labels else None
-        painted = colorize(result.disparity, limits, self._colormap)
-        self._writer.write(compose(result.image, painted, self._layout, name))
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._writer.__exit__(kind, error, trace)
-
-
-class FrameSink(Sink):
-    """Files a frame, ``000000_depth.png`` and so on, in a folder of their own; each is complete once it is there.
-
-    Frames that an earlier clip left in the folder are removed first: they would be taken for this one's.
-
-    Args:
-        folder: Where the files go.
-        outputs: What is written of each frame, keys of ``ENDINGS``.
-        style: Colors and limits of pictures.
-        camera: Intrinsics, for point clouds.
-    """
-
-    def __init__(
-        self, folder: Path, outputs: Sequence[str], style: Style, camera: Camera | Sequence[float | int] | None = None
-    ) -> None:
-        self._outputs, self._style, self._camera = tuple(outputs), style, camera
-        self._count, self.paths = 0, (folder,)
-
-    def __enter__(self) -> FrameSink:
-        for path in self.paths[0].glob("[0-9][0-9][0-9][0-9][0-9][0-9]_*"):
-            if path.name[6:] in ENDINGS.values():
-                path.unlink()
-        return self
-
-    def add(self, result: Prediction, limits: tuple[float, float]) -> None:
-        """Write the frame's files."""
-        if self._camera is not None and not isinstance(self._camera, Camera):
-            self._camera = Camera.from_numbers(self._camera, *result.depth.shape)
-        style = dataclasses.replace(self._style, limits=limits, camera=self._camera)
-        for output in self._outputs:
-            write_output(output, self.paths[0] / f"{self._count:06d}", result, style)
-        self._count += 1
+    def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
+        """Write what is not finished."""
+        for output in self.wanted(frame):
+            self.written.append(write_output(output, self.paths[0] / frame.stem, result, self._style))
+            self._manifest.claim()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -131,25 +72,60 @@ class FrameSink(Sink):
         """Every file is complete already, and stays."""
 
 
-class ViewerSink(Sink):
-    """A page to orbit the points and scrub through the clip; see `ViewerWriter`.
+class FrameFilesSink(Sink):
+    """Files of each frame of a video in a folder of their own (``000000_depth.png``), in the colors of the clip.
 
-    Args:
-        path: The HTML file to write.
-        camera: Intrinsics, see `saunet.prediction.pointcloud`.
-        fps: Frames per second.
-        max_depth: Points further away are left out, in the unit of the depth; None keeps all.
-        title: Title of the page.
+    Frames that an earlier clip left in the folder are removed first: they would be taken for this one's.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        camera: Camera | Sequence[float | int],
-        fps: float | int,
-        max_depth: float | int | None,
-        title: str,
+    def __init__(self, folder: Path, outputs: Sequence[str], style: Style) -> None:
+        self._outputs, self._style, self.paths = tuple(outputs), style, (folder,)
+
+    def __enter__(self) -> FrameFilesSink:
+        for path in self.paths[0].glob("[0-9][0-9][0-9][0-9][0-9][0-9]_*"):
+            if path.name[6:] in ENDINGS.values():
+                path.unlink()
+        return self
+
+    def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
+        """Write the frame's files."""
+        style = dataclasses.replace(self._style, limits=limits)
+        for output in self._outputs:
+            write_output(output, self.paths[0] / Path(frame.stem).name, result, style)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        """Every file is complete already, and stays."""
+
+
+class VideoSink(Sink):
+    """A side-by-side video that keeps the times of its frames."""
+
+    def __init__(self, path: Path, fps: float, layout: str, colormap: str, codec: str, timed: bool) -> None:
+        self._layout, self._colormap, self._timed = one_of("layout", layout, LAYOUTS), colormap, timed
+        self._writer, self.paths = VideoWriter(path, fps, codec), (path,)
+
+    def __enter__(self) -> VideoSink:
+        self._writer.__enter__()
+        return self
+
+    def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
+        """Append a frame."""
+        name = f"disparity ({'1/meter' if result.metric else 'relative'})"
+        painted = colorize(result.disparity, limits, self._colormap)
+        self._writer.write(compose(result.image, painted, self._layout, name), frame.time if self._timed else None)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.__exit__(kind, error, trace)
+
+
+class ViewerSink(Sink):
+    """A page to orbit the points and scrub through the clip; see `ViewerWriter`."""
+
+    def __init__(self, path: Path, camera: Camera, fps: float, max_depth: float | int | None, title: str) -> None:
         self._writer = ViewerWriter(path, camera, fps=fps, max_depth=max_depth, title=title)
         self.paths = (path,)
 
@@ -157,7 +133,7 @@ class ViewerSink(Sink):
         self._writer.__enter__()
         return self
 
-    def add(self, result: Prediction, limits: tuple[float, float]) -> None:
+    def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
         """Append a frame."""
         self._writer.add(result)
 
@@ -168,27 +144,29 @@ class ViewerSink(Sink):
 
 
 class TrajectorySink(Sink):
-    """The camera's path, drawn from above and as KITTI poses.
+    """The camera's path: drawn from above, as KITTI poses (``.txt``), and where times are known in TUM's format."""
 
-    Args:
-        path: The picture to write; the poses go beside it as ``.txt``.
-        odometer: Follows the camera from frame to frame.
-    """
+    def __init__(self, path: Path, odometer: Odometer, timed: bool) -> None:
+        self._odometer, self._times = odometer, list[float]()
+        self.paths = (path, path.with_suffix(".txt"), *((path.with_suffix(".tum"),) if timed else ()))
 
-    def __init__(self, path: Path, odometer: Odometer) -> None:
-        self._odometer, self.paths = odometer, (path, path.with_suffix(".txt"))
-
-    def add(self, result: Prediction, limits: tuple[float, float]) -> None:
+    def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
         """Follow the camera to the next frame."""
         self._odometer.add(result.image)
+        if frame.time is not None:
+            self._times.append(frame.time)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is None:
+            from saunet.io.trajectories import write_tum
             from saunet.prediction.trajectory import write_trajectory
 
-            write_trajectory(self.paths[0], self._odometer.trajectory(), self._odometer.scale is not None)
+            poses = self._odometer.trajectory()
+            write_trajectory(self.paths[0], poses, self._odometer.scale is not None)
+            for path in self.paths[2:]:
+                write_tum(path, poses, np.array(self._times))
 
 
 def compose(
@@ -197,14 +175,7 @@ def compose(
     layout: str = "auto",
     name: str | None = None,
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return one frame of a side-by-side video.
-
-    Args:
-        image: RGB.
-        painted: The disparity in colors.
-        layout: ``"stacked"``, ``"beside"``, or ``"auto"``, which stacks pictures wider than 4:3.
-        name: What the painted half shows; None draws no names.
-    """
+    """Return one frame of a side-by-side video."""
     height, width = image.shape[:2]
     halves = [image, fit(painted, height, width)]
     if name is not None:

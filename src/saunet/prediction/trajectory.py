@@ -18,11 +18,7 @@ _PAPER, _GRID, _INK, _TRACK, _START, _END = (
 
 
 def write_trajectory(picture: Path, T_world_cam: Float64[np.ndarray, "n 4 4"], metric: bool) -> None:
-    """Write a trajectory twice: drawn from above, and beside it as KITTI poses, whose name ends in ``.txt``.
-
-    Raises:
-        DataError: if the system refuses to write.
-    """
+    """Write a trajectory twice: drawn from above, and beside it as KITTI poses, whose name ends in ``.txt``."""
     write_kitti(picture.with_suffix(".txt"), T_world_cam)
     write_image(picture, draw_from_above(T_world_cam, metric))
 
@@ -30,13 +26,7 @@ def write_trajectory(picture: Path, T_world_cam: Float64[np.ndarray, "n 4 4"], m
 def draw_from_above(
     T_world_cam: Float64[np.ndarray, "n 4 4"], metric: bool, size: int = 800
 ) -> UInt8[np.ndarray, "{size} {size} 3"]:
-    """Draw where the camera went, seen from above: x to the right, z (ahead at the start) up, both at one scale.
-
-    Args:
-        T_world_cam: Camera-to-world poses.
-        metric: Whether positions are meters.
-        size: Side of the picture in pixels.
-    """
+    """Draw where the camera went, seen from above: x to the right, z (ahead at the start) up, both at one scale."""
     x, z = T_world_cam[:, 0, 3], T_world_cam[:, 2, 3]
     extent = max(float(np.ptp(x)), float(np.ptp(z)), 1e-9) * 1.15
     margin, top = size // 16, size // 10

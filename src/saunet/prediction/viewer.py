@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from types import TracebackType
@@ -32,19 +32,6 @@ class ViewerWriter:
     Use it as a context manager: frames are written as they come, each adds about 0.1 MB at the default width, and the
     page gets its name only when it is complete; leaving it by an error discards it.
 
-    Args:
-        path: The page to write, ending in ``.html``.
-        camera: True intrinsics of the camera that took the images: a `Camera`, or numbers as
-            `Camera.from_numbers` takes them, in pixels of the first image.
-        width: Points in a row; the rows follow from the first image's aspect ratio.
-        fps: Frames a second when played.
-        max_depth: Leave out what is farther, in the unit of depth.
-        edge: Leave out pixels around which depth changes by more than this share.
-        title: Heading of the page.
-
-    Raises:
-        ConfigError: for another ending or settings out of range.
-        DataError: if there is no frame, or the system refuses to write.
     """
 
     def __init__(
@@ -100,32 +87,6 @@ class ViewerWriter:
             if self.count == 0:
                 raise DataError(f"no frame was given, so {self.path} was not written")
             self._page.write(self._after)
-
-
-def write_viewer(
-    path: str | Path,
-    predictions: Iterable[Prediction],
-    camera: Camera,
-    *,
-    width: int = 320,
-    fps: float = 10.0,
-    max_depth: float | None = None,
-    edge: float = 0.15,
-    title: str = "saunet depth",
-) -> int:
-    """Write predictions, in order, as one self-contained page; see `ViewerWriter` for the arguments.
-
-    Returns:
-        The number of frames.
-
-    Raises:
-        ConfigError: for another ending or settings out of range.
-        DataError: if there is no frame, or the system refuses to write.
-    """
-    with ViewerWriter(path, camera, width=width, fps=fps, max_depth=max_depth, edge=edge, title=title) as writer:
-        for prediction in predictions:
-            writer.add(prediction)
-    return writer.count
 
 
 def _head(prediction: Prediction, camera: Camera, title: str, fps: float) -> dict[str, Any]:

@@ -33,20 +33,9 @@ def clip_batches(
 ) -> Iterator[TrainBatch]:
     """Yield frames of a clip one by one as a network wants them, with neighbors, intrinsics and partner as asked for.
 
-    Args:
-        frames: RGB bytes in the order of time.
-        height: Height of the network's input.
-        width: Width of the network's input.
-        offsets: Time offsets of the sources.
-        distance: Gives the meters traveled between two frames by their numbers, NaN where unknown.
-        intrinsics: Gives K, 3 x 3, in pixels of an image of the given height and width.
-        partner: The other camera's frames, one for each.
-        baseline: Meters from the camera to its partner, positive if that is the right one.
-        count: How many frames there are, where known.
-        most: Of more frames, only so many are used, evenly spread if ``count`` is known.
-
-    Raises:
-        DataError: if there are more frames of one camera than of the other.
+    ``distance`` gives meters between two frames by their numbers (NaN if unknown), ``intrinsics`` K of an image of a
+    (height, width), and ``baseline`` is the meters to the partner, positive if that is the right camera. Of more frames
+    than ``most``, only so many are used, evenly spread if ``count`` is known.
     """
     before, after = -min(0, *offsets, 0), max(0, *offsets, 0)
     step = max(1, (count - before - after) // most) if count else 1

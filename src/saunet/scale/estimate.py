@@ -14,10 +14,8 @@ from torch import Tensor
 from saunet.errors import ConfigError, DataError, one_of, positive
 from saunet.runs.record import Scale
 from saunet.scale.factors import height_factors, speed_factors, stereo_factors
+from saunet.scale.options import METHODS
 from saunet.types import TrainBatch
-
-METHODS = ("camera_height", "speed", "stereo")
-"""Ways to measure the scale."""
 
 DepthOf = Callable[[Tensor], Tensor]
 """Gives the depth (b 1 h w, any unit) of images (b 3 h w)."""
@@ -64,6 +62,12 @@ class ScaleEstimate:
         """Standard deviation over frames, as a share of the median."""
         return float(np.std(self.factors)) / self.factor
 
+    @property
+    def uncertainty(self) -> float:
+        """Standard error of the median for independent frames, as a share of it; NaN for a single frame."""
+        count = len(self.factors)
+        return 1.2533 * self.spread * math.sqrt(count / (count - 1)) / math.sqrt(count) if count > 1 else math.nan
+
     def scale(self) -> Scale:
         """Return what a checkpoint stores and a prediction names."""
         return Scale(self.factor, self.source)
@@ -77,6 +81,7 @@ class ScaleEstimate:
             "quartiles": list(self.quartiles),
             "iqr": self.quartiles[1] - self.quartiles[0],
             "std_over_median": self.spread,
+            "uncertainty": self.uncertainty if len(self.factors) > 1 else None,
             "frames": len(self.factors),
             "frames_left_out": self.left_out,
             "per_frame": dict(zip(self.names, self.factors, strict=True)),
@@ -85,9 +90,13 @@ class ScaleEstimate:
     def __str__(self) -> str:
         low, high = self.quartiles
         rest = f" ({self.left_out} more could not be measured)" if self.left_out else ""
+        known = (
+            f"known to about {100 * self.uncertainty:.1g} %" if len(self.factors) > 1 else "one frame shows no spread"
+        )
+        more = "; measure on more frames" if len(self.factors) < 10 else ""
         return (
             f"scale {self.factor:.4g} from {self.source}: median of {len(self.factors)} frames{rest}, "
-            f"middle half {low:.4g} to {high:.4g}, std/median {100 * self.spread:.1f} %"
+            f"middle half {low:.4g} to {high:.4g}, std/median {100 * self.spread:.1f} %, {known}{more}"
         )
 
 

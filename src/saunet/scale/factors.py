@@ -26,24 +26,13 @@ _LARGEST_DISPARITY = 0.15  # of the image's width
 def height_factors(
     depth: Float[Tensor, "b 1 h w"], K: Float[Tensor, "b 3 3"], camera_height: float
 ) -> Float[Tensor, " b"]:
-    """Camera height in meters over its height above the road in the predicted depth; NaN where no road is found.
-
-    Args:
-        depth: Predicted depth.
-        K: Intrinsics, pixels of ``depth``.
-        camera_height: Meters.
-    """
+    """Camera height in meters over its height above the road in the predicted depth; NaN where no road is found."""
     plane = fit_ground(depth, K)
     return torch.where(plane.support >= MIN_SUPPORT, camera_height / plane.height, math.nan)
 
 
 def speed_factors(T_src_tgt: Float[Tensor, "b s 4 4"], distance: Float[Tensor, "b s"]) -> Float[Tensor, " b"]:
-    """Meters traveled over the predicted motion, all sources of a frame together; NaN where unknown or standing.
-
-    Args:
-        T_src_tgt: Predicted motion.
-        distance: Meters traveled between target and source, NaN where unknown.
-    """
+    """Meters traveled over the predicted motion, all sources of a frame together; NaN where unknown or standing."""
     predicted = torch.linalg.vector_norm(T_src_tgt[..., :3, 3].double(), dim=-1)
     counts = distance.isfinite() & (distance >= MIN_DISTANCE)
     meters, length = (torch.where(counts, values, 0.0).sum(1) for values in (distance.double(), predicted))
@@ -57,15 +46,7 @@ def stereo_factors(
     K: Float[Tensor, "b 3 3"],
     T_stereo_tgt: Float[Tensor, "b 4 4"],
 ) -> Float[Tensor, " b"]:
-    """Median of depth by stereo matching over predicted depth; NaN where too few pixels match.
-
-    Args:
-        depth: Predicted depth of ``image``.
-        image: RGB in [0, 1].
-        partner: The other camera's image.
-        K: Intrinsics of both, pixels.
-        T_stereo_tgt: Where the partner is, meters.
-    """
+    """Median of depth by stereo matching over predicted depth; NaN where too few pixels match."""
     factors = []
     for i in range(len(depth)):
         across = float(T_stereo_tgt[i, 0, 3])

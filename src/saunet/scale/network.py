@@ -11,12 +11,7 @@ from saunet.types import DepthPyramid
 
 
 class MetricDepth(nn.Module):
-    """A depth network with its scale applied: image to disparity in 1/meter.
-
-    Args:
-        network: Takes images and returns a `DepthPyramid`.
-        scale: The factor to meters.
-    """
+    """A depth network with its scale applied: image to disparity in 1/meter."""
 
     def __init__(self, network: nn.Module, scale: Scale) -> None:
         super().__init__()
@@ -29,12 +24,7 @@ class MetricDepth(nn.Module):
 
 
 class MetricMotion(nn.Module):
-    """A pose network with the scale of its depth network applied: frames to motion in meters.
-
-    Args:
-        network: Takes targets and sources and returns T_src_tgt.
-        scale: The factor to meters.
-    """
+    """A pose network with the scale of its depth network applied: frames to motion in meters."""
 
     def __init__(self, network: nn.Module, scale: Scale) -> None:
         super().__init__()

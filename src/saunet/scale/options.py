@@ -6,10 +6,13 @@ from dataclasses import dataclass
 
 from saunet.errors import ConfigError, one_of, positive
 from saunet.runs.record import Scale
-from saunet.scale.estimate import METHODS
 
+METHODS = ("camera_height", "speed", "stereo")
+"""Ways to measure the scale."""
 SCALE_METHODS = ("auto", "none", "stored", *METHODS)
 """``auto``: the factor stored in the checkpoint, where there is one; `METHODS` measure it."""
+
+_USED_BY = {"camera_height": "camera_height", "speeds": "speed", "partner": "stereo", "baseline": "stereo"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +22,7 @@ class ScaleOptions:
     Args:
         method: One of `SCALE_METHODS`.
         camera_height: Meters from the road to the camera; by default what the data say.
-        speeds: A CSV file with the columns drive, frame, speed.
+        speeds: A CSV file with the columns ``time`` or ``frame``, ``speed`` and, of several drives, ``drive``.
         fps: Frames per second of the speeds.
         partner: Images of the other camera of a stereo pair.
         baseline: Meters to the other camera.
@@ -49,6 +52,12 @@ class ScaleOptions:
                 f"scale.store=true stores what is measured and scale.method is '{self.method}'; "
                 f"set scale.method to one of {', '.join(METHODS)}"
             )
+        for key, method in _USED_BY.items():
+            if getattr(self, key) is not None and self.method != method:
+                raise ConfigError(
+                    f"scale.{key} is set and scale.method is '{self.method}', which does not use it; "
+                    f"set scale.method={method}, or leave scale.{key} out"
+                )
 
     @property
     def measures(self) -> bool:
@@ -56,11 +65,7 @@ class ScaleOptions:
         return self.method in METHODS
 
     def chosen(self, known: Scale | None) -> Scale | None:
-        """Return the scale to apply, given the measured or stored one.
-
-        Raises:
-            ConfigError: if a stored one is wanted and there is none.
-        """
+        """Return the scale to apply, given the measured or stored one."""
         if self.method == "none":
             return None
         if self.method == "stored" and known is None:

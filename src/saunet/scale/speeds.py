@@ -21,54 +21,41 @@ _FORMAT = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpeedTable:
-    """Speed over time of one or several drives.
-
-    Args:
-        path: The file that it was read from, for messages.
-        unit: What ticks count, seconds (``time``) or frames (``frame``); of both, 0 is the first frame.
-        ticks: Ascending, of each drive; the drive ``""`` stands for all.
-        speeds: Meters a second at each tick.
-    """
+    """Speed over time of one or several drives."""
 
     path: Path
     unit: Literal["time", "frame"]
     ticks: Mapping[str, NDArray[np.float64]]
     speeds: Mapping[str, NDArray[np.float64]]
 
-    def distance(self, drive: str, first: int, second: int, fps: float | int) -> float:
-        """Return the meters traveled between two frames, speed being linear in between; NaN outside the table.
-
-        Args:
-            drive: Name of the drive.
-            first: Number of a frame as recorded, 0 for the first.
-            second: Number of the other frame.
-            fps: Frames a second as recorded, which tie frames to time.
-
-        Raises:
-            ConfigError: if ``fps`` is not positive.
-        """
+    def distance(
+        self, drive: str, first: int, second: int, fps: float | int, times: Sequence[float | None] | None = None
+    ) -> float:
+        """Return the meters traveled between two frames, speed being linear in between; NaN outside the table."""
         positive("fps", fps)
         key = drive if drive in self.ticks else ""
         if key not in self.ticks:
             return math.nan
-        rate = float(fps) if self.unit == "frame" else 1.0  # ticks a second
-        start, end = sorted(number * rate / fps for number in (first, second))
+        start, end = sorted((first, second))
+        seconds = (end - start) / fps if times is None else (times[end] or 0) - (times[start] or 0)
+        if self.unit == "frame":
+            return self._mean(key, start, end) * seconds
+        low, high = (start / fps, end / fps) if times is None else (times[start] or 0, times[end] or 0)
+        return self._mean(key, low, high) * seconds
+
+    def _mean(self, key: str, start: float, end: float) -> float:
+        """Return the mean speed between two ticks; NaN outside the table."""
         slack, ticks = 1e-6, self.ticks[key]
         if start < ticks[0] - slack or end > ticks[-1] + slack:
             return math.nan
+        if end <= start:
+            return 0.0
         at = np.array([start, *ticks[(ticks > start) & (ticks < end)], end])
         speeds = np.interp(at, ticks, self.speeds[key])
-        return float(np.sum(np.diff(at) * (speeds[1:] + speeds[:-1]) / 2)) / rate
+        return float(np.sum(np.diff(at) * (speeds[1:] + speeds[:-1]) / 2)) / (end - start)
 
     def check_drives(self, names: Sequence[str]) -> None:
-        """Check that at least one drive has speeds.
-
-        Args:
-            names: The drives that will be asked for; none stand for one recording without a name.
-
-        Raises:
-            DataError: if the table names others only.
-        """
+        """Check that at least one drive has speeds."""
         if "" in self.ticks or any(name in self.ticks for name in names):
             return
         expected = f"call them {_some(names)}, or leave" if names else "a single recording has no name, so leave"
@@ -79,15 +66,7 @@ class SpeedTable:
 
 
 def read_speeds(path: str | Path) -> SpeedTable:
-    """Read a CSV file of speeds.
-
-    Args:
-        path: Columns ``time`` (seconds since frame 0) or ``frame`` (its number, 0 for the first of a folder or video),
-            and ``speed`` (meters per second); with a column ``drive`` it may hold several drives by their names.
-
-    Raises:
-        DataError: if the file cannot be read, lacks a column, holds a line that is not numbers, or one moment twice.
-    """
+    """Read a CSV file of speeds."""
     rows: dict[str, dict[float, float]] = {}
     try:
         with Path(path).open(encoding="utf-8-sig", newline="") as file:

@@ -7,7 +7,7 @@ from prepare_tree import name
 
 from saunet.data.loading.depth_maps import DepthMaps
 from saunet.errors import DataError
-from saunet.prediction.pipeline import ImagePredictor
+from saunet.prediction.prediction import ImagePredictor
 from saunet.tools.prepare.recordings import kitti_recordings
 from saunet.tools.prepare.teacher import FileTeacher, ModelTeacher, teach
 

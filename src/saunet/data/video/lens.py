@@ -75,7 +75,7 @@ class Lens:
         return np.ascontiguousarray(image[self._rows, self._columns])
 
 
-class Straightener:
+class Undistorter:
     """Undistorts and crops images of any size that the camera takes, as training on its clips does.
 
     Args:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import platform
+import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from saunet.errors import CheckpointError, ConfigError, DataError, one_of
 from saunet.exporting import exporters
 from saunet.exporting.card import model_card
 from saunet.exporting.parity import Parity, Run, compare, timed
-from saunet.io.atomic import replacing, write_bytes, write_json
+from saunet.io.atomic import remove_partial_files, replacing, write_bytes, write_json
 from saunet.io.images import network_input, read_image
 from saunet.io.plain import read_json
 from saunet.io.progress import bar
@@ -43,46 +44,86 @@ _PLACES = ("root", "cache")
 """Where the training data lay: nobody's business but the trainer's, and it says nothing about them."""
 
 
-def export_model(
-    checkpoint: str | Path,
-    output_dir: str | Path,
-    formats: Sequence[str] = DEFAULT_FORMATS,
-    *,
-    images: str | Path | Sequence[str | Path] = (),
-    batch: str = "auto",
-    evaluation: str | Path | None = None,
-    overwrite: bool = False,
-    progress: bool = True,
-) -> list[Parity]:
-    """Export a trained model's depth network into a folder, with its config, a parity report and a model card.
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """What `export` writes.
 
     Args:
-        checkpoint: A checkpoint written by ``saunet train``, or a folder written by this function.
-        output_dir: Where the files of `FILES`, ``config.json``, ``report.json`` and ``README.md`` go.
-        formats: Which files to write; see `FORMATS`.
-        images: Real images to compare on, besides random ones: files, folders or patterns; at most eight are taken,
-            evenly.
-        batch: How many images the files take at once; see `saunet.exporting.exporters.BATCHES`.
-        evaluation: A ``metrics.json`` of ``saunet evaluate``, or the folder that holds it; goes into the card.
+        checkpoint: The model: a checkpoint, an exported folder, or a shipped model's name.
+        output: The folder for the files of `FILES`, ``config.json``, ``report.json`` and ``README.md``.
+        formats: ``onnx``, ``program`` (torch.export), ``compiled`` (AOTInductor), ``safetensors``.
+        images: Real images to compare on, besides random ones: a file, a folder or a pattern, in Python also several;
+            at most eight are taken, evenly.
+        batch: How many images the files take at once: ``any``, ``one``, or ``auto``: any where the network allows it.
+        opset: Of ONNX: 20, or 18 for older runtimes.
+        evaluation: A ``metrics.json`` of an evaluation, or the folder that holds it; goes into the model card.
         overwrite: Replace what an earlier export left in the folder.
-        progress: Show a progress bar on a terminal.
-
-    Returns:
-        One comparison a format.
 
     Raises:
-        ConfigError: for an unknown format, a package that is missing, a network that cannot be exported this way, or a
-            folder that holds another export.
+        ConfigError: for an unknown format, batch or opset.
+    """
+
+    checkpoint: str | Path
+    output: str | Path
+    formats: Sequence[str] = DEFAULT_FORMATS
+    images: Sequence[str | Path] | str | Path | None = None
+    batch: str = "auto"
+    opset: int = exporters.OPSETS[-1]
+    evaluation: str | Path | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        for name in self.formats:
+            one_of("formats", name, FORMATS)
+        if not self.formats:
+            raise ConfigError(f"formats is empty; allowed: {', '.join(FORMATS)}")
+        one_of("batch", self.batch, exporters.BATCHES)
+        one_of("opset", str(self.opset), map(str, exporters.OPSETS))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportResult:
+    """What `export` wrote."""
+
+    output: Path
+    reports: tuple[Parity, ...]
+    """How each file compares with the network, in the order of the formats."""
+
+    def show(self) -> None:
+        """Print the comparisons as a table."""
+        from rich.console import Console
+        from rich.table import Table
+
+        if not any(report.real for report in self.reports):
+            print("images is not set, so only random images were compared", file=sys.stderr)
+        table = Table("file", "MB", "batch", "differs by", "random", "real", "eager ms", "this ms", box=None)
+        for each in self.reports:
+            times = (f"{each.eager_ms:.1f}", f"{each.exported_ms:.1f}")
+            seen = (f"{each.difference:.1e}", str(each.random), str(each.real))
+            table.add_row(each.file, f"{each.megabytes:.1f}", each.batch, *seen, *times)
+        Console().print(table)
+        print("differs by: largest difference in disparity over all images, as a fraction of its range")
+        print(f"exported, with report.json and a model card: {self.output}")
+
+
+def export(options: ExportOptions) -> ExportResult:
+    """Export a trained model's depth network into a folder, with its config, a parity report and a model card.
+
+    Raises:
+        ConfigError: for a package that is missing, a network that cannot be exported this way, or a folder that holds
+            another export.
         CheckpointError: if the checkpoint cannot be read, or a file would differ from the original.
         DataError: if an image or the evaluation cannot be read, or the system refuses to write.
+
+    Example:
+        >>> from saunet.exporting import ExportOptions, export
+        >>> options = ExportOptions(checkpoint="last.ckpt", output="exported", formats=["onnx"])
+        >>> export(options).reports[0].difference  # doctest: +SKIP
+        3.1e-07
     """
-    for name in formats:
-        one_of("formats", name, FORMATS)
-    if not formats:
-        raise ConfigError(f"formats is empty; allowed: {', '.join(FORMATS)}")
-    one_of("batch", batch, exporters.BATCHES)
-    read = read_model(checkpoint)
-    folder = Path(output_dir)
+    formats, evaluation = tuple(dict.fromkeys(options.formats)), options.evaluation
+    read = read_model(options.checkpoint)
+    folder = Path(options.output)
     if read.path.name == WEIGHTS and read.path.resolve().parent == folder.resolve():
         raise ConfigError(f"the output folder {folder} holds the model itself; choose another")
     metrics = read_metrics(evaluation) if evaluation is not None else None
@@ -90,13 +131,14 @@ def export_model(
     network, pose = read.networks()
     record = public_record(read.record)
     network.eval()
-    random, real = random_images(record), real_images(record, images)
-    _clear(folder, overwrite)
+    random, real = random_images(record), real_images(record, options.images or ())
+    _clear(folder, options.overwrite)
+    remove_partial_files(folder)
     eager, span = exporters.run_eager(network), 1 / record.min_depth - 1 / record.max_depth
     reports, runs = list[Parity](), list[Run]()
-    with bar(progress) as shown:
-        task = shown.add_task("exporting", total=len(dict.fromkeys(formats)))
-        for name in dict.fromkeys(formats):
+    with bar() as shown:
+        task = shown.add_task("exporting", total=len(formats))
+        for name in formats:
             path = folder / FILES[name]
             with replacing(path) as temporary:
                 takes = "any"
@@ -104,7 +146,7 @@ def export_model(
                     parts = {"depth": network} if pose is None else {"depth": network, "pose": pose}
                     write_safetensors(named_state(parts), temporary)
                 else:
-                    takes = _EXPORTERS[name](network, record, temporary, batch)
+                    takes = _EXPORTERS[name](network, record, temporary, options)
                 size = temporary.stat().st_size / 2**20
                 run = _RUNNERS[name](temporary, record)
                 report = compare(path.name, eager, run, random, real, span, takes, size)
@@ -122,20 +164,18 @@ def export_model(
             runs.append(run)
             shown.advance(task)
     reports = timed(reports, eager, runs, random[0])
-    about = {"threads": torch.get_num_threads(), "machine": platform.machine(), "versions": _versions()}
+    about: dict[str, Any] = {"threads": torch.get_num_threads(), "machine": platform.machine(), "versions": _versions()}
+    if "onnx" in formats:
+        about["opset"] = options.opset
     content = {"tolerance": TOLERANCE, **about, "files": [asdict(report) for report in reports]}
     write_json(folder / REPORT, content)
     write_bytes(folder / CARD, model_card(record, reports, metrics, splits).encode())
     write_json(folder / CONFIG, record.to_plain())  # last: with it, the folder is a model
-    return reports
+    return ExportResult(output=folder, reports=tuple(reports))
 
 
 def read_metrics(path: str | Path) -> Mapping[str, Any]:
-    """Read the ``metrics.json`` of an evaluation.
-
-    Raises:
-        DataError: if it is missing or is not one.
-    """
+    """Read the ``metrics.json`` of an evaluation."""
     path = Path(path)
     path = path / "metrics.json" if path.is_dir() else path
     try:
@@ -174,11 +214,7 @@ def _clear(folder: Path, overwrite: bool) -> None:
 
 
 def public_record(record: ModelRecord) -> ModelRecord:
-    """Return a model's record without the trainer's folders.
-
-    Raises:
-        ConfigError: if a number in it is NaN or infinite, which ``config.json`` could not hold.
-    """
+    """Return a model's record without the trainer's folders."""
     record = replace(record, data={key: value for key, value in record.data.items() if key not in _PLACES})
     try:
         json.dumps(record.to_plain(), allow_nan=False)
@@ -194,11 +230,7 @@ def random_images(record: ModelRecord) -> list[NDArray[np.float32]]:
 
 
 def real_images(record: ModelRecord, images: str | Path | Sequence[str | Path]) -> list[NDArray[np.float32]]:
-    """Return at most eight of the images of files, folders or patterns at the network's size, each 1 3 h w.
-
-    Raises:
-        DataError: if there is none, or one cannot be read.
-    """
+    """Return at most eight of the images of files, folders or patterns at the network's size, each 1 3 h w."""
     several = [images] if isinstance(images, str | Path) else list(images)
     paths = [path for item in several for path in image_paths(item)]
     chosen = [paths[index] for index in np.linspace(0, len(paths) - 1, min(len(paths), _REAL_AT_MOST)).astype(int)]
@@ -224,10 +256,10 @@ def _versions() -> dict[str, str]:
     return found
 
 
-_EXPORTERS: dict[str, Callable[[DepthNet, ModelRecord, Path, str], str]] = {
-    "onnx": exporters.export_onnx,
-    "program": exporters.export_program,
-    "compiled": exporters.export_compiled,
+_EXPORTERS: dict[str, Callable[[DepthNet, ModelRecord, Path, ExportOptions], str]] = {
+    "onnx": lambda network, record, path, how: exporters.export_onnx(network, record, path, how.batch, how.opset),
+    "program": lambda network, record, path, how: exporters.export_program(network, record, path, how.batch),
+    "compiled": lambda network, record, path, how: exporters.export_compiled(network, record, path, how.batch),
 }
 _RUNNERS: dict[str, Callable[[Path, ModelRecord], Run]] = {
     "onnx": lambda path, record: exporters.run_onnx(path),

@@ -1,0 +1,403 @@
+"""`predict`: depth of an image, a folder, a pattern, a video or a camera, as pictures, points and videos."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from saunet.errors import ConfigError, DataError, one_of, positive, usable_device
+from saunet.io.atomic import remove_partial_files
+from saunet.io.colormaps import COLORMAPS, RunningRange
+from saunet.io.video import CODECS
+from saunet.prediction import pipeline
+from saunet.prediction.files import OUTPUTS, Manifest, Style, check_folder_of
+from saunet.prediction.load import load
+from saunet.prediction.pointcloud import Camera
+from saunet.prediction.prediction import ImagePredictor
+from saunet.prediction.scaling import apply_scale
+from saunet.prediction.sinks import (
+    LAYOUTS,
+    FrameFilesSink,
+    ImageFilesSink,
+    Sink,
+    TrajectorySink,
+    VideoSink,
+    ViewerSink,
+)
+from saunet.prediction.sources import Frame, Input, Recording, Source
+from saunet.scale.options import ScaleOptions
+
+if TYPE_CHECKING:
+    from saunet.prediction.odometer import Odometer
+
+CLIP_OUTPUTS: tuple[str, ...] = ("mp4", "html", "trajectory")
+"""What can be written for a recording as a whole, besides `saunet.prediction.files.OUTPUTS` for each of its frames."""
+
+_NAMES = {"mp4": "_disparity.mp4", "html": "_points.html", "trajectory": "_trajectory.png"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictOptions:
+    """What `predict` reads, how it predicts, and what it writes.
+
+    Images are predicted into files of their own, and finished ones are skipped, so that an interrupted run can be
+    started again. A video, a camera or arrays are predicted once, with colors that are stable over the recording.
+
+    Args:
+        checkpoint: The model: a checkpoint, an exported folder or file, a shipped model's name, or ``hf://owner/name``.
+        input: An image, a folder (with everything below), a pattern (``frames/*.png``), a video, or a camera's number;
+            in Python also several images, or RGB arrays h x w x 3.
+        output: The folder of the results, made if missing; names follow the inputs.
+        outputs: ``color`` (disparity in colors), ``png16`` (depth x 256), ``npy`` (depth in float32), ``ply`` (points)
+            for each image; ``mp4`` (image and disparity), ``html`` (points to orbit) and ``trajectory`` (from above,
+            as KITTI poses, and where times are known for TUM's tools) for the whole. By default color and png16 of
+            images, mp4 of videos.
+        colormap: magma, inferno, viridis, turbo or gray.
+        camera: True intrinsics, which ``ply`` and ``html`` need: a camera.yaml; fx, fy, cx, cy in pixels of the first
+            image; the nine numbers of K; or one number, the horizontal field of view in degrees.
+        undistort: A camera.yaml: undistort and crop the images first, as training on that camera's clips does.
+        max_depth: Leave out points that are farther, in the unit of depth.
+        max_frames: Predict the first so many images or frames only.
+        fps: Frames per second of results; by default a video keeps its times, and images have 10.
+        layout: Of the video: ``stacked`` (disparity below), ``beside``, or ``auto``.
+        range_smoothing: Weight of the past in the running color range of a recording, from 0 to below 1.
+        codec: Of the video: ``h264``, ``mp4v`` (quickest) or ``vp09``.
+        flip: Average with the prediction of the mirrored image: twice the time, a little less error.
+        keep_aspect: Feed each image at its own aspect ratio.
+        scale: How depth becomes meters.
+        overwrite: Replace results that are already there, whoever made them.
+        batch_size: Images that go through the network together.
+        device: Where to predict; ``auto`` takes a GPU if there is one.
+
+    Raises:
+        ConfigError: if an option cannot work, or not beside another one.
+    """
+
+    checkpoint: str | Path = "street"
+    input: Input
+    output: str | Path
+    outputs: Sequence[str] | None = None
+    colormap: str = "magma"
+    camera: Sequence[float | int] | Camera | str | Path | None = None
+    undistort: str | Path | None = None
+    max_depth: float | int | None = None
+    max_frames: int | None = None
+    fps: float | int | None = None
+    layout: str = "auto"
+    range_smoothing: float | int = 0.95
+    codec: str = "h264"
+    flip: bool = False
+    keep_aspect: bool = False
+    scale: ScaleOptions = field(default_factory=ScaleOptions)
+    overwrite: bool = False
+    batch_size: int = 1
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.outputs is not None:
+            for output in self.outputs:
+                one_of("outputs", output, (*OUTPUTS, *CLIP_OUTPUTS))
+            if not self.outputs:
+                raise ConfigError(f"outputs is empty; allowed: {', '.join((*OUTPUTS, *CLIP_OUTPUTS))}")
+        one_of("colormap", self.colormap, COLORMAPS)
+        one_of("layout", self.layout, LAYOUTS)
+        one_of("codec", self.codec, CODECS)
+        positive("batch_size", self.batch_size)
+        for name in ("max_depth", "max_frames", "fps"):
+            if getattr(self, name) is not None:
+                positive(name, getattr(self, name))
+        RunningRange(self.range_smoothing)
+        for output in self.outputs or ():
+            if output in ("ply", "html") and self.camera is None and self.undistort is None:
+                raise ConfigError(
+                    f"outputs has '{output}', which needs the camera's true intrinsics; give camera fx, fy, cx, cy, "
+                    "a camera.yaml, or one number, the horizontal field of view in degrees"
+                )
+        if self.undistort is not None:
+            if self.camera is not None:
+                raise ConfigError(
+                    "camera and undistort are both set; undistort=FILE has the intrinsics, leave camera out"
+                )
+            if self.scale.measures:
+                raise ConfigError(
+                    f"scale.method={self.scale.method} measures on the images as they are, so it does not go with "
+                    "undistort; measure with saunet evaluate data=video scale.store=true first"
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictResult:
+    """What `predict` did."""
+
+    output: Path
+    unit: str
+    """What one unit of depth is."""
+    frames: int
+    """Images or frames predicted now."""
+    written: tuple[Path, ...] = ()
+    """Files of single images written now."""
+    skipped: int | None = None
+    """Images whose files were all finished before; None if no such files were asked for."""
+    clips: tuple[Path, ...] = ()
+    """Results of the whole recording written now; for files of its frames, their folder."""
+    finished: tuple[Path, ...] = ()
+    """Results of the whole recording that were finished before."""
+    missing: int = 0
+    """Frames that a truncated video lacks."""
+    failures: tuple[str, ...] = ()
+    """One sentence for each image that could not be read, and for what was wrong with a video."""
+
+    @property
+    def exit_code(self) -> int:
+        """1 if something was missing."""
+        return 1 if self.failures else 0
+
+    def __str__(self) -> str:
+        lines = []
+        if self.skipped is not None:
+            before = f", {self.skipped} images were finished before" if self.skipped else ""
+            lines.append(f"{len(self.written)} files written{before}: {self.output}")
+        for paths, what in ((self.clips, f"{self.frames} frames"), (self.finished, "finished before")):
+            if paths:
+                lines.append(f"{what}: {', '.join(map(str, paths))}")
+        return "\n".join(lines)
+
+
+def predict(
+    options: PredictOptions, predictor: ImagePredictor | None = None, odometer: Odometer | None = None
+) -> PredictResult:
+    """Predict depth for everything that an input names; see `PredictOptions`.
+
+    Args:
+        options: What to read and write.
+        predictor: A model that is loaded already; then the checkpoint is read for its pose network only.
+        odometer: What follows the camera; then the checkpoint is not read for it.
+
+    Raises:
+        ConfigError: for options that do not fit the input, or results that are there already and not known to be these.
+        CheckpointError: if the model cannot be read.
+        DataError: if the input cannot be read, nothing in it can, or the system refuses to write.
+
+    Example:
+        >>> options = PredictOptions(checkpoint="last.ckpt", input="drive.mp4", output="out")  # doctest: +SKIP
+        >>> print(predict(options))  # doctest: +SKIP
+        48 frames: out/drive_disparity.mp4
+    """
+    folder = Path(options.output)
+    with contextlib.closing(Recording(options.input, folder, options.fps)) as recording:
+        default = ("mp4",) if recording.images is None else ("color", "png16")
+        outputs = tuple(dict.fromkeys(options.outputs or default))
+        if predictor is None:
+            device = _device(options.device)
+            predictor = load(options.checkpoint, device=device, flip=options.flip, keep_aspect=options.keep_aspect)
+        camera = _camera(options, recording, predictor)
+        apply_scale(options.scale, predictor, options.input, camera, folder, options.checkpoint)
+        print(f"depth is {predictor.unit}")
+        remove_partial_files(folder)
+        if "trajectory" in outputs and odometer is None:
+            odometer = _odometer(options, predictor)
+        style = Style(options.colormap, None, camera, options.max_depth)
+        if recording.images is None:
+            return _predict_clip(options, outputs, predictor, recording, style, odometer)
+        return _predict_images(options, outputs, predictor, recording, style, odometer)
+
+
+def _predict_clip(
+    options: PredictOptions,
+    outputs: Sequence[str],
+    predictor: ImagePredictor,
+    recording: Recording,
+    style: Style,
+    odometer: Odometer | None,
+) -> PredictResult:
+    """Predict a video, a camera or arrays in one pass; results are new or not written."""
+    sinks = _clip_sinks(options, outputs, recording, style, odometer)
+    files = [output for output in outputs if output in OUTPUTS]
+    if files:
+        sinks.append(FrameFilesSink(Path(options.output) / recording.title, files, style))
+    _refuse_existing(sinks, options.overwrite)
+    counts = pipeline.run(
+        predictor,
+        _first(recording, options.max_frames),
+        sinks,
+        RunningRange(options.range_smoothing),
+        batch_size=options.batch_size,
+        total=options.max_frames or recording.declared,
+        tolerant=False,
+        live=recording.live,
+    )
+    return PredictResult(
+        output=Path(options.output),
+        unit=predictor.unit,
+        frames=counts.frames,
+        clips=tuple(path for sink in sinks for path in sink.paths),
+        missing=recording.missing,
+        failures=tuple(recording.problems),
+    )
+
+
+def _predict_images(
+    options: PredictOptions,
+    outputs: Sequence[str],
+    predictor: ImagePredictor,
+    recording: Recording,
+    style: Style,
+    odometer: Odometer | None,
+) -> PredictResult:
+    """Predict images into files of their own, and into results of the whole; what is finished and newer is skipped."""
+    folder, frames = Path(options.output), list(_first(recording, options.max_frames))
+    sources = (recording.images or [])[: options.max_frames]
+    check_folder_of(folder, sources)
+    manifest = Manifest(folder, predictor, style, options.overwrite)
+    clips = _clip_sinks(options, outputs, recording, style, odometer)
+    look = {
+        "fps": recording.fps,
+        "layout": options.layout,
+        "range_smoothing": float(options.range_smoothing),
+        "codec": options.codec,
+    }
+    known = {} if options.overwrite else manifest.clips
+    ours = [sink for sink in clips if _made_like(known.get(sink.paths[0].name), look)]
+    _refuse_existing([sink for sink in clips if sink not in ours], options.overwrite)
+    finished = [sink for sink in ours if _finished(sink, known[sink.paths[0].name], sources)]
+    todo = [sink for sink in clips if sink not in finished]
+
+    files = ImageFilesSink(
+        folder, [output for output in outputs if output in OUTPUTS], style, manifest, options.overwrite
+    )
+    unfinished = [frame for frame in frames if files.wanted(frame)]
+
+    def check(counts: pipeline.Counts) -> None:
+        if counts.failures and len(counts.failures) == len(frames):
+            rest = len(counts.failures) - 1
+            raise DataError(counts.failures[0] + (f" (and {rest} more images cannot be read)" if rest else ""))
+        if counts.failures and todo:
+            names = ", ".join(path.name for sink in todo for path in sink.paths)
+            raise DataError(f"{counts.failures[0]}; {names} would lack it, so nothing but single images was written")
+
+    counts = pipeline.Counts()
+    if unfinished or todo:
+        wanted = frames if todo else unfinished
+        counts = pipeline.run(
+            predictor,
+            wanted,
+            [files, *todo],
+            RunningRange(options.range_smoothing),
+            batch_size=options.batch_size,
+            total=len(wanted),
+            tolerant=bool(files.outputs),
+            live=False,
+            check=check,
+        )
+    if todo:
+        manifest.write({sink.paths[0].name: {"images": len(frames), **look} for sink in todo})
+    return PredictResult(
+        output=folder,
+        unit=predictor.unit,
+        frames=counts.frames,
+        written=tuple(files.written),
+        skipped=len(frames) - len(unfinished) if files.outputs else None,
+        clips=tuple(path for sink in todo for path in sink.paths),
+        finished=tuple(path for sink in finished for path in sink.paths),
+        failures=tuple(counts.failures),
+    )
+
+
+def _clip_sinks(
+    options: PredictOptions,
+    outputs: Sequence[str],
+    recording: Recording,
+    style: Style,
+    odometer: Odometer | None,
+) -> list[Sink]:
+    """Return what takes the outputs that are made of a recording as a whole."""
+    folder, sinks = Path(options.output), list[Sink]()
+    paths = {output: folder / f"{recording.title}{_NAMES[output]}" for output in CLIP_OUTPUTS}
+    if "mp4" in outputs:
+        timed = recording.timed and options.fps is None
+        sinks.append(VideoSink(paths["mp4"], recording.fps, options.layout, style.colormap, options.codec, timed))
+    if "html" in outputs and style.camera is not None:
+        sinks.append(ViewerSink(paths["html"], style.camera, recording.fps, options.max_depth, recording.title))
+    if "trajectory" in outputs and odometer is not None:
+        sinks.append(TrajectorySink(paths["trajectory"], odometer, recording.timed))
+    return sinks
+
+
+def _first(recording: Recording, count: int | None) -> Iterator[Frame]:
+    return itertools.islice(recording, count)
+
+
+def _refuse_existing(sinks: Sequence[Sink], overwrite: bool) -> None:
+    """Check that no sink would replace a file, or fill a folder that holds some, unless it is told to."""
+    for path in (path for sink in sinks for path in sink.paths):
+        if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+            raise ConfigError(f"{path} exists; choose another output folder, or set overwrite=true")
+
+
+def _made_like(made: Any, look: dict[str, Any]) -> bool:
+    return isinstance(made, dict) and all(made.get(key) == value for key, value in look.items())
+
+
+def _finished(sink: Sink, made: dict[str, Any], sources: Sequence[Source]) -> bool:
+    if made.get("images") != len(sources) or not all(path.is_file() for path in sink.paths):
+        return False
+    newest = max(source.path.stat().st_mtime for source in sources)
+    return all(path.stat().st_mtime >= newest for path in sink.paths)
+
+
+def _device(name: str) -> str:
+    import torch
+
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    return str(usable_device(name))
+
+
+def _camera(options: PredictOptions, recording: Recording, predictor: ImagePredictor) -> Camera | None:
+    """Return the true intrinsics of what is predicted, None if they are not given; make the predictor undistort."""
+    given = options.camera if options.undistort is None else options.undistort
+    if given is None or isinstance(given, Camera):
+        return given
+    if isinstance(given, str | Path) and not _numbers(given):
+        from saunet.data.video.camera_file import read_camera
+        from saunet.data.video.lens import Undistorter
+
+        file = read_camera(given)
+        if options.undistort is not None:
+            predictor.undistort = undistorter = Undistorter(file)
+            predictor.undistorted_by = f"camera {hashlib.sha256(file.path.read_bytes()).hexdigest()[:16]}"
+            size = file.image_size or recording.first_size
+            if size is None:
+                return None
+            lens = undistorter.lens(*size)
+            return Camera(lens.K, lens.height, lens.width)
+        if any(file.distortion):
+            raise ConfigError(
+                f"camera={given} describes a lens with distortion, and points need straight images; "
+                f"set undistort={given} in its place"
+            )
+        size = recording.first_size
+        return None if size is None else Camera(file.intrinsics(*size, "the images"), *size)
+    size = recording.first_size
+    return None if size is None else Camera.from_numbers([float(each) for each in _numbers(given)], *size)
+
+
+def _numbers(given: Any) -> list[Any]:
+    """Return the numbers that are given, also as text: ``80,80,44.5,29.5``; none for a file."""
+    if not isinstance(given, str | Path):
+        return list(given)
+    words = str(given).split(",")
+    return words if all(word.strip().replace(".", "", 1).replace("-", "", 1).isdigit() for word in words) else []
+
+
+def _odometer(options: PredictOptions, predictor: ImagePredictor) -> Odometer:
+    from saunet.prediction.odometer import Odometer
+    from saunet.weights.locate import locate
+
+    path = locate(options.checkpoint)
+    return Odometer.from_model(path, predictor.scale, _device(options.device), options.batch_size)
