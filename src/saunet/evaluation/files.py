@@ -37,12 +37,6 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
     """Write ``metrics.json``, ``metrics.csv``, ``metrics.md`` and ``per_image.csv``, each whole or not at all.
 
     What else the result holds goes to ``buckets.csv``, ``views.csv`` (an image a line) and ``comparison.csv``.
-
-    Returns:
-        The files by those names.
-
-    Raises:
-        DataError: if the folder cannot be written to.
     """
     summaries = [_summary_dict(summary, result.spreads) for summary in result.summaries()]
     rows = ((row.predictor, row.protocol, row.name, row.pixels, row.scale, *row.errors) for row in result.rows)
@@ -95,14 +89,7 @@ def as_json(result: EvaluationResult) -> dict[str, object]:
 
 
 def read_rows(path: Path) -> tuple[ImageRow, ...]:
-    """Read the rows of an evaluation back, for comparisons.
-
-    Args:
-        path: Its folder, or the ``per_image.csv`` in it.
-
-    Raises:
-        DataError: if the file is missing or is not such a table.
-    """
+    """Read the rows of an evaluation back, for comparisons."""
     path = path / "per_image.csv" if path.is_dir() else path
     try:
         with path.open(encoding="utf-8", newline="") as file:

@@ -130,18 +130,7 @@ def straight_ahead(path: Path3d) -> Path3d:
 
 
 def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None = None) -> PathErrors:
-    """Compute the errors of a path whose truth is known.
-
-    Args:
-        path: The path.
-        snippet: Frames in a snippet; published numbers use 5.
-        lengths: Segment lengths in meters for t_rel and r_rel; by default KITTI's 100 to 800 m, or 20 to 80 % of
-            the path where it is shorter than 100 m (such numbers compare with no published ones).
-
-    Raises:
-        ConfigError: if a snippet has fewer than two frames, or a length is not above 0.
-        DataError: if there are fewer than two poses.
-    """
+    """Compute the errors of a path whose truth is known."""
     true = path.true
     assert true is not None, "errors need the true path"
     meters = float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum())
@@ -207,9 +196,6 @@ def write_path(path: Path3d, folder: Path) -> None:
     """Write a path as predicted and, with a truth, aligned to it and the truth itself.
 
     In KITTI's format, and in TUM's if the recording knows its times.
-
-    Raises:
-        DataError: if a file cannot be written.
     """
     kinds = {"predicted": path.predicted}
     if path.true is not None:
@@ -221,11 +207,7 @@ def write_path(path: Path3d, folder: Path) -> None:
 
 
 def write_errors(errors: Sequence[PathErrors], folder: Path, settings: dict[str, object]) -> None:
-    """Write ``odometry.json`` and ``odometry.csv``, one entry per sequence and predictor.
-
-    Raises:
-        DataError: if a file cannot be written.
-    """
+    """Write ``odometry.json`` and ``odometry.csv``, one entry per sequence and predictor."""
     rows: list[dict[str, object]] = [without_nan(asdict(row)) for row in errors]
     write_json(folder / "odometry.json", {"settings": settings, "results": rows})
     if rows:
@@ -234,16 +216,7 @@ def write_errors(errors: Sequence[PathErrors], folder: Path, settings: dict[str,
 
 
 def draw_path(path: Path3d, file: Path, errors: Sequence[PathErrors] = ()) -> None:
-    """Draw a path from above and, where the true one is known, both and the distance between them.
-
-    Args:
-        path: The path; its world's x is to the right and z is forward, as KITTI's.
-        file: Picture file to write; its suffix chooses the format.
-        errors: Of the path, and of predictors that look at no image, for the title.
-
-    Raises:
-        DataError: if the file cannot be written.
-    """
+    """Draw a path from above and, where the true one is known, both and the distance between them."""
     known = path.true is not None
     figure, (above, *more) = new_figure(1 + known, 9.0 if known else 5.0, 4.5)
     ours = spots = path.aligned[:, :3, 3]

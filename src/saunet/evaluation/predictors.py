@@ -113,11 +113,7 @@ class FilePredictor:
         self._place = {name: place for place, name in enumerate(names)}
 
     def __call__(self, batch: EvalBatch) -> Float[Tensor, "b 1 h w"]:
-        """Return the disparity of the batch's images; they must be of one size.
-
-        Raises:
-            DataError: if a prediction is missing, cannot be read, is not positive, or differs in size from others.
-        """
+        """Return the disparity of the batch's images; they must be of one size."""
         maps = [self._read(name) for name in batch["name"]]
         if len({one.shape for one in maps}) > 1:
             raise DataError(f"predictions of one batch in '{self.path}' differ in size; evaluate with batch size 1")
@@ -204,11 +200,7 @@ class ExportingPredictor:
 
 
 def truths_of(batch: EvalBatch) -> list[Float[Tensor, "_ _"]]:
-    """Return the ground truth of each image at its native size, meters, 0 where unknown; one such pixel without any.
-
-    Raises:
-        DataError: if the batch has depth without its sizes, or they do not fit.
-    """
+    """Return the ground truth of each image at its native size, meters, 0 where unknown; one such pixel without any."""
     if "depth" not in batch:
         return [batch["target"].new_zeros(1, 1) for _ in batch["name"]]
     if "depth_size" not in batch:
@@ -217,11 +209,7 @@ def truths_of(batch: EvalBatch) -> list[Float[Tensor, "_ _"]]:
 
 
 def existing(path: Path) -> Path:
-    """Return the path of predictions if there is something at it.
-
-    Raises:
-        DataError: otherwise.
-    """
+    """Return the path of predictions if there is something at it."""
     if not path.exists():
         raise DataError(f"no predictions at '{path}'; give a .npy array or a folder of .npy or .png files")
     return path

@@ -201,11 +201,7 @@ class EvaluationResult:
     """Sentences about what else was done."""
 
     def select(self, predictor: str, protocol: str) -> tuple[ImageRow, ...]:
-        """Return the rows of one predictor under one protocol, in the order they were computed.
-
-        Raises:
-            ConfigError: if the result holds no such predictor or protocol.
-        """
+        """Return the rows of one predictor under one protocol, in the order they were computed."""
         one_of("predictor", predictor, self.predictors)
         one_of("protocol", protocol, [rules.name for rules in self.protocols])
         return tuple(row for row in self.rows if row.predictor == predictor and row.protocol == protocol)
@@ -272,12 +268,7 @@ class EvaluationResult:
         )
 
     def joined(self, other: EvaluationResult) -> EvaluationResult:
-        """Return both results as one: other protocols (another ground truth) or other predictors of the same images.
-
-        Raises:
-            ConfigError: if both give rows for the same predictor and protocol, protocols of one name differ, or the
-                images do.
-        """
+        """Return both results as one: other protocols (another ground truth) or other predictors of the same images."""
         mine, theirs = ({(row.predictor, row.protocol) for row in result.rows} for result in (self, other))
         if both := sorted(mine & theirs):
             raise ConfigError(
@@ -306,11 +297,7 @@ class EvaluationResult:
         )
 
     def tables(self, ranges: bool = False) -> list[Table]:
-        """Return one table per protocol, then where the errors of the first predictor are, then comparisons.
-
-        Args:
-            ranges: Write intervals as ``low to high``, not as ``±half``.
-        """
+        """Return one table per protocol, then where the errors of the first predictor are, then comparisons."""
         found = []
         summaries, views = self.summaries(), self.view_summaries()
         for protocol in self.protocols:
@@ -367,11 +354,7 @@ class EvaluationResult:
 
 
 def summarize(rows: Iterable[ImageRow]) -> Summary:
-    """Return the means of rows that share predictor and protocol.
-
-    Raises:
-        DataError: if there are no rows or they do not share both.
-    """
+    """Return the means of rows that share predictor and protocol."""
     rows = list(rows)
     keys = {(row.predictor, row.protocol) for row in rows}
     if len(keys) != 1:

@@ -26,22 +26,14 @@ def drive_of(name: str) -> str:
 
 
 def groups_of(names: Sequence[str]) -> tuple[str, int, list[str]]:
-    """Choose what to resample: drives where there are `FEWEST_DRIVES`, else images.
-
-    Returns:
-        ``drive`` or ``image``, how many there are, and the group of each image.
-    """
+    """Choose what to resample: drives where there are `FEWEST_DRIVES`, else images."""
     drives = [drive_of(name) for name in names]
     count = len(set(drives))
     return ("drive", count, drives) if count >= FEWEST_DRIVES else ("image", len(names), list(names))
 
 
 def spreads(result: EvaluationResult, level: float = 0.95, seed: int = 0) -> tuple[Spread, ...]:
-    """Compute intervals of all means of a result that rest on at least two images.
-
-    Raises:
-        ConfigError: if the level is not in (0, 1).
-    """
+    """Compute intervals of all means of a result that rest on at least two images."""
     found = []
     for protocol in result.protocols:
         for predictor in result.predictors:

@@ -255,11 +255,7 @@ def _fitting(data: EvaluationData, motion: bool) -> list[str]:
 
 
 def _passes(options: EvaluateOptions, spec: Spec, motion: bool) -> list[tuple[EvaluationData, list[Rules]]]:
-    """Return the data modules to go through, not set up, one for each ground truth, with the protocols for each.
-
-    Raises:
-        ConfigError: if a protocol needs ground truth that these data cannot give, or motion and there is none.
-    """
+    """Return the data modules to go through, not set up, one for each ground truth, with the protocols for each."""
     first: EvaluationData | None = spec.build()
     assert first is not None
     own, choice = first.ground_truth, spec.parameters.get("depth")

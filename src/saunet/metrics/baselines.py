@@ -75,11 +75,7 @@ class MeanDepthMap(nn.Module):
             self.count.index_put_(cell, torch.ones_like(values), accumulate=True)
 
     def depth_map(self) -> Float[Tensor, "h w"]:
-        """Return the mean depth on the grid in meters, every cell filled.
-
-        Raises:
-            DataError: if no ground truth was added.
-        """
+        """Return the mean depth on the grid in meters, every cell filled."""
         seen = self.count > 0
         cells = seen.sum(1)
         known_rows = cells.nonzero()[:, 0]
@@ -92,11 +88,7 @@ class MeanDepthMap(nn.Module):
         return torch.where(seen, mean, row_mean[:, None]).float()
 
     def forward(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return the disparity (1/meter) for images, at their size.
-
-        Raises:
-            DataError: if no ground truth was added.
-        """
+        """Return the disparity (1/meter) for images, at their size."""
         disparity = 1 / self.depth_map()[None, None].to(image.device)
         size = (image.shape[-2], image.shape[-1])
         resized = interpolate(disparity, size=size, mode="bilinear", align_corners=False)

@@ -19,6 +19,12 @@ class DepthMetrics(Metric):
     An image whose ground truth has no pixel to compare is counted (``images_without_truth``) and leaves the means
     alone.
 
+    Example:
+        >>> metrics = DepthMetrics("synthetic")
+        >>> metrics.update(torch.full((1, 1, 4, 6), 0.5), torch.full((1, 1, 8, 12), 10.0), torch.tensor([[8, 12]]))
+        >>> {name: round(value.item(), 3) for name, value in metrics.compute().items() if name in ("abs_rel", "scale")}
+        {'abs_rel': 0.0, 'scale': 5.0}
+
     Args:
         protocol: A protocol or the name of one.
 
@@ -101,11 +107,7 @@ class DepthMetrics(Metric):
 def native_depths(
     depth: Float[Tensor, "b 1 hg wg"], depth_size: Int[Tensor, "b 2"], images: int
 ) -> list[Float[Tensor, "_ _"]]:
-    """Cut each ground truth of a batch out of its padding (bottom and right).
-
-    Raises:
-        DataError: if there are not ``images`` of them, or a native size does not fit into the padded one.
-    """
+    """Cut each ground truth of a batch out of its padding (bottom and right)."""
     if len(depth) != images or len(depth_size) != images:
         raise DataError(
             f"{images} predictions came with {len(depth)} ground truths and {len(depth_size)} sizes; "

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 ABS_REL, SQ_REL, RMSE, RMSE_LOG, A1, A2, A3 = range(7)
-"""Positions in the vector that `depth_errors` returns."""
+"""Positions in vectors of errors."""
 ERROR_NAMES: tuple[str, ...] = ("abs_rel", "sq_rel", "rmse", "rmse_log", "a1", "a2", "a3")
 """The seven depth errors in the field's column order."""
 ERROR_HEADINGS: tuple[str, ...] = ("Abs Rel ↓", "Sq Rel ↓", "RMSE ↓", "RMSE log ↓", "δ1 ↑", "δ2 ↑", "δ3 ↑")
@@ -21,31 +21,12 @@ _GARG_ROWS = (0.40810811, 0.99189189)
 _GARG_COLUMNS = (0.03594771, 0.96405229)
 
 
-def depth_errors(
-    prediction: Float[Tensor, " b *shape"], target: Float[Tensor, " b *shape"], mask: Bool[Tensor, " b *shape"]
-) -> Float[Tensor, "b 7"]:
-    """Compute the seven Eigen errors of each image over its masked pixels; SAU-Net eqs. (15)-(19).
+def error_terms(prediction: Float[Tensor, " *shape"], target: Float[Tensor, " *shape"]) -> Float[Tensor, "k=7 *shape"]:
+    """Compute what each pixel adds to the seven Eigen errors, SAU-Net eqs. (15)-(19), float64.
 
     The standard definitions, for the equations are misprinted: with ``d`` the prediction and ``D*`` the truth, mean
-    |d-D*|/D*; mean (d-D*)²/D*; root of mean (d-D*)²; root of mean (ln d - ln D*)²; and the share of pixels with
-    max(d/D*, D*/d) below 1.25, 1.25², 1.25³. Computed in double precision, without waiting for the device.
-
-    Args:
-        prediction: Depth in meters, positive where ``mask`` is set.
-        target: True depth in meters, positive where ``mask`` is set.
-        mask: The pixels that count.
-
-    Returns:
-        float64, columns as in `ERROR_NAMES`; a row of NaN for an image without a masked pixel.
-    """
-    terms = error_terms(torch.where(mask, prediction, 1).flatten(1), torch.where(mask, target, 1).flatten(1))
-    weight = mask.flatten(1).double()
-    # 0/0 = NaN for an empty image: a mean over nothing has no value.
-    return root_terms(((terms * weight).sum(-1) / weight.sum(-1)).T)
-
-
-def error_terms(prediction: Float[Tensor, " *shape"], target: Float[Tensor, " *shape"]) -> Float[Tensor, "k=7 *shape"]:
-    """Compute what each pixel adds to the seven errors, float64; RMSE and RMSE log still squared (see `root_terms`).
+    |d-D*|/D*; mean (d-D*)²/D*; root of mean (d-D*)²; root of mean (ln d - ln D*)²; and the fraction of pixels with
+    max(d/D*, D*/d) below 1.25, 1.25², 1.25³. RMSE and RMSE log are still squared here (see `root_terms`).
 
     Args:
         prediction: Depth in meters, positive.

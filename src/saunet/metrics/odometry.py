@@ -70,21 +70,13 @@ class SegmentErrors:
 
 
 def check_snippet(length: int) -> None:
-    """Check the number of frames in a snippet.
-
-    Raises:
-        ConfigError: if there are fewer than two, between which there is no motion.
-    """
+    """Check the number of frames in a snippet."""
     if length < 2:
         raise ConfigError(f"snippet is {length}; it counts frames and must be at least 2 (published numbers use 5)")
 
 
 def check_lengths(lengths: Sequence[float | int]) -> None:
-    """Check the lengths of segments.
-
-    Raises:
-        ConfigError: if one is not a finite number of meters above 0.
-    """
+    """Check the lengths of segments."""
     for length in lengths:
         positive("lengths", length)
 

@@ -97,11 +97,7 @@ PROTOCOLS: dict[str, Protocol] = {protocol.name: protocol for protocol in _PROTO
 
 
 def protocol(name: str) -> Protocol:
-    """Return a named protocol.
-
-    Raises:
-        ConfigError: for an unknown name; the message suggests the nearest and lists all.
-    """
+    """Return a named protocol."""
     return PROTOCOLS[one_of("protocol", name, PROTOCOLS)]
 
 

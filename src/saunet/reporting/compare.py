@@ -63,9 +63,6 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
     """Compare each run with the first one, image by image, wherever both were evaluated alike.
 
     Among all evaluations of two runs under a protocol, those of the same images and settings are paired.
-
-    Returns:
-        A table for each comparison, and a sentence for each that could not be made.
     """
     names = list(runs)
     found = {name: _scored(run) for name, run in runs.items()}
@@ -133,16 +130,7 @@ def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
 
 
 def compared(inputs: Inputs, wanted: Sequence[str]) -> tuple[list[Table], list[str]]:
-    """Return everything that can be said about the differences of runs: tables, and sentences about what is left out.
-
-    Args:
-        inputs: The runs.
-        wanted: Their names; made from what sets them apart if empty.
-
-    Raises:
-        ConfigError: if there are not as many names as runs.
-        DataError: if there are fewer than two runs.
-    """
+    """Return all that can be said about how runs differ: tables, and sentences about what is left out."""
     members = inputs.all_runs
     if len(members) < 2:
         raise DataError(f"{len(members)} run is not enough to compare; name two or more: saunet report compare A B")

@@ -15,16 +15,7 @@ Curve = tuple[list[float], list[float]]
 
 
 def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, ordered: bool = False) -> bytes | None:
-    """Draw columns of the runs' logs against epochs, one panel a column, one line a run.
-
-    Args:
-        runs: Runs by their short names.
-        panels: Columns and their titles; those that no run has are left out.
-        ordered: The runs are steps of one quantity: their colors run from dark to light.
-
-    Returns:
-        An SVG; None if there is nothing to draw.
-    """
+    """Draw columns of the runs' logs against epochs, one panel a column, one line a run."""
     drawn = [(key, title) for key, title in panels if any(curve(run.history, key)[0] for run in runs.values())]
     if not drawn:
         return None
@@ -87,11 +78,6 @@ def curve(history: Sequence[Mapping[str, float]], key: str, points: int = 150) -
 
     What is logged during an epoch lies between its whole numbers, what is logged after it on the next one: epoch 1 is
     the end of the first.
-
-    Args:
-        history: Rows with ``epoch`` and ``step``, both counted from 0.
-        key: The column.
-        points: How many points a training curve has at most.
     """
     rows = [row for row in history if key in row and "step" in row and "epoch" in row]
     if not rows:

@@ -38,9 +38,6 @@ def chosen(runs: Mapping[str, Run]) -> dict[str, Score]:
     """Return one score of each run that has any, so that as many as possible compare.
 
     Runs whose scores compare stand together, most of them first; at a draw, evaluations go before validations.
-
-    Args:
-        runs: Runs by their short names.
     """
     left = {name: [score for score in run.scores if not score.trivial] for name, run in runs.items()}
     found: dict[str, Score] = {}
@@ -56,11 +53,7 @@ def chosen(runs: Mapping[str, Run]) -> dict[str, Score]:
 
 
 def comparable(runs: Mapping[str, Run]) -> dict[str, Score]:
-    """Return the scores of the largest group of runs that compare: what one drawing may hold.
-
-    Args:
-        runs: Runs by their short names.
-    """
+    """Return the scores of the largest group of runs that compare: what one drawing may hold."""
     scores = chosen(runs)
     first = next((_key(score) for score in scores.values()), None)
     return {name: score for name, score in scores.items() if _key(score) == first}

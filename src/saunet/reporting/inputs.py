@@ -45,19 +45,7 @@ class Inputs:
 def collect(
     paths: Sequence[str | Path], checkpoint: str = "best", jobs: Jobs | None = None, *, strangers: bool = True
 ) -> Inputs:
-    """Read everything that the paths name.
-
-    Args:
-        paths: Folders of runs, sweeps, evaluations and benchmarks, folders that hold such folders, checkpoint files.
-        checkpoint: Which checkpoint of a run is meant, ``best`` or ``last``.
-        jobs: Tells which jobs a sweep should have, so that those without a folder are not forgotten.
-        strangers: An evaluation of a run that is not named stands for that run; otherwise it does so only where fewer
-            than two runs are named. One of another system's predictions always stands for that system.
-
-    Raises:
-        ConfigError: if the checkpoint is neither.
-        DataError: if a path does not exist or holds nothing of the kind.
-    """
+    """Read everything that the paths name."""
     one_of("checkpoint", checkpoint, ("best", "last"))
     if not paths:
         raise DataError("no run given; name folders of runs or sweeps, or checkpoints: saunet report outputs/train/...")

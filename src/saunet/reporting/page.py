@@ -178,12 +178,7 @@ def _anchor(title: str) -> str:
 
 
 def as_markdown(document: Document, pictures: str = "figures") -> str:
-    """Return the report as Markdown.
-
-    Args:
-        document: The report.
-        pictures: Folder of the pictures, relative to the page.
-    """
+    """Return the report as Markdown."""
     parts = [f"# {document.title}", *(f"- {fact}" for fact in document.facts)]
     for section in document.sections:
         parts += ["", f"## {section.title}", *(["", section.intro] if section.intro else [])]
@@ -220,14 +215,7 @@ def _image(picture: Picture, folder: str) -> str:
 
 
 def write(document: Document, folder: Path) -> dict[str, Path]:
-    """Write ``report.html``, ``report.md``, ``tables/*.csv`` and ``figures/``, each file whole or not at all.
-
-    Returns:
-        The files by their names in the folder.
-
-    Raises:
-        DataError: if the folder cannot be written to.
-    """
+    """Write ``report.html``, ``report.md``, ``tables/*.csv`` and ``figures/``, each file whole or not at all."""
     content = {"report.html": as_html(document).encode(), "report.md": as_markdown(document).encode()}
     content |= {f"tables/{table.name}.csv": table.csv().encode() for table in document.tables}
     content |= {f"figures/{picture.name}": picture.data for picture in document.pictures}

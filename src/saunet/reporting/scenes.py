@@ -47,16 +47,7 @@ class View:
 
 
 def read_views(scenes: Mapping[str, str | Sequence[str]], limit: int) -> list[View]:
-    """Read the images that a report shows.
-
-    Args:
-        scenes: By condition: images, folders or patterns; of a folder, images evenly spread over it.
-        limit: Images of each condition at most.
-
-    Raises:
-        ConfigError: if the limit is not positive or a condition names nothing.
-        DataError: if an image is missing or broken.
-    """
+    """Read the images that a report shows."""
     positive("scenes_limit", limit)
     views = []
     for condition, given in scenes.items():
@@ -85,17 +76,7 @@ class Seen:
 
 
 def look(run: Run, views: Sequence[View], device: str = "cpu", flip: bool = False) -> Seen | str:
-    """Build a run's networks, count their parameters and predict the views.
-
-    Args:
-        run: The run.
-        views: What to predict.
-        device: Where.
-        flip: Average with the prediction of the mirrored image.
-
-    Returns:
-        What was found, or one sentence why the run has no usable networks.
-    """
+    """Build a run's networks, count their parameters and predict the views."""
     if run.checkpoint is None:
         return run.error or "it has no checkpoint"
     try:
@@ -116,11 +97,6 @@ def edge_boxes(
     """Choose the parts of a scene where the models see most depth edges on edges of the image; they do not overlap.
 
     All models get the same boxes. A part is a sixth of the width, and two thirds as high as wide.
-
-    Args:
-        disparities: Of each model.
-        image: The scene.
-        count: How many parts.
     """
     height, width = image.shape[:2]
     size = max(8, width // 6)
@@ -145,12 +121,6 @@ def scene(view: View, disparities: Mapping[str, Float32[np.ndarray, "h w"]], nam
     """Return a scene as input and as each model sees it, with the same parts enlarged.
 
     Each model's disparity is painted over its own range: its scale means nothing.
-
-    Args:
-        view: The scene.
-        disparities: By model, at the image's size.
-        name: Start of the picture files' names.
-        boxes: How many parts are enlarged.
     """
     found = edge_boxes(list(disparities.values()), view.image, boxes)
     pictures = {"input": view.image, **{model: colorize(one) for model, one in disparities.items()}}

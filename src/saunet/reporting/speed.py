@@ -17,11 +17,7 @@ from saunet.tables.drawing import Point
 
 
 def read_benchmark(folder: Path) -> list[dict[str, object]]:
-    """Return the measurements of a ``benchmark.json``.
-
-    Raises:
-        DataError: if it is not one.
-    """
+    """Return the measurements of a ``benchmark.json``."""
     content = read_json(folder / "benchmark.json")
     rows = content.get("results") if isinstance(content, dict) else None
     keys = ("model", "size", "device", "precision", "mode", "batch_size", "depth_parameters", "median")
@@ -38,14 +34,6 @@ def speed(
     A measurement belongs to the runs whose depth network has exactly its number of parameters (only that one is timed)
     and its size: the accuracy was reached there and nowhere else. The figure has one point for each such run, device,
     precision and mode, of one image at a time; of times measured twice, the one in the benchmark that is named last.
-
-    Args:
-        benchmarks: Folders with a ``benchmark.json``.
-        runs: Runs by their short names.
-        seen: Size and parameters of their networks.
-
-    Returns:
-        The points of Fig. 10, the table behind it, and what was left out.
     """
     scores = chosen(runs)
     group, shared = Groups(scores.values()), comparable(runs)

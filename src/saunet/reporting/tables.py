@@ -16,11 +16,7 @@ PRINTED = "Published: KITTI Eigen test split (697 images), 0–80 m, median-scal
 
 
 def table1(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
-    """Return the paper's Table 1 with every score of the runs, and which runs have none.
-
-    Args:
-        runs: Runs by their short names.
-    """
+    """Return the paper's Table 1 with every score of the runs, and which runs have none."""
     rows = [Row((row.method, row.pattern, *row.errors), "published", PRINTED) for row in published().table1]
     ours, without = _scored(runs)
     group = Groups(score for _, score in ours)
@@ -44,11 +40,7 @@ def table1(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
 
 
 def explained_table(runs: Mapping[str, Run]) -> Table | None:
-    """Return how well runs explain data without ground truth, by condition; None if none was evaluated on such data.
-
-    Args:
-        runs: Runs by their short names.
-    """
+    """Return how well runs explain data without ground truth, by condition; None if none was evaluated on such data."""
     ours = dict.fromkeys((name, one) for name, run in runs.items() for one in run.explained)
     group = Groups(one for _, one in ours)
     rows = [
@@ -70,11 +62,7 @@ def explained_table(runs: Mapping[str, Run]) -> Table | None:
 
 
 def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table, list[Missing]]:
-    """Return the paper's Table 2 with the parameters of our networks.
-
-    Args:
-        sizes: Parameters of depth and pose network by model; models of the same sizes and name are listed once.
-    """
+    """Return the paper's Table 2 with the parameters of our networks."""
     rows = [Row((row.method, None, None, row.megaparameters), "published", "Published") for row in published().table2]
     rows += [
         Row((name, depth / 1e6, pose / 1e6 if pose else None, (depth + pose) / 1e6), "measured", "Counted here")
@@ -92,11 +80,7 @@ def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table, list[Missing]]:
 
 
 def table3(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
-    """Return the paper's Table 3 with our runs of different encoders and decoders.
-
-    Args:
-        runs: Runs by their short names.
-    """
+    """Return the paper's Table 3 with our runs of different encoders and decoders."""
     rows = [
         Row((row.method, _tick(row.stratified), _tick(row.attention), *row.errors), "published", PRINTED)
         for row in published().table3
@@ -122,14 +106,7 @@ def table3(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
 
 
 def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -> Table:
-    """Return runs with what sets them apart as columns, how they ended, and what they reached.
-
-    Args:
-        name: Of the CSV file.
-        title: Of the table.
-        runs: Runs by their short names; those that failed too.
-        swept: They are the jobs of one sweep: what differs is what the command line swept.
-    """
+    """Return runs with what sets them apart as columns, how they ended, and what they reached."""
     members = list(runs.values())
     keys = differing(members, by_overrides=swept)
     ratios = [ratio(run) for run in members]

@@ -149,12 +149,7 @@ class _Group:
 def build(
     inputs: Inputs, options: ReportOptions | None = None, progress: Callable[[str], None] = lambda text: None
 ) -> Document:
-    """Make a report of what was read.
-
-    Raises:
-        ConfigError: if the labels do not fit the runs.
-        DataError: if a scene or a benchmark cannot be read.
-    """
+    """Make a report of what was read."""
     options = options or ReportOptions()
     device, drawable = str(usable_device(options.device)), find_spec("matplotlib") is not None
     draw = options.figures and drawable

@@ -58,18 +58,7 @@ def measure_latency(
     warmup: int = 3,
     done: Callable[[], None] | None = None,
 ) -> Latency:
-    """Time a call, waiting for the device each time.
-
-    Args:
-        call: What to time.
-        device: The device it runs on.
-        runs: Timed calls.
-        warmup: Calls before that; timed together.
-        done: Called after each call, for a progress bar.
-
-    Raises:
-        ConfigError: if ``runs`` is below 1 or ``warmup`` below 0.
-    """
+    """Time a call, waiting for the device each time."""
     positive("runs", runs)
     positive("warmup", warmup, allow_zero=True)
 
@@ -125,13 +114,7 @@ def _kilobytes(status: Path, field: str) -> int:
 
 
 def matmul_ceiling(device: torch.device, dtype: torch.dtype, side: int = 0) -> float:
-    """Return the FLOPs per second that one large square matrix product reaches: what a network could at best.
-
-    Args:
-        device: Where to multiply.
-        dtype: Number format.
-        side: Rows and columns; 0 picks 4096 on an accelerator and 1024 on a CPU.
-    """
+    """Return the FLOPs per second that one large square matrix product reaches: what a network could at best."""
     side = side or (1024 if device.type == "cpu" else 4096)
     factor = torch.randn(side, side, device=device).to(dtype)
     latency = measure_latency(lambda: factor @ factor, device, runs=10)

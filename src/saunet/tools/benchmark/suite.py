@@ -87,16 +87,7 @@ class Measurement:
 def run_suite(
     models: Mapping[str, Networks], plan: Plan, progress: Callable[[str, int, int], None] | None = None
 ) -> list[Measurement]:
-    """Measure every combination of models and plan.
-
-    Args:
-        models: Networks by name.
-        plan: What to measure.
-        progress: Called with a line of text, steps done and all steps.
-
-    Raises:
-        ConfigError: if a size does not fit a model; nothing has been measured then.
-    """
+    """Measure every combination of models and plan."""
     for (name, networks), size in itertools.product(models.items(), plan.sizes):
         divisible(*_parse(size), getattr(networks.depth, "size_divisor", 1), by=f"the encoder stride of {name},")
     cases = list(itertools.product(models, plan.devices, plan.precisions, plan.sizes, plan.modes, plan.batch_sizes))

@@ -196,13 +196,7 @@ def write_measurements(results: Sequence[Measurement], path: Path) -> None:
 
 
 def draw_figure(results: Sequence[Measurement], path: Path, abs_rel: Mapping[str, float] | None = None) -> None:
-    """Draw time per image against accuracy; models of unknown accuracy stand beside.
-
-    Args:
-        results: Measurements. A color is a model, a marker a setting (size, device, precision, mode, batch).
-        path: Picture file to write.
-        abs_rel: Accuracy by model; the paper's Table 1 where a model is not named.
-    """
+    """Draw time per image against accuracy; models of unknown accuracy stand beside."""
     printed = {row.method: row.errors[0] for row in published().table1}
     accuracy = {model: printed[method] for model, method in PAPER_METHODS.items()} | dict(abs_rel or {})
     points = [
