@@ -68,14 +68,7 @@ LOOKED_AT = 5
 
 
 def common_size(paths: Sequence[Path]) -> tuple[Path, tuple[int, int]]:
-    """Return the (height, width) that most of a recording's readable frames have, and a frame that has it.
-
-    Args:
-        paths: Its frames in order; a few of them, the first included, are looked at.
-
-    Raises:
-        DataError: naming the first, if none of those looked at can be read.
-    """
+    """Return the (height, width) that most of a recording's readable frames have, and a frame that has it."""
     sizes: dict[Path, tuple[int, int]] = {}
     problem: DataError | None = None
     for place in np.linspace(0, len(paths) - 1, min(LOOKED_AT, len(paths))).round().astype(int):
@@ -90,16 +83,7 @@ def common_size(paths: Sequence[Path]) -> tuple[Path, tuple[int, int]]:
 
 
 def check_frame(drive: Drive, frame: int, image: NDArray[np.uint8]) -> None:
-    """Check that a frame has the size that its recording's K belongs to.
-
-    Args:
-        drive: The recording; one that does not know its ``frame_size`` passes.
-        frame: Number of the frame.
-        image: The frame, h x w x 3.
-
-    Raises:
-        DataError: naming the frame's file, if it has another size.
-    """
+    """Check that a frame has the size that its recording's K belongs to."""
     size = drive.frame_size
     if size is not None and image.shape[:2] != size:
         what = drive.path(frame) or f"frame {frame}"
@@ -110,11 +94,7 @@ def check_frame(drive: Drive, frame: int, image: NDArray[np.uint8]) -> None:
 
 
 def check_rotation(R: NDArray[np.float64], where: str) -> None:
-    """Check that a 3 x 3 matrix is a rotation: orthonormal within `ROTATION_ERROR`, and not a mirror image.
-
-    Raises:
-        DataError: with ``where`` it comes from and what is wrong with it.
-    """
+    """Check that a 3 x 3 matrix is a rotation: orthonormal within `ROTATION_ERROR`, and not a mirror image."""
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if error > ROTATION_ERROR:
         raise DataError(

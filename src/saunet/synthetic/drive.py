@@ -184,14 +184,7 @@ class SyntheticDrive(Drive):
         return len(self._frames) == self.settings.frames
 
     def render(self, progress: Callable[[], object] | None = None) -> None:
-        """Render all frames that are not in memory yet, or read them from the cache folder.
-
-        Args:
-            progress: Called after each frame.
-
-        Raises:
-            DataError: if a file in the cache folder cannot be read or written.
-        """
+        """Render all frames that are not in memory yet, or read them from the cache folder."""
         if self._cache is not None and not self.rendered and self._stored.exists():
             self._load()
         for index in self.indices:

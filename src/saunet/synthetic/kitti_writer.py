@@ -147,19 +147,7 @@ def _whole_folder(target: Path) -> Iterator[Path]:
 
 
 def lidar_scan(drive: Drive, index: int, rig: Rig) -> NDArray[np.float32]:
-    """Sample a frame's depth like a scanner with 64 beams on the car's roof.
-
-    Args:
-        drive: A recording with depth.
-        index: Frame number.
-        rig: Where the scanner is.
-
-    Returns:
-        n x 4: x forward, y left, z up in meters in the scanner's frame, and reflectance 0 to 1.
-
-    Raises:
-        DataError: if the frame has no depth.
-    """
+    """Sample a frame's depth like a scanner with 64 beams on the car's roof."""
     depth, image = _depth(drive, index), drive.image(index)
     elevation, azimuth = np.meshgrid(_BEAMS, _AZIMUTHS, indexing="ij")
     level = np.cos(elevation)

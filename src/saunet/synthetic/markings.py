@@ -28,15 +28,7 @@ def _dashed(position: F32, dash: float, gap: float, pixel: F32) -> F32:
 
 
 def markings(world: World, along: F32, across: F32, step_along: F32, step_across: F32) -> F32:
-    """How much of each pixel is paint: center line, edge lines and zebra crossings, exactly box-filtered.
-
-    Args:
-        world: The street and what is painted on it.
-        along: Way along the road of each pixel, meters.
-        across: Distance of each pixel from the road's middle, meters, to the right.
-        step_along: What a pixel covers along the road, meters.
-        step_across: What a pixel covers across the road, meters.
-    """
+    """How much of each pixel is paint: center line, edge lines and zebra crossings, exactly box-filtered."""
     step_along, step_across = np.maximum(step_along, 1e-3), np.maximum(step_across, 1e-3)
     section = world.section
     dash, gap = world.dashes

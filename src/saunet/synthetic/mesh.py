@@ -88,11 +88,7 @@ def look(surface: Surface, period: tuple[float, float], offset: float) -> list[f
 
 
 class Mesh:
-    """Collects surfaces; `polygons` and `quadrics` return them as arrays.
-
-    Args:
-        rng: Source of each surface's own pattern.
-    """
+    """Collects surfaces; `polygons` and `quadrics` return them as arrays."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -143,18 +139,7 @@ class Mesh:
         period: tuple[float, float],
         roof: Surface | None = None,
     ) -> None:
-        """Add an upright box: four walls, and a flat roof where ``roof`` is given.
-
-        Args:
-            center: World (x, z) of its middle.
-            size: Width across and length along its heading, meters.
-            heading: Radians, 0 along z, positive to the right.
-            bottom: Height above the road of its foot, meters up.
-            top: Height of its top, meters up.
-            surface: Walls.
-            period: Meters a period of the walls' material.
-            roof: Top face.
-        """
+        """Add an upright box: four walls, and a flat roof where ``roof`` is given."""
         outline = footprint(center, size, heading)
         for i in range(4):
             self.wall(outline[i], outline[(i + 1) % 4], bottom, top, surface, period)
@@ -172,44 +157,18 @@ class Mesh:
         period: tuple[float, float],
         fit: bool = False,
     ) -> None:
-        """Add an upright rectangle between two ground points, seen from the side on which ``left`` is left.
-
-        Args:
-            left: Ground point (x, z), meters.
-            right: Ground point (x, z), meters.
-            bottom: Height of the lower edge above the ground, meters.
-            top: Height of the upper edge, meters.
-            surface: What it is made of.
-            period: Width and height in meters after which the material repeats.
-            fit: Stretch the material so that whole periods fit, in place of starting it anywhere.
-        """
+        """Add an upright rectangle between two ground points, seen from the side on which ``left`` is left."""
         ends = [(left, top), (right, top), (right, bottom), (left, bottom)]
         phase = float(self._rng.integers(0, 4)) / 4
         self.polygon([(p[0], -y, p[1]) for p, y in ends], surface, period, fit, None if fit else phase)
 
     def ellipsoid(self, center: tuple[float, float, float], radius: float, height: float, surface: Surface) -> None:
-        """Add an ellipsoid of horizontal and vertical radius; y points down.
-
-        Args:
-            center: World (x, y, z), meters.
-            radius: Horizontal half axis, meters.
-            height: Vertical half axis, meters.
-            surface: What it is made of.
-        """
+        """Add an ellipsoid of horizontal and vertical radius, meters; y points down."""
         self._quadrics.append([*center, radius, height, center[1] - height, center[1] + height])
         self._quadric_look.append(look(surface, (3.0, 3.0), float(self._rng.uniform())))
 
     def cylinder(self, x: float, z: float, radius: float, bottom: float, top: float, surface: Surface) -> None:
-        """Add an upright cylinder without caps.
-
-        Args:
-            x: Of its axis, meters.
-            z: Of its axis, meters.
-            radius: Meters.
-            bottom: Height of the lower end above the ground, meters.
-            top: Height of the upper end, meters.
-            surface: What it is made of.
-        """
+        """Add an upright cylinder without caps; meters, heights above the ground."""
         self._quadrics.append([x, 0.0, z, radius, 0.0, -top, -bottom])
         self._quadric_look.append(look(surface, (1.5, 2.5), float(self._rng.uniform())))
 
@@ -230,11 +189,6 @@ def footprint(center: tuple[float, float], size: tuple[float, float], heading: f
     """Return the four ground corners (x, z) of a box; wall i has corner i on its left and corner i + 1 on its right.
 
     Order of the walls: rear, right, front, left.
-
-    Args:
-        center: Ground point (x, z) of its middle, meters.
-        size: Width and length, meters.
-        heading: Direction of its length, radians from z towards x.
     """
     right = np.array([np.cos(heading), -np.sin(heading)]) * size[0] / 2
     ahead = np.array([np.sin(heading), np.cos(heading)]) * size[1] / 2

@@ -23,14 +23,7 @@ def blank(luminance: Number = 1.0, mask: Number = 0.0) -> Canvas:
 
 
 def colored_noise(rng: np.random.Generator, low: Number, high: Number, slope: Number) -> NDArray[np.float64]:
-    """Return periodic noise, n x n, Gaussian of mean 0 and deviation 1, within ``low``..``high`` cycles a period.
-
-    Args:
-        rng: Source of randomness.
-        low: Lowest frequency, cycles a period.
-        high: Highest frequency.
-        slope: Amplitude falls as frequency to the power -slope (0 = equal amplitudes, 1 = equal power an octave).
-    """
+    """Return periodic noise, n x n, Gaussian of mean 0 and deviation 1, within ``low``..``high`` cycles a period."""
     frequency = np.hypot(np.fft.fftfreq(SIZE)[:, None], np.fft.rfftfreq(SIZE)[None]) * SIZE
     inside = (frequency >= low) & (frequency <= high)
     gain = np.where(inside, np.maximum(frequency, 1.0) ** -slope, 0.0)
@@ -46,17 +39,7 @@ def coverage(start: Number, end: Number) -> NDArray[np.float64]:
 
 
 def rectangle(canvas: Canvas, x0: Number, x1: Number, y0: Number, y1: Number, luminance: Number, mask: Number) -> None:
-    """Paint an anti-aliased rectangle in place; positions are fractions of a period, y downwards.
-
-    Args:
-        canvas: 2 x n x n: luminance and mask.
-        x0: Left edge.
-        x1: Right edge.
-        y0: Upper edge.
-        y1: Lower edge.
-        luminance: Painted into the first channel.
-        mask: Painted into the second channel.
-    """
+    """Paint an anti-aliased rectangle in place; positions are fractions of a period, y downwards."""
     alpha = coverage(y0, y1)[:, None] * coverage(x0, x1)[None]
     rows, columns = np.flatnonzero(alpha.any(axis=1)), np.flatnonzero(alpha.any(axis=0))
     if rows.size == 0 or columns.size == 0:
@@ -68,16 +51,7 @@ def rectangle(canvas: Canvas, x0: Number, x1: Number, y0: Number, y1: Number, lu
 
 
 def disc(canvas: Canvas, x: Number, y: Number, radius: Number, luminance: Number, mask: Number) -> None:
-    """Paint an anti-aliased disc in place; fractions of a period.
-
-    Args:
-        canvas: 2 x n x n: luminance and mask.
-        x: Of the center, rightwards.
-        y: Of the center, downwards.
-        radius: Of the disc.
-        luminance: Painted into the first channel.
-        mask: Painted into the second channel.
-    """
+    """Paint an anti-aliased disc in place; fractions of a period."""
     center = (np.arange(SIZE) + 0.5) / SIZE
     distance = np.hypot(center[None] - x, center[:, None] - y)
     alpha = np.clip((radius - distance) * SIZE + 0.5, 0, 1)

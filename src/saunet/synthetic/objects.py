@@ -38,17 +38,7 @@ def building(
     floors: int,
     front: int,
 ) -> None:
-    """Add a house with windows on all sides and a flat or a gabled roof.
-
-    Args:
-        mesh: Where to add it.
-        rng: Source of randomness.
-        center: World (x, z).
-        size: Depth away from the road and length along it, meters.
-        heading: Heading of the road there, radians.
-        floors: Number of floors.
-        front: Wall that faces the road (1 right, 3 left), which may get a shop.
-    """
+    """Add a house with windows on all sides and a flat or a gabled roof."""
     style = ("facade_sash", "facade_tall", "facade_ribbon", "facade_panel")[int(rng.integers(4))]
     wall = Surface(style, _pick(rng, _WALLS), _vary(rng, _GLASS, 0.3), grain=0.12)
     storey = float(rng.uniform(2.8, 3.6))
@@ -142,15 +132,7 @@ def _wheel(mesh: Mesh, x: float, z: float, radius: float, side: float, surface: 
 
 
 def tree(mesh: Mesh, rng: np.random.Generator, x: float, z: float, height: float) -> None:
-    """Add a tree: a trunk and a crown of a few ellipsoids.
-
-    Args:
-        mesh: Takes the shapes.
-        rng: Decides what varies.
-        x: Of its foot on the ground, meters.
-        z: Of its foot on the ground, meters.
-        height: To the top of the crown, meters.
-    """
+    """Add a tree: a trunk and a crown of a few ellipsoids."""
     bark = Surface("bands", _vary(rng, (0.30, 0.23, 0.17), 0.2), (0.42, 0.36, 0.28))
     green = _vary(rng, (0.22, 0.36, 0.12), 0.25)
     if rng.uniform() < 0.15:
@@ -166,28 +148,14 @@ def tree(mesh: Mesh, rng: np.random.Generator, x: float, z: float, height: float
 
 
 def bush(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
-    """Add a low shrub.
-
-    Args:
-        mesh: Takes the shapes.
-        rng: Decides what varies.
-        x: Of its foot on the ground, meters.
-        z: Of its foot on the ground, meters.
-    """
+    """Add a low shrub."""
     leaves = Surface("foliage", _vary(rng, (0.22, 0.36, 0.14), 0.25), _vary(rng, (0.42, 0.46, 0.2), 0.2), grain=0.2)
     radius = float(rng.uniform(0.5, 1.2))
     mesh.ellipsoid((x, -0.5 * radius, z), radius, radius * float(rng.uniform(0.7, 1.1)), leaves)
 
 
 def lamp(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
-    """Add a lamp post, sometimes with a sign board.
-
-    Args:
-        mesh: Takes the shapes.
-        rng: Decides what varies.
-        x: Of its foot on the ground, meters.
-        z: Of its foot on the ground, meters.
-    """
+    """Add a lamp post, sometimes with a sign board."""
     gray = float(rng.uniform(0.25, 0.6))
     metal = Surface("bands", (gray, gray, gray * 1.03), (gray * 0.7, gray * 0.65, gray * 0.6))
     height = float(rng.uniform(4.5, 8.0))
@@ -200,15 +168,7 @@ def lamp(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
 
 
 def barrier(mesh: Mesh, rng: np.random.Generator, start: np.ndarray, end: np.ndarray, kind: str) -> None:
-    """Add a hedge, a wooden fence or a garden wall between two ground points (x, z).
-
-    Args:
-        mesh: Takes the shapes.
-        rng: Decides what varies.
-        start: Ground point, two numbers, meters.
-        end: Ground point, two numbers, meters.
-        kind: ``hedge``, ``fence`` or ``wall``.
-    """
+    """Add a hedge, a wooden fence or a garden wall between two ground points (x, z)."""
     surface, period, height, thickness = {
         "hedge": (
             Surface("foliage", _vary(rng, (0.18, 0.30, 0.11), 0.2), (0.34, 0.42, 0.18), 0.2),
@@ -233,15 +193,7 @@ def barrier(mesh: Mesh, rng: np.random.Generator, start: np.ndarray, end: np.nda
 
 
 def billboard(mesh: Mesh, rng: np.random.Generator, x: float, z: float, heading: float) -> None:
-    """Add a poster on two legs, facing the traffic.
-
-    Args:
-        mesh: Takes the shapes.
-        rng: Decides what varies.
-        x: Of its foot on the ground, meters.
-        z: Of its foot on the ground, meters.
-        heading: Direction that it faces along, radians from z towards x.
-    """
+    """Add a poster on two legs, facing the traffic."""
     legs = Surface("bands", (0.4, 0.4, 0.42), (0.3, 0.28, 0.26))
     for side in (-1.3, 1.3):
         mesh.cylinder(x + side * float(np.cos(heading)), z - side * float(np.sin(heading)), 0.08, 0.0, 1.6, legs)

@@ -26,12 +26,7 @@ DATAFORMAT = (
 
 
 def records(T_world_imu: Sequence[F64], seconds: float) -> F64:
-    """Return one row of `DATAFORMAT` a frame.
-
-    Args:
-        T_world_imu: Poses of the unit (x forward, y left, z up) in a world of x right, y down, z forward, meters.
-        seconds: Time between frames.
-    """
+    """Return one row of `DATAFORMAT` a frame."""
     poses = np.asarray(T_world_imu)
     turn = _ENU_WORLD @ poses[:, :3, :3]
     place = poses[:, :3, 3] @ _ENU_WORLD.T
@@ -57,14 +52,7 @@ def records(T_world_imu: Sequence[F64], seconds: float) -> F64:
 
 
 def write(folder: Path, indices: Sequence[int], T_world_imu: Sequence[F64], seconds: float) -> None:
-    """Write dataformat.txt and one file a frame under ``folder/data``.
-
-    Args:
-        folder: The folder ``oxts`` of a drive, with ``data`` in it.
-        indices: Number of each frame.
-        T_world_imu: Pose of each frame, 4 x 4, meters.
-        seconds: Between two frames.
-    """
+    """Write dataformat.txt and one file a frame under ``folder/data``."""
     (folder / "dataformat.txt").write_text("\n".join(DATAFORMAT) + "\n")
     for index, row in zip(indices, records(T_world_imu, seconds), strict=True):
         words = [f"{value:.13g}" for value in row[:25]] + [str(int(value)) for value in row[25:]]

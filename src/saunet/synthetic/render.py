@@ -245,14 +245,7 @@ def _across(world: World, camera: Camera, rays: tuple[F32, F32], inverse: F32) -
 
 
 def ground_point(camera: Camera, x: F32, y: F32, inverse_depth: F32) -> tuple[F32, F32]:
-    """Return world (x, z) of the points at an inverse depth along rays (x, y, 1).
-
-    Args:
-        camera: Where it stands and looks.
-        x: Of each ray, any shape.
-        y: Of each ray, of the same shape.
-        inverse_depth: Of each point, 1/meter, of the same shape.
-    """
+    """Return world (x, z) of the points at an inverse depth along rays (x, y, 1)."""
     turn, place = camera.rotation.astype(np.float32), camera.position.astype(np.float32)
     depth = 1 / inverse_depth
     return (

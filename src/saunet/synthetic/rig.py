@@ -52,11 +52,7 @@ class Rig:
 
     @staticmethod
     def of(drives: Sequence[Drive], right: Sequence[Drive] | None = None) -> Rig:
-        """Return the calibration that recordings share.
-
-        Raises:
-            ConfigError: if there are none, sizes or intrinsics differ, or the right cameras do not fit the left ones.
-        """
+        """Return the calibration that recordings share."""
         if not drives:
             raise ConfigError("there are no drives to write; give at least one")
         if right is not None and len(right) != len(drives):

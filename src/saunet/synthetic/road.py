@@ -24,14 +24,7 @@ FAR_AWAY = 1e3
 
 
 class Road:
-    """A centerline of bounded curvature, from ``start`` to ``end`` meters along.
-
-    Args:
-        rng: Source of randomness.
-        start: First position along the road; it passes through the world's origin at 0, heading along z.
-        end: Last position along the road.
-        curviness: 0 for a straight road, 1 for bends down to a radius of about 45 m.
-    """
+    """A centerline of bounded curvature, from ``start`` to ``end`` meters along."""
 
     def __init__(self, rng: np.random.Generator, start: float, end: float, curviness: float) -> None:
         self.along = np.arange(start, end + _STEP, _STEP)
@@ -64,15 +57,7 @@ class Road:
         return float(x + np.cos(heading) * across), float(z - np.sin(heading) * across)
 
     def locate(self, x: F32, z: F32) -> tuple[F32, F32, F32, F32]:
-        """Return street coordinates of ground points.
-
-        Args:
-            x: World x (n).
-            z: World z (n).
-
-        Returns:
-            along and across in meters (across is `FAR_AWAY` outside the grid), cosine and sine of the heading there.
-        """
+        """Return street coordinates of ground points."""
         if x.size == 0:
             return x, x, x, x
         row = 512

@@ -82,19 +82,7 @@ def _position(texture: F32, level: NDArray[np.intp]) -> F32:
 
 
 def sample(material: F32, u: F32, v: F32, du: F32, dv: F32) -> tuple[F32, F32]:
-    """Look materials up, averaged over each sample's footprint.
-
-    Args:
-        material: Number of each sample's material (n).
-        u: Texture coordinate in periods of the picture (n), to the right.
-        v: The same, downwards.
-        du: Footprint of the pixel in u, in periods (n).
-        dv: Footprint of the pixel in v.
-
-    Returns:
-        luminance: Brightness (n), 1 on average for most materials.
-        mask: Blend between a surface's two colors (n), 0 to 1.
-    """
+    """Look materials up, averaged over each sample's footprint."""
     count = u.size
     if count == 0:
         return u, v
@@ -114,13 +102,7 @@ def sample(material: F32, u: F32, v: F32, du: F32, dv: F32) -> tuple[F32, F32]:
 
 
 def grain(u: F32, v: F32, footprint: F32) -> F32:
-    """Look up the noise that varies every surface, mean 0, deviation about 1 near by and fading with distance.
-
-    Args:
-        u: Coordinate in periods of the noise (n).
-        v: The same, across.
-        footprint: Size of a pixel there, in periods (n).
-    """
+    """Look up the noise that varies every surface, mean 0, deviation about 1 near by and fading with distance."""
     count = u.size
     if count == 0:
         return u

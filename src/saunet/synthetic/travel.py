@@ -55,16 +55,7 @@ def _smooth(rng: np.random.Generator, count: int, width: float) -> F64:
 
 
 def pose(road: Road, along: float, across: float, yaw: float, pitch: float, height: float) -> F64:
-    """Return T_world_cam, 4 x 4, of a camera over a point of the road.
-
-    Args:
-        road: The road.
-        along: Way along it, meters.
-        across: Distance from the road's middle, meters, to the right.
-        yaw: Radians from the road's direction, to the right.
-        pitch: Radians.
-        height: Meters above the ground.
-    """
+    """Return T_world_cam, 4 x 4, of a camera over a point of the road."""
     heading = road.heading_at(along) + yaw
     x, z = road.point(along, across)
     c, s = np.cos(heading), np.sin(heading)

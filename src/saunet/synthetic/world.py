@@ -74,14 +74,7 @@ class MovingCar:
 
 
 class World:
-    """A street generated from a seed.
-
-    Args:
-        seed: Equal seeds give equal streets.
-        length: Meters that the camera will travel.
-        moving_cars: Number of cars that move.
-        speed: Typical speed of the camera, meters a frame; the moving cars drive about as fast.
-    """
+    """A street generated from a seed."""
 
     def __init__(self, seed: int, length: float, moving_cars: int = 0, speed: float = 0.9) -> None:
         rng = np.random.default_rng([VERSION, seed])

@@ -28,16 +28,7 @@ _LIDAR_KEYS = {"R": (3, 3), "T": (3,)}
 
 
 def read_matrices(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
-    """Read the matrices of a file of ``key: numbers`` lines.
-
-    Args:
-        path: The file.
-        shapes: The keys wanted and their shapes (3 x 3 are rotations); other keys are ignored. Keys that the file
-            lacks are absent.
-
-    Raises:
-        DataError: if the file cannot be read, a line is malformed, a key is given twice, or a rotation is none.
-    """
+    """Read the matrices of a file of ``key: numbers`` lines."""
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except FileNotFoundError as reason:
@@ -101,11 +92,7 @@ class KittiCalibration:
     """Laser scanner to unrectified camera 0, 4 x 4; None without ``calib_velo_to_cam.txt``."""
 
     def T_cam_cam(self, to: int, source: int) -> Array:  # noqa: N802 (frames in names)
-        """Return the motion between rectified cameras, 4 x 4, meters: a point of ``source`` times it is one of ``to``.
-
-        Raises:
-            DataError: if the calibration does not know one of them, or its K cannot be right.
-        """
+        """Return the motion between rectified cameras, 4 x 4, meters: maps points of ``source`` to points of ``to``."""
         T = np.eye(4)
         for camera, sign in ((to, 1), (source, -1)):
             self.intrinsics(camera)  # P = K [I | t] is solved for t: K must be one
@@ -114,11 +101,7 @@ class KittiCalibration:
         return T
 
     def intrinsics(self, camera: int) -> Array:
-        """Return K of a camera, 3 x 3, in pixels of its rectified image counted from zero.
-
-        Raises:
-            DataError: if the calibration does not know that camera, or its K cannot be right.
-        """
+        """Return K of a camera, 3 x 3, in pixels of its rectified image counted from zero."""
         if camera not in self.projections:
             known = ", ".join(f"{each:02d}" for each in self.projections) or "none"
             raise DataError(f"{self.path} has no P_rect_{camera:02d}; cameras in it: {known}")
@@ -136,14 +119,7 @@ def zero_based(K: Array) -> Array:
 
 
 def read_calibration(folder: Path) -> KittiCalibration:
-    """Read the calibration of a date.
-
-    Args:
-        folder: The folder of the date, such as ``2011_09_26``.
-
-    Raises:
-        DataError: if ``calib_cam_to_cam.txt`` is missing, or a needed line is missing or malformed.
-    """
+    """Read the calibration of a date."""
     path = folder / "calib_cam_to_cam.txt"
     cameras = read_matrices(path, _CAMERA_KEYS)
     if "R_rect_00" not in cameras or not any(key.startswith("P_rect") for key in cameras):

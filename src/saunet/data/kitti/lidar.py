@@ -18,12 +18,7 @@ KINDS = ("camera_z", "lidar_x")
 
 
 def read_scan(path: Path) -> NDArray[np.float32]:
-    """Return the points of a Velodyne scan, n x 3: x forward, y left, z up, in meters.
-
-    Raises:
-        DataError: if the file is missing, empty, not a whole number of points of four 32-bit numbers, or no point is
-            finite; some that are not are left out with a warning that counts them.
-    """
+    """Return the points of a Velodyne scan, n x 3: x forward, y left, z up, in meters."""
     data = read_bytes(path)
     if data.size % 16:
         raise DataError(f"{path} has {data.size} bytes, not a multiple of the 16 bytes of a point; copy the file again")

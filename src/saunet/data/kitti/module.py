@@ -110,11 +110,7 @@ class KittiDataModule(DepthDataModule):
         self.odometer = measured_distance if with_speed else None
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return the frames of a split, grouped by drive and camera.
-
-        Raises:
-            DataError: if there is no data root, or none of the split's drives is there.
-        """
+        """Return the frames of a split, grouped by drive and camera."""
         raw = self._raw = self._raw or KittiRaw(self.root)
         skip = self.on_error == "skip"
         if split in ("train", "val"):

@@ -27,18 +27,7 @@ CAMERAS = {"gray_left": (0, "l"), "gray_right": (1, "r"), "color_left": (2, "l")
 
 
 class OdometrySequence(Drive):
-    """One camera of one sequence.
-
-    Args:
-        root: Folder that holds ``sequences`` and, where poses are known, ``poses``.
-        sequence: Its name, such as ``09``.
-        camera: One of `CAMERAS`.
-
-    Raises:
-        ConfigError: for an unknown camera.
-        DataError: if the sequence or its calibration is missing or broken or does not belong to the images, or its
-            file of poses is broken or empty.
-    """
+    """One camera of one sequence."""
 
     camera_height = CAMERA_HEIGHT
     """Meters from the road to the camera."""
@@ -121,11 +110,7 @@ class OdometrySequence(Drive):
         return pose
 
     def stereo(self) -> OdometrySequence:
-        """Return the other camera's recording of this sequence, of the same color.
-
-        Raises:
-            DataError: if its images or its calibration are missing.
-        """
+        """Return the other camera's recording of this sequence, of the same color."""
         return self._stereo
 
     @functools.cached_property
@@ -142,11 +127,7 @@ class OdometrySequence(Drive):
 
 
 def find_root(root: str | Path) -> Path:
-    """Return the folder that holds ``sequences``: the one given, or ``dataset`` or ``odometry`` in it.
-
-    Raises:
-        DataError: if there is none.
-    """
+    """Return the folder that holds ``sequences``: the one given, or ``dataset`` or ``odometry`` in it."""
     folder = Path(root).expanduser()
     for candidate in (folder, folder / "dataset", folder / "odometry", folder.parent):
         if (candidate / "sequences").is_dir():

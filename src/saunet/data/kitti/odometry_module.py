@@ -68,11 +68,7 @@ class KittiOdometryDataModule(DepthDataModule):
         self.camera = one_of("camera", camera, CAMERAS)
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return the frames of a split, a sequence each.
-
-        Raises:
-            DataError: if a sequence, its images or its calibration is missing.
-        """
+        """Return the frames of a split, a sequence each."""
         root: Path = find_root(self.root)
         names = self.train_sequences if split in ("train", "val") else self.test_sequences
         selections = []

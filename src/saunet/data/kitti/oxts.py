@@ -11,11 +11,7 @@ from saunet.errors import DataError
 
 
 def oxts_speed(path: Path) -> float:
-    """Return the speed in m/s of a record of KITTI's inertial unit: the length of (vf, vl, vu).
-
-    Raises:
-        DataError: if the file cannot be read or holds no such record.
-    """
+    """Return the speed in m/s of a record of KITTI's inertial unit: the length of (vf, vl, vu)."""
     try:
         words = path.read_text(encoding="utf-8", errors="replace").split()
         velocity = np.array([float(word) for word in words[8:11]])
@@ -29,11 +25,7 @@ def oxts_speed(path: Path) -> float:
 
 
 def read_timestamps(path: Path) -> NDArray[np.float64] | None:
-    """Read the ``timestamps.txt`` of a KITTI raw camera: seconds, one per frame from frame 0; None if there is none.
-
-    Raises:
-        DataError: if the file cannot be read, or a line is no date and time; names the line.
-    """
+    """Read the ``timestamps.txt`` of a KITTI raw camera: seconds, one per frame from frame 0; None if there is none."""
     if not path.is_file():
         return None
     try:

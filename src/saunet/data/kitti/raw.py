@@ -42,17 +42,7 @@ _FRAME = re.compile(r"(\d+)\.(png|jpg|jpeg)", re.IGNORECASE)
 
 
 class KittiDrive(Drive):
-    """One camera of one KITTI raw drive.
-
-    Args:
-        folder: The drive's folder, ``.../<date>/<date>_drive_NNNN_sync``; it may be absent: then it has no frames.
-        calibration: Calibration of its date.
-        camera: ``left`` or ``right`` color camera.
-        depth_kind: What `depth` returns: the scans by ``camera_z`` or ``lidar_x``, or the ``improved`` ground truth.
-
-    Raises:
-        ConfigError: for an unknown camera or depth kind.
-    """
+    """One camera of one KITTI raw drive."""
 
     camera_height = CAMERA_HEIGHT
     """Meters from the road to the camera."""
@@ -92,11 +82,7 @@ class KittiDrive(Drive):
         return read_image(self.path(index))
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
-        """Return K of this camera on this date, in pixels of `image`; images made smaller beforehand scale it.
-
-        Raises:
-            DataError: if the images have another shape than the calibration says, or K cannot be that of such images.
-        """
+        """Return K of this camera on this date, in pixels of `image`; images made smaller beforehand scale it."""
         return self._intrinsics.copy()
 
     @functools.cached_property
@@ -170,11 +156,7 @@ class KittiDrive(Drive):
         return digest.hexdigest()
 
     def speed(self, index: int) -> float | None:
-        """Return the car's speed in m/s; None where there is no OXTS record.
-
-        Raises:
-            DataError: if the record is malformed.
-        """
+        """Return the car's speed in m/s; None where there is no OXTS record."""
         record = self.folder / "oxts" / "data" / f"{index:010d}.txt"
         return oxts_speed(record) if record.is_file() else None
 
@@ -234,14 +216,7 @@ class KittiDrive(Drive):
 
 
 class KittiRaw:
-    """The KITTI raw recordings below a folder.
-
-    Args:
-        root: Folder that holds the date folders (``2011_09_26``), one above it, a date folder itself, or one drive.
-
-    Raises:
-        DataError: if the folder is missing or holds no drive.
-    """
+    """The KITTI raw recordings below a folder."""
 
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root).expanduser()
@@ -259,16 +234,7 @@ class KittiRaw:
         self._calibrations: dict[str, KittiCalibration] = {}
 
     def drive(self, name: str, camera: str = "left", depth_kind: DepthKind = "camera_z") -> KittiDrive:
-        """Return a drive by its name ``<date>/<drive>``; one that is not on disk has no frames.
-
-        Args:
-            name: Such as ``2011_09_26/2011_09_26_drive_0001_sync``.
-            camera: ``left`` or ``right``.
-            depth_kind: What ground truth it gives, as in `KittiDrive`.
-
-        Raises:
-            DataError: if the calibration of its date is broken.
-        """
+        """Return a drive by its name ``<date>/<drive>``; one that is not on disk has no frames."""
         date = name.partition("/")[0]
         folder = self.drives.get(name, self._dates.get(date, self.root / date) / name.rpartition("/")[2])
         if date not in self._dates:

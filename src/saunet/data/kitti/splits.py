@@ -106,29 +106,17 @@ TEST: Mapping[str, Callable[[], list[Frame]]] = {
 
 
 def training_split(name: str, seed: int = 0) -> Parts:
-    """Return training and validation frames of a named split.
-
-    Raises:
-        ConfigError: for an unknown name.
-    """
+    """Return training and validation frames of a named split."""
     return TRAINING[one_of("split", name, TRAINING)](seed)
 
 
 def test_split(name: str) -> list[Frame]:
-    """Return the frames of a named test split.
-
-    Raises:
-        ConfigError: for an unknown name.
-    """
+    """Return the frames of a named test split."""
     return TEST[one_of("test_split", name, TEST)]()
 
 
 def read_split(path: Path) -> list[Frame]:
-    """Read a list in Monodepth2's format: a line ``<date>/<drive> <frame> <l or r>`` each.
-
-    Raises:
-        DataError: if the file is missing, empty, or a line is malformed.
-    """
+    """Read a list in Monodepth2's format: a line ``<date>/<drive> <frame> <l or r>`` each."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as reason:

@@ -36,15 +36,7 @@ def place(name: str) -> Path:
 
 
 class DepthMaps:
-    """The maps of one kind.
-
-    Args:
-        kind: ``linear`` or ``colorization`` (dense LiDAR, meters), or ``teacher`` (predicted, up to scale).
-        folder: Where they are; None: beside each recording.
-
-    Raises:
-        ConfigError: for another kind.
-    """
+    """The maps of one kind."""
 
     def __init__(self, kind: MapKind, folder: str | Path | None = None) -> None:
         one_of("kind of depth maps", kind, MAP_KINDS)
@@ -53,11 +45,7 @@ class DepthMaps:
         self._factors: dict[str, float] = {}
 
     def home(self, drive: Drive) -> Path:
-        """Return the folder of a recording's maps.
-
-        Raises:
-            DataError: if it is to lie beside a recording that has no folder.
-        """
+        """Return the folder of a recording's maps."""
         where = place(drive.name)
         if self.folder is not None:
             base = self.folder / (where.parent if where.name in ("l", "r") else where)
@@ -79,11 +67,7 @@ class DepthMaps:
         return {int(name) for name in names if name.isdecimal()}
 
     def read(self, drive: Drive, frame: int) -> NDArray[np.float32] | None:
-        """Return a frame's map, h x w, 0 where unknown; None where there is none.
-
-        Raises:
-            DataError: if the map is broken, or of another version.
-        """
+        """Return a frame's map, h x w, 0 where unknown; None where there is none."""
         path = self.path(drive, frame)
         if not path.is_file():
             return None
@@ -92,11 +76,7 @@ class DepthMaps:
         return np.asarray(read_depth(path) / self._factors[drive.name], dtype=np.float32)
 
     def info(self, drive: Drive) -> dict[str, Any]:
-        """Return how a recording's maps were made.
-
-        Raises:
-            DataError: if that is not written down, or the maps are of another version.
-        """
+        """Return how a recording's maps were made."""
         path = self.home(drive) / INFO
         try:
             info = read_json(path)
@@ -116,19 +96,7 @@ class DepthMaps:
         return dict(info)
 
     def claim(self, drive: Drive, made_from: Mapping[str, Any], factor: float = 1.0) -> float:
-        """Write down how a recording's maps are made, before the first; those there must have been made the same way.
-
-        Args:
-            drive: The recording.
-            made_from: What decides the maps' values.
-            factor: Stored depth is true depth times this.
-
-        Returns:
-            The factor of the maps there, which may be older.
-
-        Raises:
-            DataError: if there are maps that were made differently.
-        """
+        """Write down how a recording's maps are made, before the first; maps there must be made the same way."""
         path = self.home(drive) / INFO
         made = json.loads(json.dumps(dict(made_from)))
         if path.exists():
@@ -145,15 +113,7 @@ class DepthMaps:
         return factor
 
     def check(self, wanted: Sequence[tuple[Drive, Sequence[int]]], command: str) -> None:
-        """Check that frames have maps.
-
-        Args:
-            wanted: Recordings and their frames.
-            command: What makes the maps, for the message.
-
-        Raises:
-            DataError: if a map is missing or of another version.
-        """
+        """Check that frames have maps."""
         total, missing, first = 0, 0, None
         for drive, frames in wanted:
             there = self.frames(drive)

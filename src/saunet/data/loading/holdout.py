@@ -29,11 +29,7 @@ Parts = tuple[list[Frame], list[Frame]]
 
 
 def hold_out_drives(frames: Iterable[Frame], drives: Iterable[str]) -> Parts:
-    """Put the frames of the named drives into validation; a name may be the end of ``<date>/<drive>``.
-
-    Raises:
-        ConfigError: if a name fits no drive.
-    """
+    """Put the frames of the named drives into validation; a name may be the end of ``<date>/<drive>``."""
     frames, held = list(frames), set()
     known = sorted({frame.drive for frame in frames})
     for name in drives:

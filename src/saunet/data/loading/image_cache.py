@@ -30,17 +30,7 @@ SETTINGS, FRAMES = "cache.json", "frames.json"
 
 @dataclass(frozen=True, slots=True)
 class CacheSettings:
-    """What all copies of a cache have in common.
-
-    Args:
-        height: Rows of each copy.
-        width: Columns of each copy.
-        format: ``jpg`` or ``webp``.
-        quality: 1 to 100.
-
-    Raises:
-        ConfigError: if one is out of range.
-    """
+    """What all copies of a cache have in common."""
 
     height: int
     width: int
@@ -59,14 +49,7 @@ class CacheSettings:
 
 
 class ImageCache:
-    """A folder of smaller copies.
-
-    Args:
-        folder: The folder that ``saunet prepare cache`` made.
-
-    Raises:
-        DataError: if it is not there, not whole, or of another version.
-    """
+    """A folder of smaller copies."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder).expanduser()
@@ -93,11 +76,7 @@ class ImageCache:
         return self.home(drive) / f"{frame:010d}.{self.settings.format}"
 
     def frames(self, drive: Drive) -> dict[str, Any]:
-        """Return what ``frames.json`` of a recording says; empty where it is not finished.
-
-        Raises:
-            DataError: if the file is damaged.
-        """
+        """Return what ``frames.json`` of a recording says; empty where it is not finished."""
         path = self.home(drive) / FRAMES
         if not path.is_file():
             return {}
@@ -109,15 +88,7 @@ class ImageCache:
         return plain
 
     def check_origin(self, drive: Drive, frames: dict[str, Any]) -> None:
-        """Check that copies were made from the images that a recording has now.
-
-        Args:
-            drive: The recording.
-            frames: What ``frames.json`` says of it.
-
-        Raises:
-            DataError: if its images have another size now, or its frames another camera or other numbers.
-        """
+        """Check that copies were made from the images that a recording has now."""
         size = drive.frame_size
         made_from, now = frames["native"], list(size) if size else frames["native"]
         remedy = f"delete {self.home(drive)} and complete the cache: {self._command()}"
@@ -134,15 +105,7 @@ class ImageCache:
             )
 
     def drive(self, drive: Drive, needed: Iterable[int] = ()) -> CachedDrive:
-        """Return a recording that reads the copies.
-
-        Args:
-            drive: The recording.
-            needed: Frames that the cache must hold.
-
-        Raises:
-            DataError: if the cache does not hold it.
-        """
+        """Return a recording that reads the copies."""
         frames = self.frames(drive)
         if not frames:
             raise DataError(f"the cache at {self.folder} does not hold '{drive.name}'; complete it: {self._command()}")
@@ -171,13 +134,7 @@ def _damaged(path: Path) -> DataError:
 
 
 class CachedDrive(DriveProxy):
-    """A recording whose images are the cache's; in everything else the recording itself.
-
-    Args:
-        drive: The recording.
-        cache: Where its copies are.
-        frames: What ``frames.json`` says of it.
-    """
+    """A recording whose images are the cache's; in everything else the recording itself."""
 
     def __init__(self, drive: Drive, cache: ImageCache, frames: dict[str, Any]) -> None:
         super().__init__(drive)
@@ -200,11 +157,7 @@ class CachedDrive(DriveProxy):
         return self._cache.path(self._drive, index)
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """Return the smaller frame, h x w x 3, RGB.
-
-        Raises:
-            DataError: if it is missing or broken.
-        """
+        """Return the smaller frame, h x w x 3, RGB."""
         return read_image(self.path(index))
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
@@ -217,18 +170,7 @@ class CachedDrive(DriveProxy):
 def check_enlarged(
     cache: ImageCache, drives: Iterable[CachedDrive], size: tuple[int, int], margin: tuple[int, int]
 ) -> None:
-    """Check that training does not enlarge copies of originals that are larger: detail that is there would be lost.
-
-    Args:
-        cache: The cache.
-        drives: Recordings that read it.
-        size: (height, width) of the images trained on.
-        margin: Rows and columns that frames are loaded larger. A cache without them is warned about only: its images
-            are enlarged by some percent, and making it anew takes long.
-
-    Raises:
-        ConfigError: if copies are smaller than ``size`` and their originals are not.
-    """
+    """Check that training does not enlarge copies of originals that are larger: detail that is there would be lost."""
     copies, loaded = (cache.settings.height, cache.settings.width), (size[0] + margin[0], size[1] + margin[1])
     room = [tuple(map(min, loaded, drive.originals)) for drive in drives]
     if not any(each[0] > copies[0] or each[1] > copies[1] for each in room):

@@ -25,15 +25,7 @@ LeaveOut = Mapping[str, Mapping[str, Sequence[int]]]
 
 @dataclass(frozen=True)
 class Manifest:
-    """Frames to leave out of training and validation.
-
-    Args:
-        leave_out: Drive -> reason -> frame numbers.
-        numbering: Drive -> how its frames were numbered; see `Drive.numbering`.
-        facts: Whatever else was found, free-form.
-        path: The file it was read from, for messages.
-        test_only: Those of its drives that neither training nor validation read when it was made.
-    """
+    """Frames to leave out of training and validation."""
 
     leave_out: LeaveOut
     numbering: Mapping[str, str] = field(default_factory=dict)
@@ -42,14 +34,7 @@ class Manifest:
     test_only: Set[str] = frozenset()
 
     def check(self, names: Set[str]) -> None:
-        """Check that the manifest is of these drives; warn where some of its drives are not among them.
-
-        Args:
-            names: Of the drives that training and validation read.
-
-        Raises:
-            DataError: if it names drives and none of them is among these.
-        """
+        """Check that the manifest is of these drives; warn where some of its drives are not among them."""
         mine = self.leave_out.keys() - self.test_only
         strange = sorted(mine - names)
         if not strange:
@@ -66,11 +51,7 @@ class Manifest:
         )
 
     def apply(self, selection: Selection, offsets: Sequence[int]) -> Selection:
-        """Return a selection without the frames to leave out, counted by reason.
-
-        Raises:
-            DataError: if the drive's frames are numbered otherwise than when the manifest was made.
-        """
+        """Return a selection without the frames to leave out, counted by reason."""
         name = selection.drive.name
         if name in self.numbering and self.numbering[name] != selection.drive.numbering:
             raise DataError(
@@ -90,11 +71,7 @@ class Manifest:
 
 
 def write_manifest(path: str | Path, manifest: Manifest) -> None:
-    """Write a manifest, whole or not at all.
-
-    Raises:
-        DataError: if the system refuses.
-    """
+    """Write a manifest, whole or not at all."""
     plain = {
         "format": FORMAT,
         **manifest.facts,
@@ -109,11 +86,7 @@ def write_manifest(path: str | Path, manifest: Manifest) -> None:
 
 
 def read_manifest(path: str | Path) -> Manifest:
-    """Read a manifest.
-
-    Raises:
-        DataError: if it is missing, not JSON, of another format, or malformed.
-    """
+    """Read a manifest."""
     path = Path(path).expanduser()
     try:
         plain = read_json(path)

@@ -107,11 +107,7 @@ class DepthDataModule(LightningDataModule):
         raise NotImplementedError(f"{type(self).__name__} does not say which frames belong to '{split}'")
 
     def setup(self, stage: str | None = None) -> None:
-        """Find the windows of the splits that a stage needs, and report what is used and what is left out.
-
-        Raises:
-            DataError: if a split has no usable frame, or the manifest is of other recordings.
-        """
+        """Find the windows of the splits that a stage needs, and report what is used and what is left out."""
         fresh = "train" not in self.datasets
         for split in STAGES[str(getattr(stage, "value", stage))] if stage else ("train", "val", "test", "predict"):
             self.setup_split(split)
@@ -120,11 +116,7 @@ class DepthDataModule(LightningDataModule):
             self._check_manifests({drive.name for dataset in read for drive in dataset.drives})
 
     def setup_split(self, split: str) -> None:
-        """Find the windows of one split, unless that is done.
-
-        Raises:
-            DataError: if it has no usable frame.
-        """
+        """Find the windows of one split, unless that is done."""
         selections = [] if split in self.datasets else [Selection(*each) for each in self.select(split)]
         if selections or (split != "val" and split not in self.datasets):
             self.datasets[split] = self._dataset(split, [self._usable(split, each) for each in selections])
@@ -244,12 +236,7 @@ class DepthDataModule(LightningDataModule):
             yield self.prepare(move_data_to_device(batch, torch.device(device)))
 
     def ground_truths(self, split: str, most: int = 500) -> Iterator[Float[torch.Tensor, "1 h w"]]:
-        """Yield the true depth of a split's frames at native size, meters, 0 where unknown; skips those without any.
-
-        Args:
-            split: ``train``, ``val`` or ``test``, set up.
-            most: Of more frames, only so many are read, evenly spread.
-        """
+        """Yield the true depth of a split's frames at native size, meters, 0 where unknown; skips those without any."""
         dataset = self._set_up(split)
         for position, frame in (dataset.windows[place] for place in evenly(len(dataset), most)):
             depth = dataset.drives[position].depth(frame)

@@ -25,21 +25,7 @@ def surroundings(
     odometer: Odometer | None = None,
     most: int = 100,
 ) -> Iterator[EvalBatch]:
-    """Yield frames of a split one by one, as the networks want them, with the sources asked for.
-
-    Args:
-        data: A data module that is set up.
-        split: One of its splits; whether its own samples carry sources does not matter.
-        device: Where the batches go.
-        offsets: Time offsets of the sources.
-        stereo: Add the stereo view as the last source.
-        odometer: Gives the distance traveled.
-        most: Of more frames, only so many are read, evenly spread.
-
-    Raises:
-        ConfigError: if the split is not set up.
-        DataError: if no frame has what is asked for.
-    """
+    """Yield frames of a split one by one, as the networks want them, with the sources asked for."""
     if split not in data.datasets:
         raise ConfigError(f"the '{split}' split is not set up; call setup() first")
     dataset = data.datasets[split]

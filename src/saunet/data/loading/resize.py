@@ -14,11 +14,6 @@ def resize_depth(depth: NDArray[np.float32], height: int, width: int) -> NDArray
 
     A sparse map (less than half of it known) moves each measurement to the pixel where it now falls, the nearest wins;
     a dense map is sampled at the new pixel centers.
-
-    Args:
-        depth: h x w, meters, 0 where unknown.
-        height: New height.
-        width: New width.
     """
     if depth.shape == (height, width):
         return np.ascontiguousarray(depth, dtype=np.float32)
@@ -34,14 +29,7 @@ def resize_depth(depth: NDArray[np.float32], height: int, width: int) -> NDArray
 def nearest_map(
     rows: NDArray[np.int64], columns: NDArray[np.int64], values: NDArray[Any], size: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Scatter values into a map of zeros, height x width; where several fall on one pixel the smallest stays.
-
-    Args:
-        rows: Of each value, n.
-        columns: Of each value, n.
-        values: n positive numbers, such as depths in meters.
-        size: (height, width) of the map.
-    """
+    """Scatter values into a map of zeros, height x width; where several fall on one pixel the smallest stays."""
     order = np.argsort(-values, kind="stable")
     out = np.zeros(size, np.float32)
     out[rows[order], columns[order]] = values[order]

@@ -20,18 +20,7 @@ from saunet.errors import ConfigError, SaunetError
 
 
 class TrainBatches(DistributedSampler[Any]):
-    """Shuffled batches of `Item`; step k sees the same samples and random numbers on any number of devices.
-
-    Args:
-        dataset: What is sampled.
-        batch_size: Global batch size: the sum over devices.
-        seed: With the epoch, all that order and augmentation depend on.
-        rank: This device.
-        world_size: Number of devices.
-
-    Raises:
-        ConfigError: if the devices do not divide the batch, or there are fewer samples than one batch.
-    """
+    """Shuffled batches of `Item`; step k sees the same samples and random numbers on any number of devices."""
 
     def __init__(
         self, dataset: Dataset[Any], batch_size: int, seed: int = 0, rank: int = 0, world_size: int = 1
@@ -66,15 +55,6 @@ class EvalBatches(DistributedSampler[Any]):
 
     Equal numbers of batches keep collective operations of a step (buffer broadcast) in time with each other; the sizes
     of batches differ by one where they must.
-
-    Args:
-        dataset: What is evaluated.
-        batch_size: Samples a batch on one device; a batch may hold one more where devices and samples do not divide.
-        rank: This device.
-        world_size: Number of devices.
-
-    Raises:
-        ConfigError: if there are fewer samples than devices.
     """
 
     def __init__(self, dataset: Dataset[Any], batch_size: int, rank: int = 0, world_size: int = 1) -> None:
@@ -101,11 +81,7 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def share(batch_size: int, world_size: int) -> int:
-    """Return one device's part of the global batch.
-
-    Raises:
-        ConfigError: if the number of devices does not divide it.
-    """
+    """Return one device's part of the global batch."""
     if batch_size < 1 or batch_size % world_size:
         nearest = max(1, round(batch_size / world_size)) * world_size
         raise ConfigError(

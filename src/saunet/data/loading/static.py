@@ -23,22 +23,12 @@ MIN_FLOW = 0.5
 
 
 def median_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
-    """Return the median length of the optical flow between two images, in pixels of an image 320 pixels wide.
-
-    Args:
-        first: RGB, h x w x 3.
-        second: RGB, h x w x 3.
-    """
+    """Return the median length of the optical flow between two images, in pixels of an image 320 pixels wide."""
     return float(np.median(np.linalg.norm(optical_flow(first, second), axis=-1)))
 
 
 def optical_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the optical flow between two images, h x w x 2, in pixels of an image 320 pixels wide.
-
-    Args:
-        first: RGB, h x w x 3.
-        second: RGB, h x w x 3.
-    """
+    """Return the optical flow between two images, h x w x 2, in pixels of an image 320 pixels wide."""
     before, after = _small(first), _small(second)
     flow = np.zeros((*before.shape, 2), np.float32)
     measure = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
@@ -52,17 +42,7 @@ def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def static_by_flow(drive: Drive, frames: Sequence[int], min_flow: float, *, skip_unreadable: bool = False) -> set[int]:
-    """Return the frames that look like the frame before them (after them for the first), each image decoded once.
-
-    Args:
-        drive: The recording.
-        frames: The frames to judge.
-        min_flow: Median flow in pixels, at 320 pixels width, from which a frame counts as moving.
-        skip_unreadable: Count frames that cannot be read as moving in place of raising; who reads them later says so.
-
-    Raises:
-        DataError: naming the first frame that cannot be read or has another size, unless ``skip_unreadable``.
-    """
+    """Return the frames that look like the frame before them (after them for the first), each image decoded once."""
     existing, wanted = set(drive.indices), set(frames)
     static: set[int] = set()
     last: tuple[int, NDArray[np.uint8]] | None = None
@@ -84,16 +64,7 @@ def static_by_flow(drive: Drive, frames: Sequence[int], min_flow: float, *, skip
 
 
 def moving(selection: Selection, *, by_speed: bool, skip_unreadable: bool = False) -> Selection:
-    """Return a selection without the frames in which the car stands, and their count as ``static``.
-
-    Args:
-        selection: Frames of one drive.
-        by_speed: Judge by the OXTS speed where it is known; else, and without this everywhere, by flow.
-        skip_unreadable: Keep frames that cannot be read, in place of raising; who reads them later passes them over.
-
-    Raises:
-        DataError: naming the first record or frame that cannot be read, unless ``skip_unreadable``.
-    """
+    """Return a selection without the frames in which the car stands, and their count as ``static``."""
     drive, existing = selection.drive, set(selection.drive.indices)
     frames = [frame for frame in selection.frames if frame in existing]
     speeds = {frame: _speed(drive, frame, skip_unreadable) if by_speed else None for frame in frames}
@@ -105,11 +76,7 @@ def moving(selection: Selection, *, by_speed: bool, skip_unreadable: bool = Fals
 
 
 def has_speed(selection: Selection, skip_unreadable: bool = False) -> bool:
-    """Tell whether the speed is known in any of the frames.
-
-    Raises:
-        DataError: naming a broken record that comes before the first good one, unless ``skip_unreadable``.
-    """
+    """Tell whether the speed is known in any of the frames."""
     return any(_speed(selection.drive, frame, skip_unreadable) is not None for frame in selection.frames)
 
 

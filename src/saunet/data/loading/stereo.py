@@ -19,11 +19,7 @@ _SAME_K = 0.5
 
 
 def other_view(drive: Drive) -> tuple[Drive, NDArray[np.float64]]:
-    """Return the recording of the other camera, and T_stereo_cam, 4 x 4, meters.
-
-    Raises:
-        DataError: if the drive has no second camera.
-    """
+    """Return the recording of the other camera, and T_stereo_cam, 4 x 4, meters."""
     other = drive.stereo()
     T_stereo_cam = None if other is None else drive.T_stereo_cam
     if other is None or T_stereo_cam is None:
@@ -35,11 +31,7 @@ def other_view(drive: Drive) -> tuple[Drive, NDArray[np.float64]]:
 
 
 def stereo_image(drive: Drive, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Return the other camera's frame, h x w x 3, RGB, and T_stereo_cam, 4 x 4, meters.
-
-    Raises:
-        DataError: if there is no second camera, or the two cameras do not share their intrinsics.
-    """
+    """Return the other camera's frame, h x w x 3, RGB, and T_stereo_cam, 4 x 4, meters."""
     other, T_stereo_cam = other_view(drive)
     K, K_other = drive.intrinsics(index), other.intrinsics(index)
     if np.abs(K - K_other).max() > _SAME_K:

@@ -29,15 +29,7 @@ TARGETS: tuple[Literal["target_depth", "target_teacher"], ...] = ("target_depth"
 def crop(
     maps: Shaped[Tensor, "b n c h w"], left: Int[Tensor, " b"], top: Int[Tensor, " b"], height: int, width: int
 ) -> Shaped[Tensor, "b n c {height} {width}"]:
-    """Cut one window a sample out of its maps.
-
-    Args:
-        maps: Frames or maps of each sample.
-        left: First column of each sample's window.
-        top: First row of each sample's window.
-        height: Height of the window.
-        width: Width of the window.
-    """
+    """Cut one window a sample out of its maps."""
     rows = top[:, None] + torch.arange(height, device=maps.device)
     columns = left[:, None] + torch.arange(width, device=maps.device)
     batch = torch.arange(len(maps), device=maps.device)
@@ -127,11 +119,7 @@ class Augment(nn.Module):
 
     @torch.no_grad()
     def forward(self, batch: FrameBatch) -> TrainBatch:
-        """Return the augmented batch.
-
-        Raises:
-            DataError: if the frames are smaller than the images wanted.
-        """
+        """Return the augmented batch."""
         draws = batch["draws"]
         margin_y, margin_x = _margin(batch["frames"], self.height, self.width)
         top = (draws[:, 0] * (margin_y + 1)).long().clamp(max=margin_y)
@@ -164,12 +152,7 @@ class Augment(nn.Module):
 
 
 class Prepare(nn.Module):
-    """`FrameBatch` -> `EvalBatch`: the window in the middle, nothing random; ground truth stays at its native size.
-
-    Args:
-        height: Height of the images made.
-        width: Width of the images made.
-    """
+    """`FrameBatch` -> `EvalBatch`: the window in the middle, nothing random; ground truth stays at its native size."""
 
     def __init__(self, height: int, width: int) -> None:
         super().__init__()
@@ -177,11 +160,7 @@ class Prepare(nn.Module):
 
     @torch.no_grad()
     def forward(self, batch: FrameBatch) -> EvalBatch:
-        """Return the batch as the networks want it.
-
-        Raises:
-            DataError: if the frames are smaller than the images wanted.
-        """
+        """Return the batch as the networks want it."""
         margin_y, margin_x = _margin(batch["frames"], self.height, self.width)
         top, left = margin_y // 2, margin_x // 2
         window = (..., slice(top, top + self.height), slice(left, left + self.width))

@@ -19,23 +19,14 @@ from saunet.io.plain import read_arrays
 
 
 class CachedTruth(DriveProxy):
-    """A drive whose projected ground truth is kept in a folder; in everything else the drive itself.
-
-    Args:
-        drive: The recording.
-        folder: Where maps are kept, shared by all recordings; made when the first is written.
-    """
+    """A drive whose projected ground truth is kept in a folder; in everything else the drive itself."""
 
     def __init__(self, drive: Drive, folder: Path) -> None:
         super().__init__(drive)
         self._folder = folder
 
     def depth(self, index: int) -> NDArray[np.float32] | None:
-        """Return ground truth as the drive does, from the folder where it is there already.
-
-        Raises:
-            DataError: if a scan is broken, or the folder cannot be written to.
-        """
+        """Return ground truth as the drive does, from the folder where it is there already."""
         path = self.truth_path(index)
         if path is None:
             return self._drive.depth(index)

@@ -49,13 +49,7 @@ class SkippingWindows(WindowDataset):
 
 
 def readable(selection: Selection, offsets: Sequence[int], with_depth: bool) -> Selection:
-    """Return a selection without the frames that cannot be read, themselves or a neighbor, each decoded once.
-
-    Args:
-        selection: Frames of one drive.
-        offsets: Time offsets of the neighbors.
-        with_depth: Also read the ground truth.
-    """
+    """Return a selection without the frames that cannot be read, themselves or a neighbor, each decoded once."""
     drive, existing = selection.drive, set(selection.drive.indices)
     needed = {frame + offset for frame in selection.frames for offset in (0, *offsets)} & existing
     broken = set()

@@ -235,11 +235,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
 
 
 def collate(samples: Sequence[Mapping[str, Any]] | Mapping[str, Any]) -> FrameBatch:
-    """Stack samples to a batch; ground truth of different sizes is padded with 0 at the bottom and right.
-
-    Args:
-        samples: What `WindowDataset` yields. A sample without ground truth beside others with it gets one zero pixel.
-    """
+    """Stack samples to a batch; ground truth of different sizes is padded with 0 at the bottom and right."""
     rows = [samples] if isinstance(samples, Mapping) else list(samples)
     keys = dict.fromkeys(key for row in rows for key in row)
     batch: dict[str, Any] = {}

@@ -82,16 +82,7 @@ class CameraFile:
     """Root mean square in pixels, where the file comes from a calibration."""
 
     def intrinsics(self, height: int, width: int, what: str = "the frames") -> NDArray[np.float64]:
-        """Return K, 3 x 3, in pixels of frames of a size, which must have the shape of the calibrated ones.
-
-        Args:
-            height: Of the frames, in pixels.
-            width: Of the frames, in pixels.
-            what: What the frames are, for the message.
-
-        Raises:
-            DataError: if they have another shape, or K cannot be that of such an image.
-        """
+        """Return K, 3 x 3, in pixels of frames of a size, which must have the shape of the calibrated ones."""
         given = torch.from_numpy(self.K)
         if self.image_size is None:  # one pixel, whose center is 0
             scaled = scale_intrinsics(crop_intrinsics(given, 0.5, 0.5), width, height)
@@ -109,11 +100,7 @@ class CameraFile:
 
 
 def read_camera(path: str | Path) -> CameraFile:
-    """Read a ``camera.yaml``.
-
-    Raises:
-        DataError: if it is missing, not YAML, or a key is missing, unknown, of the wrong length or not a number.
-    """
+    """Read a ``camera.yaml``."""
     path = Path(path)
     try:
         plain = read_yaml(path)
@@ -176,11 +163,7 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
 
 
 def check_crop(crop: Sequence[float | int], what: str, error: type[SaunetError] = DataError) -> None:
-    """Check the shares to cut off at the top, bottom, left and right.
-
-    Raises:
-        SaunetError: of class ``error``, if they are not four shares that leave something of the image.
-    """
+    """Check the shares to cut off at the top, bottom, left and right."""
     fits = len(crop) == 4 and all(0 <= share < 1 for share in crop)
     if not fits or crop[0] + crop[1] > 0.9 or crop[2] + crop[3] > 0.9:
         raise error(
@@ -234,16 +217,7 @@ def _positive(path: Path, key: str, value: Any) -> float | None:
 
 
 def write_camera(path: str | Path, camera: CameraFile, note: str = "") -> None:
-    """Write a ``camera.yaml`` that `read_camera` reads, whole or not at all.
-
-    Args:
-        path: The file.
-        camera: What to write; its own path is not looked at.
-        note: First lines of the file, as comments.
-
-    Raises:
-        DataError: if the system refuses.
-    """
+    """Write a ``camera.yaml`` that `read_camera` reads, whole or not at all."""
     plain: dict[str, Any] = {}
     if camera.image_size is None:
         plain["normalized"] = True

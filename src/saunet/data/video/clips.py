@@ -70,16 +70,7 @@ class Recording:
 
 
 def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]:
-    """Find all clips below a folder; a folder of images or a video file is itself one.
-
-    Args:
-        root: Where to look.
-        camera: Description of the camera of all clips; by default the nearest ``camera.yaml``: beside the images or the
-            video, or in a folder above, up to the root.
-
-    Raises:
-        DataError: if the root is missing, holds no clip, or a clip has no camera.
-    """
+    """Find all clips below a folder; a folder of images or a video file is itself one."""
     root = Path(root).expanduser()
     if not root.exists():
         raise DataError(f"no data root at {root.absolute()}; set data.root to a folder of clips, or to a video")
@@ -111,12 +102,7 @@ def frame_paths(folder: Path) -> list[Path]:
 
 
 def every(recorded: float | None, wanted: float | None) -> Iterator[int]:
-    """Yield the numbers of the frames to take for a frame rate: those nearest to equal steps of time.
-
-    Args:
-        recorded: Frames a second of the recording; None takes every frame.
-        wanted: Frames a second to take; None, or more than there are, takes every frame.
-    """
+    """Yield the numbers of the frames to take for a frame rate: those nearest to equal steps of time."""
     ratio = max(1.0, recorded / wanted) if recorded and wanted else 1.0
     step = 0
     while True:
@@ -131,19 +117,7 @@ def read_clip(
     max_width: int,
     advance: Callable[[int, int | None], None] = lambda done, total: None,
 ) -> Recording:
-    """Return a clip's frames; those of a video are decoded into the cache the first time.
-
-    Args:
-        clip: What to read.
-        fps: Frames a second to take; None takes all.
-        cache: Folder of the cache.
-        max_width: Frames of a video are kept at most this wide.
-        advance: Called with the frames decoded so far and their expected number, while a video is decoded.
-
-    Raises:
-        DataError: if a video cannot be decoded.
-        FramesCacheError: if the cache cannot be written.
-    """
+    """Return a clip's frames; those of a video are decoded into the cache the first time."""
     if not clip.is_video:
         paths = frame_paths(clip.path)
         stamps = name_times([path.stem for path in paths])

@@ -27,16 +27,6 @@ class ClipDrive(Drive):
 
     Frames are numbered anew from 0 in the order of time, without those that are left out; a number is skipped where
     frames on both sides are no neighbors (a broken image or a long stop between them).
-
-    Args:
-        clip: Where it lies and what its camera is.
-        recording: Its frames on disk.
-        crop: Shares to cut off at the top, bottom, left and right; the camera's own by default.
-        motion: What was measured of the recording; None measures and leaves out nothing.
-        parallax: Frames follow each other when the median flow since the last reaches this, in pixels at 320 width; 0
-            takes all.
-        settings: How frames were chosen before, for `numbering`.
-        camera_height: Meters from the road to the camera, where the camera file does not say.
     """
 
     def __init__(
@@ -114,20 +104,12 @@ class ClipDrive(Drive):
 
     @property
     def frame_size(self) -> tuple[int, int]:
-        """(height, width) of `image`.
-
-        Raises:
-            DataError: if the frames do not belong to the camera.
-        """
+        """(height, width) of `image`."""
         return self._lens.height, self._lens.width
 
     @functools.cached_property
     def origin(self) -> str:
-        """What the numbers and the pixels of the frames depend on, as a hash: camera, crop, and which file is which.
-
-        Raises:
-            DataError: if the frames do not belong to the camera.
-        """
+        """What the numbers and the pixels of the frames depend on, as a hash: camera, crop, and which file is which."""
         camera, lens = self.clip.camera, self._lens
         files = [(index, self.recorded(index), self.path(index).name) for index in self._indices]
         text = repr((lens.K.tolist(), lens.recorded, self.frame_size, camera.model, camera.distortion, files))
@@ -142,20 +124,12 @@ class ClipDrive(Drive):
         return self.recording.numbers[self._places[index]]
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """Return the frame, undistorted and cropped, h x w x 3, RGB.
-
-        Raises:
-            DataError: naming the file, if it is broken or has another size than most frames of the clip.
-        """
+        """Return the frame, undistorted and cropped, h x w x 3, RGB."""
         path = self.path(index)
         return self._lens(read_image(path), str(path))
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
-        """Return K, 3 x 3, in pixels of `image`.
-
-        Raises:
-            DataError: if the frames do not belong to the camera.
-        """
+        """Return K, 3 x 3, in pixels of `image`."""
         return self._lens.K.copy()
 
     @functools.cached_property

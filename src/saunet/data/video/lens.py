@@ -17,24 +17,7 @@ from saunet.geometry.camera import crop_intrinsics
 
 
 class Lens:
-    """Undistorts and crops the frames of one size of one camera.
-
-    Args:
-        camera: Its description.
-        height: Height of the frames as recorded.
-        width: Width of the frames as recorded.
-        crop: Shares to cut off at the top, bottom, left and right of the undistorted image; the camera's own by
-            default.
-        what: What has this size, for messages.
-
-    Attributes:
-        K: Intrinsics of the images returned, 3 x 3, in pixels (integer coordinates are pixel centers).
-        height: Height of the images returned.
-        width: Width of the images returned.
-
-    Raises:
-        DataError: if frames of that size do not belong to the camera, or the crop leaves nothing.
-    """
+    """Undistorts and crops the frames of one size of one camera."""
 
     def __init__(
         self,
@@ -59,11 +42,7 @@ class Lens:
         self.K = crop_intrinsics(torch.from_numpy(K), self._columns.start, self._rows.start).numpy()
 
     def __call__(self, image: UInt8[np.ndarray, "_ _ 3"], name: str = "a frame") -> UInt8[np.ndarray, "_ _ 3"]:
-        """Return a recorded frame, straightened and cut.
-
-        Raises:
-            DataError: if it has another size than the lens was made for.
-        """
+        """Return a recorded frame, straightened and cut."""
         if image.shape[:2] != self.recorded:
             height, width = self.recorded
             raise DataError(
@@ -76,23 +55,14 @@ class Lens:
 
 
 class Undistorter:
-    """Undistorts and crops images of any size that the camera takes, as training on its clips does.
-
-    Args:
-        camera: Its description.
-        crop: Shares to cut off at the top, bottom, left and right; the camera's own by default.
-    """
+    """Undistorts and crops images of any size that the camera takes, as training on its clips does."""
 
     def __init__(self, camera: CameraFile, crop: Sequence[float | int] | None = None) -> None:
         self.camera, self._crop = camera, crop
         self._lenses: dict[tuple[int, int], Lens] = {}
 
     def lens(self, height: int, width: int) -> Lens:
-        """Return the lens for images of a size.
-
-        Raises:
-            DataError: if images of that size do not belong to the camera.
-        """
+        """Return the lens for images of a size."""
         if (height, width) not in self._lenses:
             self._lenses[height, width] = Lens(self.camera, height, width, self._crop, "the images")
         return self._lenses[height, width]

@@ -106,12 +106,7 @@ class VideoDataModule(DepthDataModule):
         self.drives()
 
     def drives(self) -> list[ClipDrive]:
-        """Return all clips below the root, in order of their names.
-
-        Raises:
-            DataError: if there is none, one has no camera, or a video or image cannot be read.
-            ConfigError: if a condition or a named clip does not exist.
-        """
+        """Return all clips below the root, in order of their names."""
         if self._drives is None:
             clips = find_clips(self.root, self.camera)
             if self.conditions:
@@ -130,12 +125,7 @@ class VideoDataModule(DepthDataModule):
         return heights.pop() if len(heights) == 1 else None
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return the frames of a split, a clip each.
-
-        Raises:
-            DataError: if there is no clip, or no image in any of them.
-            ConfigError: if a named clip does not exist.
-        """
+        """Return the frames of a split, a clip each."""
         drives = {drive.name: drive for drive in self.drives()}
         if not any(drive.indices for drive in drives.values()):
             example = next(iter(drives), None) or self._broken[0]

@@ -73,19 +73,7 @@ def measure(
     cache: Path | None = None,
     advance: Callable[[], None] = lambda: None,
 ) -> Motion:
-    """Measure the motion between consecutive images, each decoded once.
-
-    Args:
-        paths: Images in order of time.
-        crop: Shares at the top, bottom, left and right that do not count: sky and bonnet do not move.
-        skip_unreadable: Note broken images in place of raising.
-        cache: Folder in which the result is kept; None keeps nothing.
-        advance: Called after every image.
-
-    Raises:
-        DataError: naming the first image that cannot be read, unless ``skip_unreadable``.
-        FramesCacheError: if the cache cannot be written.
-    """
+    """Measure the motion between consecutive images, each decoded once."""
     file = cache / f"motion-{_key(paths, crop)}.json" if cache else None
     known = _read(file, len(paths)) if file else None
     if known is not None and (skip_unreadable or not known.unreadable):
@@ -112,12 +100,7 @@ def measure(
 
 
 def even_steps(flow: NDArray[np.float64], parallax: float) -> NDArray[np.bool_]:
-    """Choose frames so that the picture moves by about ``parallax`` from each to the next; the first is one.
-
-    Args:
-        flow: Motion against the frame before, one number a frame, pixels at 320 width; NaN counts as none.
-        parallax: Motion to gather before the next frame is chosen.
-    """
+    """Choose frames so that the picture moves by about ``parallax`` from each to the next; the first is one."""
     chosen, gathered = np.zeros(len(flow), dtype=bool), 0.0
     for place, step in enumerate(np.nan_to_num(flow)):
         gathered += step
