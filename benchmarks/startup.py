@@ -29,7 +29,7 @@ def seconds(source: Path, words: list[str]) -> float:
     """Return user and system time of one start."""
     here = (source / "saunet" / "__main__.py").is_file()
     command = ["-m", "saunet", *words] if here else ["-m", f"saunet.cli.{words[0]}", *words[1:]]
-    line = "saunet-train data.ba"
+    line = "saunet train data.ba"
     environment = {**os.environ, "PYTHONPATH": str(source), "OMP_NUM_THREADS": "1"}
     environment |= {"COMP_LINE": line, "COMP_POINT": str(len(line))}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -22,7 +22,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from saunet import config
+from saunet.cli import config
 from saunet.data.loading.windows import DRAWS
 from saunet.registry import instantiate
 from saunet.training.speed import Speed
@@ -34,7 +34,6 @@ SIZE = (192, 640)
 def build(overrides: list[str], batch: int) -> tuple[Any, Any]:
     """Return the training module and the data module of a composed config."""
     config.register_configs()
-    config.register_training_configs()
     with initialize_config_dir(str(config.config_dir()), version_base="1.3"):
         chosen = ["model=mono_r18", "objective=monodepth2", "data=synthetic", f"data.height={SIZE[0]}"]
         chosen += [f"data.width={SIZE[1]}", f"data.batch_size={batch}", "output_dir=unused", *overrides]

@@ -88,10 +88,9 @@ def hydra() -> Iterator[None]:
     """Let a test compose configurations, as the tools do."""
     from hydra import initialize_config_dir
 
-    from saunet.config import config_dir, register_configs, register_training_configs
+    from saunet.cli.config import config_dir, register_configs
 
     register_configs()
-    register_training_configs()
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
         yield
 

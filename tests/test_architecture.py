@@ -75,14 +75,12 @@ ALLOWED: dict[str, set[str]] = {
         "__version__",
     },
     "tools": {"errors", "registry", "io", "tables", "data", "prediction", "published"},
-    "roots": set(),
-    "config": {"errors", "registry", "schema", "roots", "training", "cli"},
 }
 # third-party package -> the rooms that may import it
 THIRD_PARTY: dict[str, set[str]] = {
-    "hydra": {"config", "cli"},
-    "omegaconf": {"config", "roots", "cli"},
-    "lightning": {"training", "data", "cli", "config"},
+    "hydra": {"cli"},
+    "omegaconf": {"cli"},
+    "lightning": {"training", "data", "cli"},
     "torchmetrics": {"metrics", "training"},
 }
 

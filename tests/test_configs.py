@@ -10,7 +10,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from saunet.config import config_dir, plain
+from saunet.cli.config import config_dir, plain
 from saunet.registry import REGISTRIES
 
 pytestmark = pytest.mark.usefixtures("hydra")

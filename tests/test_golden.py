@@ -10,7 +10,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from saunet import config
+from saunet.cli import config
 from saunet.registry import instantiate
 from saunet.training.tool import TrainOptions, assemble
 
@@ -23,7 +23,6 @@ GOLDEN: dict[str, list[float]] = {
 @pytest.mark.parametrize("objective", sorted(GOLDEN))
 def test_the_first_losses_of_a_seeded_training(objective: str) -> None:
     config.register_configs()
-    config.register_training_configs()
     with initialize_config_dir(str(config.config_dir()), version_base="1.3"):
         cfg = compose(
             "train", ["experiment=smoke", f"objective={objective}", "output_dir=unused", "data.color_jitter_prob=0"]

@@ -10,7 +10,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from saunet.config import config_dir, plain
+from saunet.cli.config import config_dir, plain
 
 pytestmark = pytest.mark.usefixtures("hydra")
 

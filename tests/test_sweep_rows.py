@@ -9,7 +9,7 @@ import pytest
 from hydra import compose
 
 from saunet.cli import app, words
-from saunet.config import config_dir, plain
+from saunet.cli.config import config_dir, plain
 from saunet.errors import ConfigError
 from saunet.tools.benchmark.tool import PAPER_METHODS
 from saunet.training.tool import TrainOptions

@@ -13,16 +13,9 @@ from unittest import mock
 
 import pytest
 
-from saunet import config
 from saunet.cli import app
-from saunet.cli._app import run
-from saunet.cli.benchmark import benchmark
 from saunet.synthetic import SyntheticDrive
 from saunet.synthetic.kitti_writer import write_raw
-
-TASKS = {
-    "benchmark": benchmark,
-}
 
 
 @dataclass(frozen=True)
@@ -49,17 +42,13 @@ Tool = Callable[..., Outcome]
 
 def run_tool(name: str, *overrides: str, folder: Path) -> Outcome:
     """Run ``saunet <name>`` in ``folder``."""
-    config.register_training_configs()
     out, err, code = io.StringIO(), io.StringIO(), 0
     before, arguments = Path.cwd(), sys.argv
     os.chdir(folder)
-    sys.argv = [f"saunet-{name}", *overrides]
+    sys.argv = ["saunet"]
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), mock.patch.dict(os.environ):
-            if app.TOOLS[name].options:
-                app.run(name, overrides)
-            else:
-                run(name, TASKS[name])  # a training leaves its seed in the environment
+            app.run(name, overrides)  # a training leaves its seed in the environment
     except SystemExit as exit_:
         code = int(exit_.code or 0)
     finally:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from saunet.cli._app import sentence
+from saunet.cli.errors import sentence
 
 Tool = Callable[..., Any]
 

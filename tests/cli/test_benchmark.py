@@ -15,7 +15,7 @@ Tool = Callable[..., Any]
 
 
 def run(tmp_path: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "saunet.cli.benchmark", f"hydra.run.dir={tmp_path}/out", *overrides]
+    command = [sys.executable, "-m", "saunet", "benchmark", f"hydra.run.dir={tmp_path}/out", *overrides]
     return subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path)
 
 

@@ -8,8 +8,6 @@ from typing import Any
 
 import pytest
 
-from saunet.cli._folders import Folder
-
 Tool = Callable[..., Any]
 
 
@@ -40,19 +38,3 @@ def test_an_empty_folder_that_was_there_stays(tool: Tool, tmp_path: Path) -> Non
     (tmp_path / "d").mkdir()
     tool("train", "experiment=smoke", "hydra.run.dir=d", "data.height=90").says("96x96")
     assert content(tmp_path) == {"d": None}
-
-
-def test_a_run_that_began_keeps_its_folder(tmp_path: Path) -> None:
-    folder = Folder.as_it_is(tmp_path / "new")
-    (tmp_path / "new" / "checkpoints").mkdir(parents=True)
-    (tmp_path / "new" / "checkpoints" / "last.ckpt").touch()
-    folder.remove_traces("train")
-    assert (tmp_path / "new" / "checkpoints" / "last.ckpt").is_file()
-
-
-def test_the_log_of_another_program_in_a_new_folder_is_never_removed(tmp_path: Path) -> None:
-    folder = Folder.as_it_is(tmp_path / "new")
-    (tmp_path / "new" / ".hydra").mkdir(parents=True)
-    (tmp_path / "new" / "slurm.log").write_text("important")
-    folder.remove_traces("train")
-    assert (tmp_path / "new" / "slurm.log").is_file()

@@ -9,22 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
-from saunet.cli._app import run
-from saunet.cli._runs import arguments, planned_jobs
-from saunet.cli.report import report
+from saunet.cli import app, words
 from saunet.errors import ConfigError
 from saunet.reporting import collect
+from saunet.runs.sweep import read_plan
 
 
 def tool(*given: str) -> tuple[int, str, str]:
     """Run ``saunet report`` here; return its exit code and what it said."""
     out, err, code, before = io.StringIO(), io.StringIO(), 0, sys.argv
-    sys.argv = ["saunet report", *arguments(given)]
+    sys.argv = ["saunet"]
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            run("report", report)
+            app.main(["report", *given])
     except SystemExit as exit_:
         code = int(exit_.code or 0)
     finally:
@@ -53,7 +51,7 @@ def test_a_run_with_a_folder_of_its_own_is_one_run_that_knows_itself(tool: Any, 
         *("model/pose=posecnn", "output_dir=runs/mine"),
     )
     assert outcome.code == 0, outcome.err
-    (read,) = collect([tmp_path / "outputs", tmp_path / "runs" / "mine"], jobs=planned_jobs).runs
+    (read,) = collect([tmp_path / "outputs", tmp_path / "runs" / "mine"], jobs=read_plan).runs
     assert (read.path, read.component("model/encoder"), read.overrides["model/pose"]) == (
         tmp_path / "runs" / "mine", "resnet18", "posecnn",
     )  # fmt: skip
@@ -66,7 +64,7 @@ def test_a_run_with_a_folder_of_its_own_is_one_run_that_knows_itself(tool: Any, 
     ("given", "words"),
     [
         (("gone",), "there is nothing at gone"),
-        ((), "runs is not set"),
+        ((), "runs is empty"),
         (("scenes=3", "."), "give images by condition"),
         (("titel=x",), "did you mean 'title'"),
     ],
@@ -81,34 +79,15 @@ def test_mistakes_are_one_sentence(
     assert "Traceback" not in err
 
 
-def test_plain_folders_become_runs(tmp_path: Path) -> None:
+def test_plain_folders_become_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def read(*given: str) -> tuple[str, ...]:
+        return words.overrides(given, "report", app.table(), "runs*").overrides
+
+    monkeypatch.chdir(tmp_path)
     odd = tmp_path / "it's=odd"
     odd.mkdir()
     quoted = str(odd).replace("'", "\\'")
-    assert arguments([str(odd), "flip=true"]) == ["flip=true", f"runs=['{quoted}']"]
-    assert arguments(["--cfg", "job", "-cd", str(tmp_path), "runs=[a]"]) == [
-        "--cfg",
-        "job",
-        "-cd",
-        str(tmp_path),
-        "runs=[a]",
-    ]
-    assert arguments(["compare", "a", "b"])[0] == "compare=true"
-    with pytest.raises(ConfigError, match="named twice"):
-        arguments(["a", "runs=[b]"])
-
-
-def test_the_jobs_of_a_sweep_are_known_from_its_config(tmp_path: Path) -> None:
-    hydra = {
-        "sweeper": {"_target_": "hydra._internal.core_plugins.basic_sweeper.BasicSweeper", "params": {"loss": "a,b"}},
-        "overrides": {"task": ["seed=1,2", "experiment=smoke"]},
-    }
-    (tmp_path / "multirun.yaml").write_text(yaml.safe_dump({"hydra": hydra}))
-    jobs = planned_jobs(tmp_path)
-    assert jobs is not None
-    assert jobs[1] == ["loss=a", "seed=2", "experiment=smoke"]
-    assert len(jobs) == 4
-    hydra["sweeper"]["_target_"] = "optuna"  # type: ignore[index]
-    (tmp_path / "multirun.yaml").write_text(yaml.safe_dump({"hydra": hydra}))
-    assert planned_jobs(tmp_path) is None
-    assert planned_jobs(tmp_path / "gone") is None
+    assert read(str(odd), "flip=true") == ("flip=true", f"runs=['{quoted}']")
+    assert read("--cfg", "job", "-cd", str(tmp_path), "runs=[a]") == ("runs=[a]",)
+    with pytest.raises(ConfigError, match="given twice"):
+        read("a", "runs=[b]")

@@ -18,7 +18,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from saunet.cli import app, words
-from saunet.config import config_dir, register_configs, register_training_configs
+from saunet.cli.config import config_dir, register_configs
 
 from .pages import PAGES, ROOT, blocks, commands, lines, mistakes
 
@@ -45,7 +45,6 @@ def _overrides(command: str) -> list[str]:
 def test_every_printed_command_composes() -> None:
     """A key that was renamed, or never was, fails here."""
     register_configs()
-    register_training_configs()
     wrong = []
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
         for page, command in dict.fromkeys(commands("", "bash")):

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
 
 from saunet import __version__, plugins
+from saunet.cli.config import config_dir
 from saunet.errors import ConfigError, SaunetError, suggest
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ class Tool:
         examples: Command lines without ``saunet``.
         positional: The key that plain words stand for; a trailing ``*`` takes several.
         aliases: Short form -> key.
+        words: First word -> what it stands for.
         recorded: Whether the function is also given ``choices`` and ``overrides`` for the record of a run, and
             ``describe``, which puts an error into one sentence; what it returns is not printed.
         config: Name of the root config; the tool's own by default.
@@ -47,6 +49,7 @@ class Tool:
     examples: Sequence[str] = ()
     positional: str | None = None
     aliases: dict[str, str] = field(default_factory=dict)
+    words: dict[str, str] = field(default_factory=dict)
     recorded: bool = False
     config: str = ""
     preset: Sequence[str] = ()
@@ -99,13 +102,18 @@ TOOLS: dict[str, Tool] = {
     ),
     "report": Tool(
         "one page of tables, curves and pictures from finished runs; how runs differ",
-        function="saunet.cli.report:main",
-        examples=("report outputs/train",),
+        "saunet.reporting.tool:ReportOptions",
+        "saunet.reporting.tool:report",
+        ("report outputs/train", "report compare outputs/train/A outputs/train/B"),
+        positional="runs*",
+        words={"compare": "compare=true"},
     ),
     "benchmark": Tool(
         "parameters, FLOPs, time and memory of networks",
-        function="saunet.cli.benchmark:main",
-        examples=("benchmark models=[sau_net,street]",),
+        "saunet.cli.benchmark:BenchmarkCommand",
+        "saunet.cli.benchmark:benchmark",
+        ("benchmark models=[sau_net,street]", "benchmark model/encoder=resnet18 sizes=192x640,320x1024"),
+        recorded=True,
     ),
     "doctor": Tool(
         "look at a data set before hours of training",
@@ -179,19 +187,6 @@ class Costed(Protocol):
     @property
     def cost(self) -> float | None:
         """The number; None if there is none."""
-
-
-def config_dir() -> Path:
-    """Return the folder of the YAML files: inside the installed package, or ``conf/`` of a source checkout.
-
-    Raises:
-        ConfigError: if neither exists (a broken installation).
-    """
-    package = Path(__file__).resolve().parents[1]
-    for folder in (package / "conf", package.parents[1] / "conf"):
-        if (folder / "train.yaml").is_file():
-            return folder
-    raise ConfigError(f"no configuration files beside {package}; reinstall saunet")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -299,6 +294,7 @@ def _run(name: str, argv: Sequence[str]) -> int:
     from saunet.cli import compose, words
 
     tool, conf = TOOLS[name], config_dir()
+    argv = [tool.words.get(argv[0], argv[0]), *argv[1:]] if argv else []
     if not tool.options:
         from saunet.cli.table import imported
 

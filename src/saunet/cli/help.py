@@ -8,7 +8,8 @@ from collections.abc import Iterator, Mapping
 
 from saunet import schema
 from saunet.cli import words
-from saunet.cli.app import Tool, config_dir
+from saunet.cli.app import Tool
+from saunet.cli.config import config_dir
 from saunet.cli.errors import HIDDEN
 from saunet.cli.table import Table
 
