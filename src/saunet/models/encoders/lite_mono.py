@@ -122,9 +122,20 @@ class DilatedBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """Return the refined map."""
-        y = self.norm(self.depthwise(x)).permute(0, 2, 3, 1)
+        y = self.norm(self._depthwise(x)).permute(0, 2, 3, 1)
         y = self.scale * self.reduce(F.gelu(self.expand(y)))
         out: Tensor = x + self.drop_path(y.permute(0, 3, 1, 2))
+        return out
+
+    def _depthwise(self, x: Tensor) -> Tensor:
+        out: Tensor
+        if x.device.type == "cpu" and torch.is_autocast_enabled("cpu"):
+            # On some processors torch 2.13.0 and 2.14.1 compute garbage as the weight gradient of a dilated depthwise
+            # convolution in bfloat16 and channels-last; it is a small part of the work, so it runs in float32.
+            with torch.autocast("cpu", enabled=False):
+                out = self.depthwise(x.float())
+        else:
+            out = self.depthwise(x)
         return out
 
 
