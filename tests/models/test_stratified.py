@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,7 +16,9 @@ import torch.nn.functional as F
 from saunet.errors import ConfigError
 from saunet.models.encoders.stratified import StratifiedTransformer
 from saunet.models.layers import window
+from saunet.models.layers.drop_path import DropPath
 from saunet.registry import encoders
+from saunet.training.speed import Speed
 
 
 def little(**changes: object) -> StratifiedTransformer:
@@ -66,10 +69,20 @@ def test_all_parameters_learn_and_streaming_agrees() -> None:
             torch.testing.assert_close(streamed, whole.detach(), atol=1e-5, rtol=1e-5)
 
 
-def test_checkpointing_gives_the_same_gradients() -> None:
+def test_the_drop_path_schedule_rises_over_all_stages() -> None:
+    """Linear from 0 in the first block to ``drop_path`` in the last one, as Swin has it."""
+    encoder = little(drop_path=0.3)
+    rates = [module.rate for module in encoder.modules() if isinstance(module, DropPath)]
+    count = len(rates)
+    assert count > 2
+    assert rates == pytest.approx([0.3 * index / (count - 1) for index in range(count)])
+
+
+def test_recomputation_gives_the_same_gradients() -> None:
     plain = little(drop_path=0.2).train()
-    thrifty = little(drop_path=0.2, checkpointing=True).train()
+    thrifty = little(drop_path=0.2).train()
     thrifty.load_state_dict(plain.state_dict())
+    Speed(checkpoint_activations=True).apply(SimpleNamespace(depth=thrifty, pose=None))
     image, gradients = torch.rand(2, 3, 32, 64), []
     for encoder in (plain, thrifty):
         torch.manual_seed(1)

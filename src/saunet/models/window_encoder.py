@@ -35,7 +35,6 @@ class WindowEncoder(nn.Module):
         mlp_ratio: Hidden channels of the MLPs per channel.
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
         mask_padding: See `saunet.models.layers.window.WindowAttention`.
-        checkpointing: Recompute blocks in the backward pass: less memory, more time.
 
     Attributes:
         features: Channels and stride of each feature map, finest first.
@@ -60,7 +59,6 @@ class WindowEncoder(nn.Module):
         mlp_ratio: float,
         drop_path: float,
         mask_padding: bool,
-        checkpointing: bool,
     ) -> None:
         super().__init__()
         depths, heads, window = tuple(depths), tuple(heads), tuple(window)
@@ -95,7 +93,6 @@ class WindowEncoder(nn.Module):
                     drop_path=own,
                     mask_padding=mask_padding,
                     merge=i + 1 < stages,
-                    checkpointing=checkpointing,
                 )
             )
             self.add_module(f"norm{i}", nn.LayerNorm(spec.channels))

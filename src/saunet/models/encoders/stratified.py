@@ -29,7 +29,6 @@ class StratifiedTransformer(WindowEncoder):
         mlp_ratio: Hidden channels of the MLPs per channel.
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
         mask_padding: Windows over the border attend to real tokens only; False pads with zeros that take part.
-        checkpointing: Recompute blocks in the backward pass: less memory, more time.
         weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
 
     Attributes:
@@ -50,10 +49,9 @@ class StratifiedTransformer(WindowEncoder):
         mlp_ratio: float = 4.0,
         drop_path: float = 0.1,
         mask_padding: bool = True,
-        checkpointing: bool = False,
         weights: str | None = None,
     ) -> None:
-        super().__init__(2, dim, depths, heads, window, mlp_ratio, drop_path, mask_padding, checkpointing)
+        super().__init__(2, dim, depths, heads, window, mlp_ratio, drop_path, mask_padding)
         self.size_divisor = 2 * self.features[-1].stride  # decoders may halve the deepest map once more
         self.stem = nn.ModuleDict({"conv": nn.Conv2d(3, dim, 3, stride=2, padding=1), "norm": nn.LayerNorm(dim)})
         self.not_pretrained += ("stem.",)

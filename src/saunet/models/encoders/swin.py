@@ -30,7 +30,6 @@ class SwinTransformer(WindowEncoder):
         mlp_ratio: Hidden channels of the MLPs per channel.
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
         mask_padding: True keeps padded tokens out of the attention instead.
-        checkpointing: Recompute blocks in the backward pass: less memory, more time.
         weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
 
     Attributes:
@@ -52,11 +51,10 @@ class SwinTransformer(WindowEncoder):
         mlp_ratio: float = 4.0,
         drop_path: float = 0.2,
         mask_padding: bool = False,
-        checkpointing: bool = False,
         weights: str | None = None,
     ) -> None:
         errors.positive("patch", patch)
-        super().__init__(patch, dim, depths, heads, window, mlp_ratio, drop_path, mask_padding, checkpointing)
+        super().__init__(patch, dim, depths, heads, window, mlp_ratio, drop_path, mask_padding)
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, dim, patch, stride=patch), "norm": nn.LayerNorm(dim)})
         self._init_weights()
         if weights is not None:

@@ -21,7 +21,6 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes, _get_current_dispatch_mode
-from torch.utils.checkpoint import checkpoint
 
 from saunet import errors
 from saunet.models.layers.drop_path import DropPath
@@ -384,10 +383,8 @@ class SwinStage(nn.Module):
         drop_path: Sequence[float],
         mask_padding: bool = True,
         merge: bool = True,
-        checkpointing: bool = False,
     ) -> None:
         super().__init__()
-        self.checkpointing = checkpointing
         self.blocks = nn.ModuleList(
             SwinBlock(dim, heads, window, window // 2 * (i % 2), mlp_ratio, drop_path[i], mask_padding)
             for i in range(depth)
@@ -397,8 +394,5 @@ class SwinStage(nn.Module):
     def forward(self, x: Float[Tensor, "b h w c"]) -> tuple[Tensor, Tensor]:
         """Return the map after the last block, b h w c, and what the next stage starts from, b h/2 w/2 2c."""
         for block in self.blocks:
-            if self.checkpointing and torch.is_grad_enabled():
-                x = checkpoint(block, x, use_reentrant=False)
-            else:
-                x = block(x)
+            x = block(x)
         return x, x if self.downsample is None else self.downsample(x)
