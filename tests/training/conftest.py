@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
 from saunet.cli.compose import structured
+from saunet.data.drive import Drive
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.windows import Selection
 from saunet.registry import REGISTRIES
@@ -22,8 +23,11 @@ from saunet.training.module import SelfSupervisedDepth
 from saunet.training.tool import TrainOptions, assemble
 
 
-class Wall:
+class Wall(Drive):
     """A camera that drives towards a textured wall: depth is known in closed form."""
+
+    name = ""
+    indices = range(0)
 
     def __init__(self, name: str, frames: int = 8, seed: int = 0) -> None:
         self.name = name

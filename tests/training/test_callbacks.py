@@ -25,3 +25,21 @@ def test_the_bar_is_drawn_on_a_terminal_only(
     assert ("loss=" in written.out) is terminal
     if not terminal:
         assert "\r" not in written.out + written.err
+
+
+def test_without_a_terminal_lines_say_where_the_training_is(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    clock = iter(range(0, 1000, 6))  # six seconds between two looks at the clock
+    monkeypatch.setattr("saunet.training.callbacks.time.monotonic", lambda: float(next(clock)))
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=2, callbacks=[Progress()], enable_progress_bar=True)
+    with caplog.at_level("INFO"):
+        trainer.fit(tiny.tiny_model(), tiny.tiny_walls())
+    lines = [record.getMessage() for record in caplog.records if record.getMessage().startswith("epoch ")]
+    rows = [line for line in lines if "val/loss" in line]
+    assert len(lines) > 2
+    assert any(line.startswith("epoch 1/2, step 2, loss ") and "time left" in line for line in lines)
+    assert any(line.startswith("epoch 1/2, step 3, loss ") and "val/abs_rel" in line for line in rows)
+    assert lines[-1].startswith("epoch 2/2, step 6, loss ")
+    assert lines[-1].endswith("time left 0:00:00")

@@ -15,6 +15,9 @@ from typing import Any
 import pytest
 import torch
 
+from saunet.errors import ConfigError
+from saunet.training.tool import TrainOptions
+
 pytestmark = pytest.mark.ddp
 
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -61,16 +64,17 @@ def test_two_processes_validate_exactly_like_one(tmp_path: Path) -> None:
         assert two[f"val/{name}"] == pytest.approx(one[name], rel=1e-6), name
 
 
-def test_spawned_processes_train_too(tmp_path: Path) -> None:
-    _run("train", tmp_path / "run", *SMOKE, "trainer=ddp_spawn", "trainer.accelerator=cpu", "trainer.devices=2")
-    assert _logged(tmp_path / "run")["train/loss"] > 0
+def test_spawned_processes_are_refused_with_the_reason(config: dict[str, Any]) -> None:
+    for strategy in ("ddp_spawn", {"_target_": "lightning.pytorch.strategies.DDPStrategy", "start_method": "spawn"}):
+        with pytest.raises(ConfigError, match=r"trainer\.strategy is .*a signal would end"):
+            TrainOptions.from_plain({**config, "trainer": {"strategy": strategy}})
 
 
 def test_a_sweep_over_processes_is_refused_with_the_ways_out(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "saunet.cli.train", "--multirun", *SMOKE, *TWO, "seed=1,2"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path, check=False)
     assert done.returncode == 1
-    assert "trainer=ddp_spawn, or one process per job through a Hydra launcher" in done.stderr
+    assert "start each training with a command of its own" in done.stderr
     assert "Traceback" not in done.stderr
 
 

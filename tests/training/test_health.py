@@ -10,8 +10,8 @@ import pytest
 import tiny
 import torch
 from lightning import Callback
-from saunet.data.windows import Selection
 
+from saunet.data.loading.windows import Selection
 from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.registry import objectives

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Sequence
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +30,9 @@ from saunet.prediction.panel import panel
 from saunet.runs.checkpoint import atomic_save
 from saunet.training.module import EPOCH_LOSS
 from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
+
+EVERY = 10.0
+"""Seconds between two lines of a training whose output is no terminal."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -220,9 +225,9 @@ def _rgb(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "h w 3"]:
 
 
 class Progress(TQDMProgressBar):
-    """One bar with what matters, after one line that says how large the networks are.
+    """One bar with what matters, after one line that says how large the networks are, and one line per epoch.
 
-    The bar is on a terminal or in a notebook only; a file or a pipe gets the line alone.
+    The bar is on a terminal or in a notebook only; a file or a pipe gets a line about every ten seconds.
 
     Args:
         refresh_rate: Steps between two updates of the bar.
@@ -230,12 +235,47 @@ class Progress(TQDMProgressBar):
 
     def __init__(self, refresh_rate: int = 5) -> None:
         super().__init__(refresh_rate=refresh_rate)
+        self._lines, self._began, self._said, self._first = False, 0.0, 0.0, 0
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Show the bar where somebody looks."""
         super().setup(trainer, pl_module, stage)
-        if not watched(Console()):  # standard output, where Lightning's bar is
+        self._lines = not watched(Console())  # standard output, where Lightning's bar is
+        if self._lines:
             self.disable()
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        super().on_train_start(trainer, pl_module)
+        self._began = self._said = time.monotonic()
+        self._first = trainer.fit_loop.total_batch_idx + 1
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Say where the training is, now and then, where there is no bar."""
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        if self._lines and time.monotonic() - self._said >= EVERY:
+            rank_zero_info(self._line(trainer))
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say what the epoch came to."""
+        super().on_train_epoch_end(trainer, pl_module)
+        rank_zero_info(self._line(trainer))
+
+    def _line(self, trainer: Trainer) -> str:
+        self._said = time.monotonic()
+        done, epochs = trainer.fit_loop.total_batch_idx + 1, trainer.max_epochs
+        parts = [f"epoch {trainer.current_epoch + 1}{f'/{epochs}' if epochs and epochs > 0 else ''}"]
+        parts.append(f"step {trainer.global_step}")
+        for name, shown in (("train/loss", "loss"), ("val/loss", "val/loss"), ("val/abs_rel", "val/abs_rel")):
+            if name in trainer.callback_metrics:
+                parts.append(f"{shown} {float(trainer.callback_metrics[name]):.4f}")
+        if epochs and epochs > 0 and done > self._first:
+            each = (self._said - self._began) / (done - self._first)
+            left = timedelta(seconds=round(each * max(trainer.num_training_batches * epochs - done, 0)))
+            parts.append(f"time left {left}")
+        return ", ".join(parts)
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say how many parameters are trained."""

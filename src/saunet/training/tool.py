@@ -184,7 +184,7 @@ class TrainOptions:
                 "set callbacks.progress=null instead"
             )
         strategy = trainer.get("strategy", "auto")
-        strategy = str(strategy.get("_target_") if isinstance(strategy, Mapping) else strategy).lower()
+        strategy = str(dict(strategy) if isinstance(strategy, Mapping) else strategy).lower()
         if "spawn" in strategy or "fork" in strategy:
             raise ConfigError(
                 f"trainer.strategy is {strategy}, whose first process only waits for the others: a signal would end "
