@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 from made_runs import add_checkpoint, make_evaluation, make_run
 
@@ -190,3 +191,24 @@ def test_jobs_led_elsewhere_by_output_dir_are_read_there(tmp_path: Path, sweep: 
     (left / "config.yaml").write_text(yaml.safe_dump(config | {"output_dir": str(tmp_path / "runs/${objective.beta}")}))
     (found,) = collect([sweep]).sweeps
     assert (found.runs[3].path, found.runs[3].status) == (place, "finished")
+
+
+@pytest.mark.parametrize("resumed", [None, "checkpoints/last.ckpt"])
+def test_a_resumed_run_is_reported_with_the_rate_that_it_kept(tmp_path: Path, resumed: str | None) -> None:
+    """Its config asks for 0.001; the optimizer's state, which a resumed run continues, says 0.0001."""
+    folder = make_run(tmp_path / "a", overrides=["optim.lr=0.001"], resumed=resumed)
+    groups = [{"lr": 0.00003, "initial_lr": 0.0001, "weight_decay": 0.0}]
+    (folder / "checkpoints").mkdir()
+    torch.save({"optimizer_states": [{"state": {}, "param_groups": groups}]}, folder / "checkpoints" / "last.ckpt")
+    (run,) = collect([folder]).runs
+    rate = 0.0001 if resumed else 0.001
+    assert run.config["optim"]["lr"] == rate
+    assert run.overrides["optim.lr"] == str(rate)
+
+
+def test_a_damaged_checkpoint_leaves_a_resumed_run_as_it_says(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "a", resumed="last.ckpt")
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "last.ckpt").write_bytes(b"PK broken")
+    (run,) = collect([folder]).runs
+    assert run.config["optim"]["lr"] == 0.001

@@ -56,7 +56,10 @@ class EvaluationData(Protocol):
     ground_truth: str
     protocol: str
     neighbors: Sequence[str]
-    datasets: Mapping[str, Any]
+
+    @property
+    def datasets(self) -> Mapping[str, Any]:
+        """Data sets of the splits that are set up."""
 
     @property
     def protocols(self) -> Sequence[str]:

@@ -9,13 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from saunet.errors import DataError, one_of
+from saunet.errors import CheckpointError, DataError, one_of
+from saunet.io.torch_files import read_plain
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.runs.files import read_json, read_mapping
 from saunet.runs.folder import Explained, Run, Score, Status, began, home, read_run, split_overrides
 
 Jobs = Callable[[Path], "list[list[str]] | None"]
 """Returns the overrides of every job that a sweep folder was to hold; None where that cannot be told."""
+
+
+_KEPT = {"lr": "initial_lr", "weight_decay": "weight_decay"}
+"""Settings of a recipe that live on in an optimizer's state, and what they are called there."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +95,30 @@ def collect(
         scores = (*(score for evaluation in mine for score in evaluation.scores), *run.scores)
         explained = tuple(row for evaluation in mine for row in evaluation.explained)
         folders = tuple(evaluation.folder for evaluation in mine)
-        return dataclasses.replace(run, scores=scores, explained=explained, evaluations=folders)
+        return dataclasses.replace(_as_trained(run), scores=scores, explained=explained, evaluations=folders)
 
     return Inputs(
         tuple(scored(run) for run in runs.values()),
         tuple(dataclasses.replace(sweep, runs=tuple(map(scored, sweep.runs))) for sweep in sweeps.values()),
         tuple(benchmarks),
     )
+
+
+def _as_trained(run: Run) -> Run:
+    """Return a resumed run with the learning rate and the like that its optimizer kept from the resumed checkpoint."""
+    optim = run.config.get("optim")
+    if not run.record.get("resumed") or run.checkpoint is None or not isinstance(optim, Mapping):
+        return run
+    try:
+        groups = read_plain(run.checkpoint, "a checkpoint")["optimizer_states"][0]["param_groups"]
+    except (CheckpointError, KeyError, IndexError, TypeError):  # without it, what was asked for is all that is known
+        return run
+    kept = {key: groups[0].get(name) for key, name in _KEPT.items()}
+    kept["encoder_lr"] = groups[1].get("initial_lr") if len(groups) > 1 else None
+    real = {key: value for key, value in kept.items() if value is not None and key in optim}
+    told = {f"optim.{key}": str(value) for key, value in real.items() if f"optim.{key}" in run.overrides}
+    config = {**run.config, "optim": {**optim, **real}}
+    return dataclasses.replace(run, config=config, overrides={**run.overrides, **told})
 
 
 def _find(path: Path, depth: int = 3) -> list[tuple[str, Path]]:
