@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from saunet.evaluation import OdometryOptions as OdometryOptions
     from saunet.evaluation import evaluate as evaluate
     from saunet.evaluation import odometry as odometry
+    from saunet.exporting.tool import ExportOptions as ExportOptions
+    from saunet.exporting.tool import export as export
     from saunet.geometry.pose import invert_pose as invert_pose
     from saunet.geometry.pose import pose_matrix as pose_matrix
     from saunet.geometry.warp import backproject as backproject
@@ -33,6 +35,8 @@ if TYPE_CHECKING:
     from saunet.metrics.depth import DepthMetrics as DepthMetrics
     from saunet.prediction.prediction import Prediction as Prediction
     from saunet.prediction.predictor import Predictor as Predictor
+    from saunet.prediction.tool import PredictOptions as PredictOptions
+    from saunet.prediction.tool import predict as predict
     from saunet.tools.calibrate.tool import CalibrateOptions as CalibrateOptions
     from saunet.tools.calibrate.tool import calibrate as calibrate
     from saunet.tools.doctor.tool import DoctorOptions as DoctorOptions
@@ -52,8 +56,10 @@ _LAZY = {
     "DoctorOptions": "tools.doctor.tool",
     "Drive": "data.drive",
     "EvaluateOptions": "evaluation.tool",
+    "ExportOptions": "exporting.tool",
     "ModelOptions": "training.tool",
     "OdometryOptions": "evaluation.tool_odometry",
+    "PredictOptions": "prediction.tool",
     "Prediction": "prediction.prediction",
     "Predictor": "prediction.predictor",
     "PrepareOptions": "tools.prepare.tool",
@@ -62,11 +68,13 @@ _LAZY = {
     "calibrate": "tools.calibrate.tool",
     "doctor": "tools.doctor.tool",
     "evaluate": "evaluation.tool",
+    "export": "exporting.tool",
     "gradient_loss": "losses.functional",
     "invert_pose": "geometry.pose",
     "odometry": "evaluation.tool_odometry",
     "photometric_error": "losses.functional",
     "pose_matrix": "geometry.pose",
+    "predict": "prediction.tool",
     "prepare": "tools.prepare.tool",
     "project": "geometry.warp",
     "smoothness_loss": "losses.functional",

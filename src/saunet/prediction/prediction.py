@@ -35,6 +35,11 @@ class Prediction:
         image: The image it belongs to, RGB.
         scale: The factor that has been applied to reach meters; None where only relative depth is known.
         name: Where the image came from, such as a file name.
+
+    Example:
+        >>> prediction = saunet.load("last.ckpt").predict("road.png")
+        >>> prediction.depth.shape, prediction.color().shape
+        ((96, 160), (96, 160, 3))
     """
 
     depth: Float32[np.ndarray, "h w"]

@@ -28,6 +28,10 @@ class Predictor(ImagePredictor):
         scale: Factor to meters; None leaves depth relative.
         flip: Average with the prediction of the mirrored image (twice the time, a little less error).
         keep_aspect: Feed each image at its own aspect ratio, with about height x width pixels, not exactly that size.
+
+    Example:
+        >>> saunet.Predictor.from_checkpoint("last.ckpt").predict("road.png").disparity.dtype
+        dtype('float32')
     """
 
     def __init__(

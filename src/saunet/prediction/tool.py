@@ -76,6 +76,10 @@ class PredictOptions:
 
     Raises:
         ConfigError: if an option cannot work, or not beside another one.
+
+    Example:
+        >>> saunet.PredictOptions(checkpoint="last.ckpt", input="drive.mp4", output="out").codec
+        'h264'
     """
 
     checkpoint: str | Path = "street"
@@ -178,15 +182,19 @@ def predict(
         predictor: A model that is loaded already; then the checkpoint is read for its pose network only.
         odometer: What follows the camera; then the checkpoint is not read for it.
 
+    Returns:
+        What was written, and what was wrong.
+
     Raises:
         ConfigError: for options that do not fit the input, or results that are there already and not known to be these.
         CheckpointError: if the model cannot be read.
         DataError: if the input cannot be read, nothing in it can, or the system refuses to write.
 
     Example:
-        >>> options = PredictOptions(checkpoint="last.ckpt", input="drive.mp4", output="out")  # doctest: +SKIP
-        >>> print(predict(options))  # doctest: +SKIP
-        48 frames: out/drive_disparity.mp4
+        >>> options = saunet.PredictOptions(checkpoint="last.ckpt", input="road.png", output="out", device="cpu")
+        >>> print(saunet.predict(options))
+        depth is ...
+        2 files written: out
     """
     folder = Path(options.output)
     with contextlib.closing(Recording(options.input, folder, options.fps)) as recording:
