@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import re
 from dataclasses import dataclass
 from pathlib import Path
+
+from hydra import compose
+from omegaconf import DictConfig
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
@@ -77,3 +81,9 @@ def mistakes(page: str) -> list[tuple[str, str]]:
     """Return each command that a page shows after a prompt, with the answer that it prints below."""
     shown = [line for where, line in lines("") if where == page]
     return [(line[2:], answer) for line, answer in itertools.pairwise(shown) if line.startswith("$ ")]
+
+
+@functools.cache
+def composed(tool: str, *choices: str) -> DictConfig:
+    """Return a tool's configuration with some choices of groups; composing takes its time, so each is made once."""
+    return compose(tool, overrides=list(choices), return_hydra_config=True)

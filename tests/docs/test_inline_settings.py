@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import copy
-import functools
 import itertools
 import shlex
 from typing import Any
 
 import pytest
-from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -19,7 +17,7 @@ from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 from saunet.cli.config import config_dir
 from saunet.registry import REGISTRIES
 
-from .pages import inline, tools
+from .pages import composed, inline, tools
 
 pytestmark = pytest.mark.usefixtures("hydra")
 
@@ -43,11 +41,6 @@ def _alternatives(code: str) -> list[list[str]]:
     return [list(each) for each in itertools.product(*choices)]
 
 
-@functools.cache
-def _composed(tool: str, *choices: str) -> DictConfig:
-    return compose(tool, overrides=list(choices), return_hydra_config=True)
-
-
 def _accepts(tool: str, overrides: list[str], data: str | None) -> bool:
     """Tell whether a tool composes with settings; of a key without a value, whether it has the key.
 
@@ -58,12 +51,12 @@ def _accepts(tool: str, overrides: list[str], data: str | None) -> bool:
         [each if each.startswith((below, "data=", "+")) else f"{below}{each}" for each in overrides]
     )
     try:
-        groups = _composed(tool).hydra.runtime.choices
+        groups = composed(tool).hydra.runtime.choices
         chosen = [each for each in parsed if each.key_or_group in groups and not _is_open(each)]
         choices = [f"{each.key_or_group}={_first(each)}" for each in chosen]
         if data:
             choices.append(f"data={data}")
-        cfg = copy.deepcopy(_composed(tool, *choices))
+        cfg = copy.deepcopy(composed(tool, *choices))
         for each in parsed:
             if each.key_or_group in groups:
                 continue

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import functools
 import os
 import pkgutil
 import re
@@ -17,13 +16,13 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from saunet.cli import app, words
 from saunet.cli.config import config_dir, register_configs
 
-from .pages import PAGES, ROOT, blocks, commands, lines, mistakes
+from .pages import PAGES, ROOT, blocks, commands, composed, lines, mistakes
 
 NOT_CONFIGURED = {"components", "resume", "demo"}  # takes names, no configuration
 NOT_INSTALLED = ("hydra/launcher", "hydra/sweeper", "hydra.launcher", "hydra.sweeper")  # plugins of the sweep extra
@@ -45,19 +44,14 @@ def _overrides(command: str) -> list[str]:
     return single
 
 
-@functools.cache
-def _composed(tool: str, *choices: str) -> DictConfig:
-    return compose(tool, overrides=list(choices), return_hydra_config=True)
-
-
 def _compose(tool: str, overrides: list[str]) -> None:
     """Compose a tool's choices, once for all commands that share them, and set the values one by one."""
-    groups = _composed(tool).hydra.runtime.choices
+    groups = composed(tool).hydra.runtime.choices
     parsed = OverridesParser.create().parse_overrides(overrides)
     if any(each.is_delete() or (each.is_add() and "." not in each.key_or_group) for each in parsed):
         compose(tool, overrides=overrides, return_hydra_config=True)
         return
-    cfg = copy.deepcopy(_composed(tool, *sorted(each.input_line for each in parsed if each.key_or_group in groups)))
+    cfg = copy.deepcopy(composed(tool, *sorted(each.input_line for each in parsed if each.key_or_group in groups)))
     for each in parsed:
         if each.key_or_group not in groups:
             OmegaConf.update(cfg, each.key_or_group, each.value(), force_add=each.is_add())

@@ -56,11 +56,7 @@ def solve(
     max_error: float = 1.0,
     advance: Callable[[int, int | None], None] = lambda done, total: None,
 ) -> Calibration:
-    """Calibrate a camera from a video or a folder of pictures of a board held in many places and tilts.
-
-    Raises:
-        DataError: if the source cannot be read, the board is hardly seen, or the result cannot be trusted.
-    """
+    """Calibrate a camera from a video or a folder of pictures of a board held in many places and tilts."""
     most = max(FEWEST_VIEWS, views)
     found: list[BoardView] = []
     looked_at, size, example = 0, (0, 0), None

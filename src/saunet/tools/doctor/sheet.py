@@ -23,13 +23,7 @@ _Picture = NDArray[np.uint8]
 
 
 def draw_sheet(survey: Survey, findings: Sequence[Finding], title: str) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return a picture sheet, RGB: a title, up to eight frames, three charts, and the findings as text.
-
-    Args:
-        survey: What was measured.
-        findings: What to say.
-        title: The first line.
-    """
+    """Return a picture sheet, RGB: a title, up to eight frames, three charts, and the findings as text."""
     rows = [_text(title, WIDTH, 0.7, _INK, bold=True), *_frames(survey), _charts(survey)]
     for finding in findings:
         rows += _paragraph(str(finding), _COLORS[finding.level])

@@ -105,12 +105,7 @@ def build_cache(
     workers: int = 0,
     on_error: OnError = "raise",
 ) -> CacheReport:
-    """Make, complete or check a cache of some frames of each recording; the recordings are only read.
-
-    Raises:
-        DataError: if the folder holds something else or a cache of another version or other settings, a frame is
-            broken or has another size than its recording, or the system refuses to write.
-    """
+    """Make, complete or check a cache of some frames of each recording; the recordings are only read."""
     cache = _open(Path(folder).expanduser(), settings)
     homes = [cache.home(drive) for drive, _ in recordings]
     for home in homes:

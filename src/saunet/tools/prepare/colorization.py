@@ -25,9 +25,6 @@ def affinity(gray: Float[ndarray, "h w"]) -> Float[ndarray, "9 h w"]:
     With v the variance of the 3 x 3 window, s = max(0.6 v, -min (g_n - g)**2 / ln 0.01, 2e-6) and the weight of
     neighbor n is exp(-(g_n - g)**2 / s), normalized. The order is that of
     `saunet.tools.prepare.sparse_solver.NEIGHBORS`.
-
-    Args:
-        gray: Brightness in [0, 1], at least two pixels.
     """
     height, width = gray.shape
     difference = np.zeros((9, height, width))
@@ -64,16 +61,9 @@ def _reach(length: int) -> Float[ndarray, " {length}"]:
 
 
 def colorize(image: UInt8[ndarray, "_ _ 3"], depth: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
-    """Return depth at every pixel: measured where it is known, spread along similar brightness elsewhere.
+    """Return depth at every pixel of an RGB image: measured where known (not 0), spread along similar brightness else.
 
     Solves (I - W + diag(known)) x = known depth, with W of `affinity`.
-
-    Args:
-        image: RGB.
-        depth: Meters, 0 where unknown.
-
-    Raises:
-        DataError: if the sizes differ, or no pixel is known.
     """
     if image.shape[:2] != depth.shape or min(depth.shape) < 2:
         raise DataError(f"depth of shape {depth.shape} does not belong to an image of shape {image.shape}")

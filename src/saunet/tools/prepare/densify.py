@@ -69,11 +69,7 @@ def densify(
     workers: int = 0,
     on_error: OnError = "raise",
 ) -> Done:
-    """Write the dense maps of recordings (``folder`` None: beside each); what is there already is left alone.
-
-    Raises:
-        DataError: if no frame has a scan, a file is broken, or there are maps that were made differently.
-    """
+    """Write the dense maps of recordings (``folder`` None: beside each); what is there already is left alone."""
     maps = tuple(DepthMaps(kind, folder) for kind in dict.fromkeys(kinds))
     work: Work[tuple[int, int], None] = Work(_Densify(tuple(drive for drive, _ in recordings), maps), workers, on_error)
     items, total, before = [], 0, 0

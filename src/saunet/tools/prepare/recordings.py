@@ -23,12 +23,7 @@ def kitti_recordings(
     split: str = "all",
     depth: DepthKind = "camera_z",
 ) -> list[Recording]:
-    """Find the recordings of a KITTI raw tree that have frames of a split (see `PrepareOptions`).
-
-    Raises:
-        ConfigError: if a drive or split is unknown.
-        DataError: if there is no such recording, or a calibration is broken.
-    """
+    """Find the recordings of a KITTI raw tree that have frames of a split (see `PrepareOptions`)."""
     raw = KittiRaw(root)
     for drive in drives:
         if not any(name.endswith(drive) for name in raw.drives):

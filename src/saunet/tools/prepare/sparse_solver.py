@@ -41,13 +41,7 @@ def apply_stencil(stencil: Float[ndarray, "9 h w"], x: Float[ndarray, "h w"]) ->
 
 
 class StencilSolver:
-    """The factors of a grid of equations, ready for right sides.
-
-    Args:
-        stencil: Coefficients of each pixel's equation, in the order of `NEIGHBORS`; those that point out of the image
-            are 0.
-        dtype: Numbers to calculate with.
-    """
+    """The factors of a grid of equations (in the order of `NEIGHBORS`, 0 out of the image), ready for right sides."""
 
     def __init__(self, stencil: Float[ndarray, "9 h w"], dtype: torch.dtype = torch.float32) -> None:
         self.height, self.width = stencil.shape[1:]

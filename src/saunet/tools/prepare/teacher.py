@@ -114,11 +114,7 @@ class FileTeacher:
 def teach(
     recordings: Sequence[Recording], source: DepthSource, folder: str | None = None, on_error: OnError = "raise"
 ) -> Done:
-    """Write a teacher's depth for recordings (``folder`` None: beside each); what is there already is left alone.
-
-    Raises:
-        DataError: if a frame cannot be read or has no depth, or there are maps of another teacher.
-    """
+    """Write a teacher's depth for recordings (``folder`` None: beside each); what is there already is left alone."""
     maps = DepthMaps("teacher", folder)
     items, before = [], 0
     for position, (drive, frames) in enumerate(recordings):
