@@ -23,16 +23,24 @@ if TYPE_CHECKING:
     from saunet.evaluation import odometry as odometry
     from saunet.exporting.tool import ExportOptions as ExportOptions
     from saunet.exporting.tool import export as export
+    from saunet.geometry.camera import crop_intrinsics as crop_intrinsics
+    from saunet.geometry.camera import flip_intrinsics as flip_intrinsics
+    from saunet.geometry.camera import scale_intrinsics as scale_intrinsics
+    from saunet.geometry.depth import disparity_to_depth as disparity_to_depth
+    from saunet.geometry.depth import sigmoid_to_disparity as sigmoid_to_disparity
     from saunet.geometry.pose import invert_pose as invert_pose
     from saunet.geometry.pose import pose_matrix as pose_matrix
     from saunet.geometry.warp import backproject as backproject
     from saunet.geometry.warp import project as project
     from saunet.geometry.warp import synthesize as synthesize
+    from saunet.losses.functional import automask as automask
+    from saunet.losses.functional import combine_sources as combine_sources
     from saunet.losses.functional import gradient_loss as gradient_loss
     from saunet.losses.functional import photometric_error as photometric_error
     from saunet.losses.functional import smoothness_loss as smoothness_loss
     from saunet.losses.functional import ssim_loss as ssim_loss
     from saunet.metrics.depth import DepthMetrics as DepthMetrics
+    from saunet.models.depth import DepthNet as DepthNet
     from saunet.prediction.prediction import Prediction as Prediction
     from saunet.prediction.predictor import Predictor as Predictor
     from saunet.prediction.tool import PredictOptions as PredictOptions
@@ -53,6 +61,7 @@ _LAZY = {
     "CalibrateOptions": "tools.calibrate.tool",
     "DepthDataModule": "data.loading.module",
     "DepthMetrics": "metrics.depth",
+    "DepthNet": "models.depth",
     "DoctorOptions": "tools.doctor.tool",
     "Drive": "data.drive",
     "EvaluateOptions": "evaluation.tool",
@@ -64,11 +73,16 @@ _LAZY = {
     "Predictor": "prediction.predictor",
     "PrepareOptions": "tools.prepare.tool",
     "TrainOptions": "training.tool",
+    "automask": "losses.functional",
     "backproject": "geometry.warp",
     "calibrate": "tools.calibrate.tool",
+    "combine_sources": "losses.functional",
+    "crop_intrinsics": "geometry.camera",
+    "disparity_to_depth": "geometry.depth",
     "doctor": "tools.doctor.tool",
     "evaluate": "evaluation.tool",
     "export": "exporting.tool",
+    "flip_intrinsics": "geometry.camera",
     "gradient_loss": "losses.functional",
     "invert_pose": "geometry.pose",
     "odometry": "evaluation.tool_odometry",
@@ -77,6 +91,8 @@ _LAZY = {
     "predict": "prediction.tool",
     "prepare": "tools.prepare.tool",
     "project": "geometry.warp",
+    "scale_intrinsics": "geometry.camera",
+    "sigmoid_to_disparity": "geometry.depth",
     "smoothness_loss": "losses.functional",
     "ssim_loss": "losses.functional",
     "synthesize": "geometry.warp",
