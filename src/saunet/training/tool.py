@@ -21,7 +21,7 @@ from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import protocol
 from saunet.registry import Spec
-from saunet.runs.checkpoint import build_networks
+from saunet.runs.checkpoint import build_networks, read_checkpoint
 from saunet.runs.folder import locked, recording, remove_partial_files
 from saunet.runs.record import ModelRecord, Scale
 from saunet.training.callbacks import AtomicCheckpointIO, BestCheckpoint
@@ -266,6 +266,8 @@ def train(
     if not (options.resume or options.overwrite):
         check_unused(folder)
     resume = resume_path(options.resume, folder, options.init_from)
+    if resume:
+        read_checkpoint(resume)  # before the data are set up, which writes to the log
     seed_everything(options.seed, workers=True, verbose=False)
     data = options.data.build()
     model = assemble(options, data, pretrained=resume is None and options.init_from is None)
