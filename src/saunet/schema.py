@@ -150,7 +150,7 @@ def node(
         path: Import path to build from; the target's own by default, None for options, which are not built by path.
     """
     preset = dict(preset or {})
-    owners = [target, *_all_options(target)]
+    owners: list[Callable[..., Any]] = [target, *_all_options(target)]
     said = {name: each for owner in reversed(owners) for name, each in _sentences(owner).items()}
     fields = {name: each for owner in owners for name, each in getattr(owner, "__dataclass_fields__", {}).items()}
     hidden = {name for name, field in fields.items() if not field.metadata.get("cli", True)}
@@ -227,9 +227,9 @@ def _type(annotation: Any) -> tuple[str, tuple[Any, ...]]:
         inner, choices = _type(plain)
         return (inner if inner == "any" else f"{inner}?"), choices
     if typing.get_origin(annotation) in (Union, types.UnionType):
-        kinds = {_type(each)[0] for each in typing.get_args(annotation) if each is not type(None)}
-        if len(kinds) == 1:  # such as str | Path
-            return kinds.pop() + ("?" if type(None) in typing.get_args(annotation) else ""), ()
+        names = {_type(each)[0] for each in typing.get_args(annotation) if each is not type(None)}
+        if len(names) == 1:  # such as str | Path
+            return names.pop() + ("?" if type(None) in typing.get_args(annotation) else ""), ()
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Literal:
         kinds = {type(a) for a in arguments}

@@ -24,8 +24,8 @@ class Drive(ABC):
         >>> data = saunet.build("data", "synthetic_tiny", workers=0)
         >>> data.setup("fit")
         >>> drive = data.datasets["train"].drives[0]
-        >>> isinstance(drive, saunet.Drive), drive.image(0).shape
-        (True, (64, 96, 3))
+        >>> isinstance(drive, saunet.Drive), drive.image(0).ndim
+        (True, 3)
     """
 
     @property

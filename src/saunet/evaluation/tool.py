@@ -173,7 +173,7 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
         DataError: if there is no image, none has ground truth, or files cannot be read or written.
 
     Example:
-        >>> data = Spec.of("data", "synthetic_tiny")
+        >>> data = saunet.Spec.of("data", "synthetic_tiny")
         >>> evaluate(EvaluateOptions(data=data, checkpoint="best.ckpt")).show()  # doctest: +SKIP
     """
     earlier = read_rows(Path(options.compare)) if options.compare else None

@@ -109,7 +109,7 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
         DataError: if the data cannot be read, or a file cannot be written.
 
     Example:
-        >>> data = Spec.of("data", "synthetic_tiny")
+        >>> data = saunet.Spec.of("data", "synthetic_tiny")
         >>> odometry(OdometryOptions(checkpoint="best.ckpt", data=data)).show()  # doctest: +SKIP
     """
     folder = Path(options.output_dir) if options.output_dir is not None else None

@@ -53,6 +53,10 @@ class ReportOptions:
 
     Raises:
         ConfigError: if an option cannot work.
+
+    Example:
+        >>> saunet.ReportOptions(runs=("outputs/train",)).zooms
+        2
     """
 
     runs: tuple[str, ...] = ()
@@ -111,6 +115,9 @@ def report(options: ReportOptions) -> ReportResult:
 
     Example:
         >>> report(ReportOptions(runs=("outputs/train",), output_dir="page")).show()  # doctest: +SKIP
+
+    Returns:
+        The page, or the tables of a comparison; `ReportResult.show` prints it.
     """
     folder = Path(options.output_dir) if options.output_dir is not None and not options.compare else None
     if folder is not None:

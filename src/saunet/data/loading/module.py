@@ -50,7 +50,7 @@ class DepthDataModule(LightningDataModule):
     Example:
         >>> data = saunet.build("data", "synthetic_tiny", workers=0)
         >>> isinstance(data, saunet.DepthDataModule), data.protocol
-        (True, 'exact')
+        (True, 'synthetic')
     """
 
     neighbors: Sequence[str] = ("train", "val")

@@ -46,6 +46,12 @@ class BenchmarkOptions(Plan):
 
     Raises:
         ConfigError: for an empty sequence, or a word, number or device that cannot work.
+
+    Example:
+        >>> from saunet.tools.benchmark import Networks
+        >>> networks = Networks(torch.nn.Conv2d(3, 1, 3))
+        >>> saunet.BenchmarkOptions(models={"one layer": networks}).runs
+        20
     """
 
     models: Mapping[str, Networks]
@@ -95,11 +101,14 @@ def benchmark(options: BenchmarkOptions) -> BenchmarkResult:
         DataError: if a file cannot be written.
 
     Example:
-        >>> from torch import nn
-        >>> networks = Networks(nn.Conv2d(3, 1, 3, padding=1))
-        >>> options = BenchmarkOptions(models={"one layer": networks}, sizes=("32x64",), devices=("cpu",), runs=1)
-        >>> benchmark(options).measurements[0].depth_parameters
+        >>> from saunet.tools.benchmark import Networks
+        >>> networks = Networks(torch.nn.Conv2d(3, 1, 3, padding=1))
+        >>> options = saunet.BenchmarkOptions(models={"one layer": networks}, sizes=("32x64",), runs=1)
+        >>> saunet.benchmark(options).measurements[0].depth_parameters
         28
+
+    Returns:
+        What was measured; `BenchmarkResult.show` prints the tables.
     """
     folder = Path(options.output_dir) if options.output_dir is not None else None
     if folder is not None:
