@@ -98,7 +98,7 @@ def test_speed_becomes_the_way_traveled(tmp_path):
     data = module(tmp_path, with_speed=True)
     data.setup("fit")
     batch = data.on_after_batch_transfer(next(iter(data.train_dataloader())), 0)
-    torch.testing.assert_close(batch["distance"], torch.full((2, 2), 0.8))
+    torch.testing.assert_close(batch["distance"], torch.full((2, 2), 8 * 0.1037))
 
 
 @pytest.mark.parametrize(
