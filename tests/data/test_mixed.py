@@ -65,7 +65,7 @@ def test_one_source_knows_the_way_traveled(tmp_path):
     }
     assert {each.partition("/")[0] for each in found} == {"town", "campus"}
     for each, way in found.items():
-        expected = torch.full((2,), 0.8 if each.startswith("town/") else torch.nan)
+        expected = torch.full((2,), 8 * 0.1037 if each.startswith("town/") else torch.nan)
         torch.testing.assert_close(way, expected, equal_nan=True)
     with pytest.raises(DataError, match=r"with_speed is true but no training frame .* has an OXTS record"):
         datamodules.build("mixed", sources=sources(tmp_path / "b", with_speed=True), **SIZE).setup("fit")
