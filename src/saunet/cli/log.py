@@ -24,6 +24,14 @@ class RunLog(logging.FileHandler):
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record, once the folder exists."""
         self._early.append(record)
+        self._write()
+
+    def close(self) -> None:
+        """Write what is still kept: a tool may say nothing more once its folder exists."""
+        self._write()
+        super().close()
+
+    def _write(self) -> None:
         if Path(self.baseFilename).parent.is_dir():
             early, self._early = self._early, []
             for each in early:
