@@ -48,7 +48,10 @@ class Frames:
                 ends = np.cumsum(np.concatenate([[0], data["sizes"]]))
                 blob, depth, second = data["images"], data["depth"], data["second"]
                 K, T = data["K"], data["T_world_cam"]
+            seen = [in_the_open(z) for z in depth]
             for i in range(len(depth)):
+                if not seen[i] or (second[i] and not seen[i - 1]):
+                    continue  # the camera stands inside of something
                 if second[i]:
                     self.pairs.append(len(self.images) - 1)
                 self.images.append(blob[ends[i] : ends[i + 1]])
@@ -68,6 +71,7 @@ class Frames:
         image, depth = self.image(index), self.depths[index].astype(np.float32)
         window = crop_window(rng, image.shape[:2], size, augment)
         x = crop(image, window, size, cv2.INTER_AREA)
+        depth = close_gaps(depth)
         z = crop(depth, window, size, cv2.INTER_NEAREST)
         focal = self.K[index][0, 0] / (window[3] - window[2])
         z = z * (CANONICAL_FOCAL / focal)
@@ -110,6 +114,21 @@ class Frames:
         return images[0].astype(np.float32) / 255, images[1].astype(np.float32) / 255, T
 
 
+def in_the_open(depth: NDArray[np.float16]) -> bool:
+    """Return whether a view is not blocked by something right before the camera; the sky counts as open."""
+    return bool(((depth > 0) & (depth < 2.5)).mean() < 0.4)
+
+
+def close_gaps(depth: Array, side: int = 7) -> Array:
+    """Return depth with the gaps in foliage and fences filled, as a laser or an eye takes a crown for one body.
+
+    Far pixels within fewer than ``side`` pixels between near ones get the near depth; near things keep their shape.
+    """
+    far = np.where(depth > 0, depth, np.float32(1e4))
+    filled = cv2.morphologyEx(far, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
+    return np.where(filled < 9e3, filled, np.float32(0))
+
+
 def crop_window(
     rng: np.random.Generator, shape: tuple[int, ...], size: tuple[int, int], augment: bool, zoom: float = 0.55
 ) -> tuple[float, float, float, float]:
@@ -147,7 +166,7 @@ def photometric(
     if rng.uniform() < 0.8:
         x = (x - x.mean()) * np.exp(rng.normal(0.2, 0.3)) + x.mean() * np.exp(rng.normal(0, 0.2))
     gray = x.mean(2, keepdims=True)
-    if rng.uniform() < 0.25:
+    if rng.uniform() < 0.35:
         x = np.repeat(gray, 3, 2)
     elif rng.uniform() < 0.7:
         x = gray + (x - gray) * rng.uniform(0.2, 1.5)
