@@ -88,8 +88,10 @@ class Frames:
         first = self.pairs[pair]
         images = [self.image(first), self.image(first + 1)]
         T = np.linalg.inv(self.T[first + 1]) @ self.T[first]
-        if augment and rng.uniform() < 0.7:  # turn the second camera: exact, since a turn has no parallax
-            turned = np.deg2rad([rng.normal(0, 0.3), rng.normal(0, 1.2), rng.normal(0, 0.2)])
+        if augment and rng.uniform() < 0.3:  # the car stands: the turn below is all there is to see
+            images[1], T = images[0], np.eye(4)
+        if augment and rng.uniform() < 0.8:  # turn the second camera: exact, since a turn has no parallax
+            turned = np.deg2rad([rng.normal(0, 0.3), rng.normal(0, 1.5), rng.normal(0, 0.2)])
             R = cv2.Rodrigues(turned)[0]
             K = self.K[first].astype(float)
             H = K @ R @ np.linalg.inv(K)
@@ -99,7 +101,7 @@ class Frames:
             T[:3] = R @ T[:3]
         window = crop_window(rng, images[0].shape[:2], size, augment, zoom=0.85)
         images = [crop(x, window, size, cv2.INTER_AREA) for x in images]
-        if augment:
+        if augment and rng.uniform() < 0.3:
             state = rng.integers(2**32)
             images = [photometric(np.random.default_rng(state), x, fresh=rng) for x in images]
         T[:3, 3] *= CANONICAL_FOCAL / (self.K[first][0, 0] / (window[3] - window[2]))
@@ -107,10 +109,8 @@ class Frames:
             images = [x[:, ::-1] for x in images]
             mirror = np.diag([-1.0, 1, 1, 1])
             T = mirror @ T @ mirror
-        if augment and rng.uniform() < 0.3:  # the same drive backward
+        if augment and rng.uniform() < 0.05:  # the same drive backward
             images, T = images[::-1], np.linalg.inv(T)
-        if augment and rng.uniform() < 0.03:
-            images, T = [images[0], images[0]], np.eye(4)
         return images[0].astype(np.float32) / 255, images[1].astype(np.float32) / 255, T
 
 

@@ -17,11 +17,12 @@ from train_depth import rate_factor
 import saunet
 
 
-def build(weights: str | None = "imagenet") -> nn.Module:
-    """Return the pose network; its head starts with larger weights, since motions here are in meters."""
-    network = saunet.build("pose", "efficientnet_lite0", weights=weights)
+def build() -> nn.Module:
+    """Return the pose network; its last layer starts near meters and half a meter ahead."""
+    network = saunet.build("pose", "posecnn")
     with torch.no_grad():
-        network.head.project.weight.mul_(20)
+        network.project.weight[3:].mul_(30)
+        network.project.bias[5] = -50.0  # T_later_earlier moves points backward
     return network
 
 
@@ -110,7 +111,7 @@ def main() -> None:
     )
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--size", type=int, nargs=2, default=(96, 320))
-    parser.add_argument("--rate", type=float, default=5e-4)
+    parser.add_argument("--rate", type=float, default=3e-4)
     parser.add_argument("--hold", type=float, default=0.6, help="fraction of the steps before the rate falls to 0")
     parser.add_argument("--start", type=Path, help="weights to start from (a .pt of this script)")
     parser.add_argument("--seed", type=int, default=0)
@@ -135,7 +136,7 @@ def main() -> None:
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
     size = tuple(options.size)
     for step in range(1, options.steps + 1):
-        network.eval()  # batch statistics stay those of ImageNet
+        network.train()
         samples = [frames.pair_sample(rng, int(i), size) for i in rng.integers(len(frames.pairs), size=options.batch)]
         a, b = (torch.from_numpy(np.stack([s[k] for s in samples])).permute(0, 3, 1, 2) for k in (0, 1))
         true = torch.from_numpy(np.stack([s[2] for s in samples])).float()
