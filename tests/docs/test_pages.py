@@ -66,7 +66,7 @@ def test_every_printed_command_composes() -> None:
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
         for page, command in dict.fromkeys(commands("", "bash")):
             tool = shlex.split(command)[1]
-            if tool in NOT_CONFIGURED:
+            if tool in NOT_CONFIGURED or "plugins=" in command:  # a component that the page itself writes
                 continue
             try:
                 _compose(tool, _overrides(command))
@@ -174,7 +174,7 @@ def test_the_benchmarks_have_the_options_that_pages_name() -> None:
 
 def test_every_page_is_on_the_site() -> None:
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    missing = [page.name for page in PAGES if page.parent.name == "docs" and page.name not in navigation]
+    missing = [page.name for page in PAGES if page.parent == ROOT / "docs" and page.name not in navigation]
     assert not missing
 
 
