@@ -146,7 +146,7 @@ def build(kind: str, name: str, /, **kwargs: Any) -> Any:
     Raises:
         ConfigError: for an unknown kind, name or parameter.
 
-    Example:
+    Examples:
         >>> encoder = saunet.build("encoder", "resnet18")
         >>> [feature.channels for feature in encoder.features]
         [64, 64, 128, 256, 512]
@@ -166,7 +166,7 @@ def available(kind: str) -> list[str]:
     Raises:
         ConfigError: for an unknown kind.
 
-    Example:
+    Examples:
         >>> saunet.available("attention")
         ['cbam', 'eca', 'gct', 'none', 'se']
     """
@@ -191,7 +191,7 @@ def load(source: Any = DEFAULT, *, device: str = "cpu", flip: bool = False, keep
         CheckpointError: if it is missing, broken, or not a saunet model.
         ConfigError: if a package is missing or the device does not exist.
 
-    Example:
+    Examples:
         >>> model = saunet.load("last.ckpt")
         >>> image = np.zeros((96, 160, 3), np.uint8)  # height x width x RGB
         >>> model.predict(image).depth.shape

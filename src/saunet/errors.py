@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 class SaunetError(Exception):
     """An error that a user can act on; command-line tools print it as one sentence, without a traceback.
 
-    Example:
+    Examples:
         >>> try:
         ...     saunet.build("encoder", "resnet19")
         ... except saunet.SaunetError as error:
@@ -26,7 +26,7 @@ class SaunetError(Exception):
 class ConfigError(SaunetError, ValueError):
     """A parameter, name or combination of parameters that cannot work.
 
-    Example:
+    Examples:
         >>> saunet.Spec.of("encoder", "resnet18", wieghts="imagenet")
         Traceback (most recent call last):
         saunet.errors.ConfigError: encoder 'resnet18' has no parameter 'wieghts'; did you mean 'weights'? ...
@@ -36,7 +36,7 @@ class ConfigError(SaunetError, ValueError):
 class DataError(SaunetError, ValueError):
     """A file or data set that is missing, broken or does not fit.
 
-    Example:
+    Examples:
         >>> saunet.build("data", "kitti", root="/nowhere").setup()
         Traceback (most recent call last):
         saunet.errors.DataError: no data root at /nowhere...
@@ -50,7 +50,7 @@ class UnreadableError(DataError):
 class CheckpointError(SaunetError, ValueError):
     """A checkpoint that cannot be read or does not belong to the model at hand.
 
-    Example:
+    Examples:
         >>> saunet.load("nowhere.ckpt")
         Traceback (most recent call last):
         saunet.errors.CheckpointError: no ... nowhere.ckpt...

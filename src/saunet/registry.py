@@ -55,7 +55,7 @@ class Registry:
         home: Package whose modules register the built-in components; imported on first use.
         late: Parameters that the caller supplies when the rest of the system is known (a decoder's ``features``).
 
-    Example:
+    Examples:
         A class of your own becomes a component, on the command line too where its module is one of ``plugins=``:
 
         >>> @saunet.encoders.register("mine")  # doctest: +SKIP
@@ -190,7 +190,7 @@ class Spec:
         node: Plain containers: ``_target_`` and parameters; nested components are nodes too.
         name: The registered name, where it is known: several names can share a class.
 
-    Example:
+    Examples:
         >>> data = saunet.Spec.of("data", "synthetic_tiny", workers=0)
         >>> data.get("workers"), data.changed(height=96).build().height
         (0, 96)

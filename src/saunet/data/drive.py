@@ -20,7 +20,7 @@ class Drive(ABC):
     "unknown" (None, False, an empty string); override what the data set knows. Frames are addressed by their index in
     the recording; indices ascend with time and may have gaps.
 
-    Example:
+    Examples:
         >>> data = saunet.build("data", "synthetic_tiny", workers=0)
         >>> data.setup("fit")
         >>> drive = data.datasets["train"].drives[0]

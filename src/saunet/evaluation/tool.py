@@ -107,7 +107,7 @@ class EvaluateOptions:
     Raises:
         ConfigError: if an option cannot work, or not beside another one.
 
-    Example:
+    Examples:
         >>> data = saunet.Spec.of("data", "synthetic_tiny")
         >>> saunet.EvaluateOptions(data=data, checkpoint="best.ckpt").split
         'test'
@@ -172,7 +172,7 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
         CheckpointError: if the checkpoint cannot be read.
         DataError: if there is no image, none has ground truth, or files cannot be read or written.
 
-    Example:
+    Examples:
         >>> data = saunet.Spec.of("data", "synthetic_tiny")
         >>> evaluate(EvaluateOptions(data=data, checkpoint="best.ckpt")).show()  # doctest: +SKIP
     """

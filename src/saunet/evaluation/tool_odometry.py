@@ -47,7 +47,7 @@ class OdometryOptions:
     Raises:
         ConfigError: if an option cannot work.
 
-    Example:
+    Examples:
         >>> data = saunet.Spec.of("data", "kitti_odometry", root="/data/kitti/odometry")
         >>> saunet.OdometryOptions(checkpoint="best.ckpt", data=data).snippet
         5
@@ -108,7 +108,7 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
         CheckpointError: if the checkpoint cannot be read.
         DataError: if the data cannot be read, or a file cannot be written.
 
-    Example:
+    Examples:
         >>> data = saunet.Spec.of("data", "synthetic_tiny")
         >>> odometry(OdometryOptions(checkpoint="best.ckpt", data=data)).show()  # doctest: +SKIP
     """

@@ -62,7 +62,7 @@ class ExportOptions:
     Raises:
         ConfigError: for an unknown format, batch or opset.
 
-    Example:
+    Examples:
         >>> saunet.ExportOptions(checkpoint="last.ckpt", output="exported").formats
         ('onnx', 'program', 'safetensors')
     """
@@ -125,7 +125,7 @@ def export(options: ExportOptions) -> ExportResult:
         CheckpointError: if the checkpoint cannot be read, or a file would differ from the original.
         DataError: if an image or the evaluation cannot be read, or the system refuses to write.
 
-    Example:
+    Examples:
         >>> options = saunet.ExportOptions(checkpoint="last.ckpt", output="exported", formats=["safetensors"])
         >>> saunet.export(options).reports[0].difference < 1e-6
         True

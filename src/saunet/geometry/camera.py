@@ -26,7 +26,7 @@ def scale_intrinsics(K: Float[Tensor, "*b 3 3"], scale_x: Number, scale_y: Numbe
     Returns:
         Intrinsics in pixels of the resized image.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[100.0, 0.0, 49.5], [0.0, 100.0, 29.5], [0.0, 0.0, 1.0]])
         >>> saunet.scale_intrinsics(K, 0.5, 0.5)[:2]
         tensor([[50.0000,  0.0000, 24.5000],
@@ -55,7 +55,7 @@ def crop_intrinsics(K: Float[Tensor, "*b 3 3"], left: Number, top: Number) -> Fl
     Returns:
         Intrinsics in pixels of the crop.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[100.0, 0.0, 49.5], [0.0, 100.0, 29.5], [0.0, 0.0, 1.0]])
         >>> saunet.crop_intrinsics(K, left=10, top=4)[:2, 2]
         tensor([39.5000, 25.5000])
@@ -77,7 +77,7 @@ def flip_intrinsics(K: Float[Tensor, "*b 3 3"], width: Number) -> Float[Tensor, 
     Returns:
         Intrinsics in pixels of the mirrored image.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[100.0, 0.0, 40.0], [0.0, 100.0, 29.5], [0.0, 0.0, 1.0]])
         >>> saunet.flip_intrinsics(K, width=100)[0, 2]
         tensor(59.)

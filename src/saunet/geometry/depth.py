@@ -21,7 +21,7 @@ def sigmoid_to_disparity(sigmoid: Float[Tensor, "*b"], min_depth: float, max_dep
     Returns:
         Disparity (inverse depth), 1/meter.
 
-    Example:
+    Examples:
         >>> saunet.sigmoid_to_disparity(torch.tensor([0.0, 1.0]), min_depth=0.1, max_depth=10.0)
         tensor([ 0.1000, 10.0000])
     """
@@ -39,7 +39,7 @@ def disparity_to_depth(disparity: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
     Returns:
         Depth.
 
-    Example:
+    Examples:
         >>> saunet.disparity_to_depth(torch.tensor([0.5, 0.1]))
         tensor([ 2., 10.])
     """

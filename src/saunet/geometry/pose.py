@@ -59,7 +59,7 @@ def pose_matrix(
     Returns:
         4x4 matrices.
 
-    Example:
+    Examples:
         >>> forward = saunet.pose_matrix(torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
         >>> forward @ torch.tensor([0.0, 0.0, 5.0, 1.0])
         tensor([0., 0., 6., 1.])
@@ -78,7 +78,7 @@ def invert_pose(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     Returns:
         Their inverses.
 
-    Example:
+    Examples:
         >>> T = saunet.pose_matrix(torch.tensor([0.0, 0.1, 0.0]), torch.tensor([0.0, 0.0, 1.0]))
         >>> torch.allclose(saunet.invert_pose(T) @ T, torch.eye(4))
         True

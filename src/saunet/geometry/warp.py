@@ -35,7 +35,7 @@ def backproject(depth: Float[Tensor, "b 1 h w"], K: Float[Tensor, "b 3 3"]) -> F
     Returns:
         Points (x right, y down, z forward), meters.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[[2.0, 0.0, 1.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]])
         >>> points = saunet.backproject(torch.full((1, 1, 1, 3), 4.0), K)
         >>> points[0, :, 0]  # x, y and z of three pixels in a row
@@ -67,7 +67,7 @@ def project(
         Pixels (u, v) in the source image, and depth z in the source camera. A point less than `MIN_Z` in front of the
         camera gets a pixel outside every image, and no gradient.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[[2.0, 0.0, 1.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]])
         >>> points = saunet.backproject(torch.full((1, 1, 1, 3), 4.0), K)
         >>> pixels, z = saunet.project(points, K, torch.eye(4)[None])
@@ -136,7 +136,7 @@ def synthesize(
     Returns:
         The warped images, and where a point lies in front of the source camera and inside its image.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[[2.0, 0.0, 1.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]])
         >>> source = torch.tensor([0.1, 0.2, 0.3]).expand(1, 1, 3, 1, 3)
         >>> shift = saunet.pose_matrix(torch.zeros(1, 1, 3), torch.tensor([[[2.0, 0.0, 0.0]]]))  # 2 m: one pixel at 4 m

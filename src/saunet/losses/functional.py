@@ -28,7 +28,7 @@ def ssim_loss(prediction: Float[Tensor, "*b c h w"], target: Float[Tensor, "*#b 
     Returns:
         One map a channel.
 
-    Example:
+    Examples:
         >>> image = torch.rand(1, 3, 8, 8)
         >>> float(saunet.ssim_loss(image, image).max())
         0.0
@@ -57,7 +57,7 @@ def photometric_error(
     Returns:
         One map an image.
 
-    Example:
+    Examples:
         >>> black, white = torch.zeros(1, 3, 4, 4), torch.ones(1, 3, 4, 4)
         >>> error = saunet.photometric_error(black, white, ssim_weight=0.0)
         >>> error.shape, float(error.mean())
@@ -86,7 +86,7 @@ def combine_sources(
     Raises:
         ConfigError: for another word.
 
-    Example:
+    Examples:
         >>> errors = torch.tensor([0.3, 0.1]).view(1, 2, 1, 1, 1)  # two sources, one pixel
         >>> saunet.combine_sources(errors)[0].item() == errors.min().item()
         True
@@ -120,7 +120,7 @@ def automask(
     Returns:
         The mask mu.
 
-    Example:
+    Examples:
         >>> warped, unwarped = torch.full((1, 1, 1, 2), 0.2), torch.tensor([[[[0.5, 0.1]]]])
         >>> saunet.automask(warped, unwarped)
         tensor([[[[ True, False]]]])
@@ -157,7 +157,7 @@ def smoothness_loss(disparity: Float[Tensor, "b 1 h w"], image: Float[Tensor, "b
     Returns:
         Mean over horizontal plus mean over vertical neighbor pairs.
 
-    Example:
+    Examples:
         >>> flat, image = torch.ones(1, 1, 4, 4), torch.rand(1, 3, 4, 4)
         >>> saunet.smoothness_loss(flat, image)
         tensor(0.)
@@ -213,7 +213,7 @@ def gradient_loss(
     Raises:
         ConfigError: for an unknown operator or padding.
 
-    Example:
+    Examples:
         >>> ramp = torch.arange(4.0).expand(1, 1, 4, 4)
         >>> saunet.gradient_loss(2 * ramp, ramp)  # one more per pixel to the right, none downwards
         tensor(1.)

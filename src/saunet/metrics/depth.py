@@ -19,7 +19,7 @@ class DepthMetrics(Metric):
     An image whose ground truth has no pixel to compare is counted (``images_without_truth``) and leaves the means
     alone.
 
-    Example:
+    Examples:
         >>> metrics = saunet.DepthMetrics("synthetic")
         >>> metrics.update(torch.full((1, 1, 4, 6), 0.5), torch.full((1, 1, 8, 12), 10.0), torch.tensor([[8, 12]]))
         >>> {name: round(value.item(), 3) for name, value in metrics.compute().items() if name in ("abs_rel", "scale")}

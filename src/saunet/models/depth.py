@@ -35,7 +35,7 @@ class DepthNet(nn.Module):
     Raises:
         ConfigError: if not 0 < min_depth < max_depth, the encoder takes several frames, or the decoder does not fit.
 
-    Example:
+    Examples:
         >>> import functools
         >>> encoder = saunet.build("encoder", "stratified_nano")
         >>> decoder = functools.partial(saunet.build, "decoder", "aunet")

@@ -36,7 +36,7 @@ class Prediction:
         scale: The factor that has been applied to reach meters; None where only relative depth is known.
         name: Where the image came from, such as a file name.
 
-    Example:
+    Examples:
         >>> prediction = saunet.load("last.ckpt").predict("road.png")
         >>> prediction.depth.shape, prediction.color().shape
         ((96, 160), (96, 160, 3))

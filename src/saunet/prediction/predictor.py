@@ -29,7 +29,7 @@ class Predictor(ImagePredictor):
         flip: Average with the prediction of the mirrored image (twice the time, a little less error).
         keep_aspect: Feed each image at its own aspect ratio, with about height x width pixels, not exactly that size.
 
-    Example:
+    Examples:
         >>> saunet.Predictor.from_checkpoint("last.ckpt").predict("road.png").disparity.dtype
         dtype('float32')
     """

@@ -77,7 +77,7 @@ class PredictOptions:
     Raises:
         ConfigError: if an option cannot work, or not beside another one.
 
-    Example:
+    Examples:
         >>> saunet.PredictOptions(checkpoint="last.ckpt", input="drive.mp4", output="out").codec
         'h264'
     """
@@ -190,7 +190,7 @@ def predict(
         CheckpointError: if the model cannot be read.
         DataError: if the input cannot be read, nothing in it can, or the system refuses to write.
 
-    Example:
+    Examples:
         >>> options = saunet.PredictOptions(checkpoint="last.ckpt", input="road.png", output="out", device="cpu")
         >>> print(saunet.predict(options))
         depth is ...

@@ -54,7 +54,7 @@ class ReportOptions:
     Raises:
         ConfigError: if an option cannot work.
 
-    Example:
+    Examples:
         >>> saunet.ReportOptions(runs=("outputs/train",)).zooms
         2
     """
@@ -113,7 +113,7 @@ def report(options: ReportOptions) -> ReportResult:
         DataError: if a path holds no run, sweep, checkpoint, evaluation or benchmark, or a file cannot be read or
             written.
 
-    Example:
+    Examples:
         >>> report(ReportOptions(runs=("outputs/train",), output_dir="page")).show()  # doctest: +SKIP
 
     Returns:

@@ -68,7 +68,7 @@ class Row:
 class Table:
     r"""A table of plain values.
 
-    Example:
+    Examples:
         >>> columns = (Column("model"), Column("Abs Rel", ".3f", better=-1))
         >>> table = Table("scores", "Scores", columns, (Row(("ours", 0.1)), Row(("theirs", 0.25))))
         >>> print(table.markdown())

@@ -70,7 +70,7 @@ class ModelOptions:
         min_depth: Smallest depth that the network can say, meters up to scale.
         max_depth: Largest depth.
 
-    Example:
+    Examples:
         >>> parts = {"encoder": "resnet18", "decoder": "unet", "pose": "posecnn"}
         >>> saunet.ModelOptions(**{kind: saunet.Spec.of(kind, name) for kind, name in parts.items()}).max_depth
         100.0
@@ -108,7 +108,7 @@ class TrainOptions:
     Raises:
         ConfigError: for values with which no training can run.
 
-    Example:
+    Examples:
         >>> parts = {"encoder": "resnet18", "decoder": "unet", "pose": "posecnn"}
         >>> model = {kind: saunet.Spec.of(kind, name) for kind, name in parts.items()}
         >>> options = saunet.TrainOptions(
@@ -258,7 +258,7 @@ def train(
     Returns:
         Where the results are, the best checkpoint, the model and the data.
 
-    Example:
+    Examples:
         >>> result = saunet.train(options)  # doctest: +SKIP
         >>> saunet.load(result.best).predict(image).show()  # doctest: +SKIP
     """

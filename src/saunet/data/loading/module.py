@@ -47,7 +47,7 @@ class DepthDataModule(LightningDataModule):
         ConfigError: if a parameter is out of range.
         DataError: if the manifest or the cache cannot be read.
 
-    Example:
+    Examples:
         >>> data = saunet.build("data", "synthetic_tiny", workers=0)
         >>> isinstance(data, saunet.DepthDataModule), data.protocol
         (True, 'synthetic')

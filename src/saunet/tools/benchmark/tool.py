@@ -47,7 +47,7 @@ class BenchmarkOptions(Plan):
     Raises:
         ConfigError: for an empty sequence, or a word, number or device that cannot work.
 
-    Example:
+    Examples:
         >>> from saunet.tools.benchmark import Networks
         >>> networks = Networks(torch.nn.Conv2d(3, 1, 3))
         >>> saunet.BenchmarkOptions(models={"one layer": networks}).runs
@@ -100,7 +100,7 @@ def benchmark(options: BenchmarkOptions) -> BenchmarkResult:
         ConfigError: if a size does not fit a model; nothing has been measured then.
         DataError: if a file cannot be written.
 
-    Example:
+    Examples:
         >>> from saunet.tools.benchmark import Networks
         >>> networks = Networks(torch.nn.Conv2d(3, 1, 3, padding=1))
         >>> options = saunet.BenchmarkOptions(models={"one layer": networks}, sizes=("32x64",), runs=1)

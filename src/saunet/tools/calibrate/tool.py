@@ -23,7 +23,7 @@ class CalibrateOptions:
     Raises:
         ConfigError: for a board that cannot exist, another wrong value, or neither ``input`` nor ``print_board``.
 
-    Example:
+    Examples:
         >>> saunet.CalibrateOptions(input="board.mp4", columns=8, rows=6).output
         'camera.yaml'
     """
@@ -109,7 +109,7 @@ def calibrate(
     Raises:
         DataError: if the pictures cannot be read, the board is hardly seen, or the result cannot be trusted.
 
-    Example:
+    Examples:
         >>> print(saunet.calibrate(saunet.CalibrateOptions(print_board="board.png", columns=8)))
         chessboard of 8x7 squares (7x6 inner corners): board.png; print it, glue it to something flat, ...
     """

@@ -23,7 +23,7 @@ class DoctorOptions:
     Raises:
         ConfigError: for an unknown split, none, or a negative number of frames.
 
-    Example:
+    Examples:
         >>> options = saunet.DoctorOptions(data=saunet.Spec.of("data", "synthetic"), output_dir="look")
         >>> options.frames
         1000
@@ -94,7 +94,7 @@ def doctor(options: DoctorOptions, *, advance: Callable[[int, int], None] | None
         ConfigError: if the data module cannot be built.
         DataError: if the results cannot be written.
 
-    Example:
+    Examples:
         >>> data = saunet.Spec.of("data", "synthetic_tiny", workers=0)
         >>> diagnosis = saunet.doctor(saunet.DoctorOptions(data=data, output_dir="look", frames=4))
         >>> diagnosis.usable

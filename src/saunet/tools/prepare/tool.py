@@ -37,7 +37,7 @@ class PrepareOptions:
     Raises:
         ConfigError: for a wrong value, or an option that the job does not have.
 
-    Example:
+    Examples:
         >>> options = saunet.PrepareOptions(job="densify", root="/data/kitti/raw", kinds=["linear"])
         >>> options.cameras
         ('left', 'right')
@@ -128,7 +128,7 @@ def prepare(options: PrepareOptions) -> Done | CacheReport:
         CheckpointError: if the teacher's checkpoint cannot be read.
         ConfigError: if a drive, split or data module does not fit.
 
-    Example:
+    Examples:
         >>> tree = saunet.PrepareOptions(job="densify", root="/nowhere")
         >>> saunet.prepare(tree)
         Traceback (most recent call last):
