@@ -45,6 +45,10 @@ if TYPE_CHECKING:
     from saunet.prediction.predictor import Predictor as Predictor
     from saunet.prediction.tool import PredictOptions as PredictOptions
     from saunet.prediction.tool import predict as predict
+    from saunet.reporting.tool import ReportOptions as ReportOptions
+    from saunet.reporting.tool import report as report
+    from saunet.tools.benchmark.tool import BenchmarkOptions as BenchmarkOptions
+    from saunet.tools.benchmark.tool import benchmark as benchmark
     from saunet.tools.calibrate.tool import CalibrateOptions as CalibrateOptions
     from saunet.tools.calibrate.tool import calibrate as calibrate
     from saunet.tools.doctor.tool import DoctorOptions as DoctorOptions
@@ -58,6 +62,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _LAZY = {
+    "BenchmarkOptions": "tools.benchmark.tool",
     "CalibrateOptions": "tools.calibrate.tool",
     "DepthDataModule": "data.loading.module",
     "DepthMetrics": "metrics.depth",
@@ -72,9 +77,11 @@ _LAZY = {
     "Prediction": "prediction.prediction",
     "Predictor": "prediction.predictor",
     "PrepareOptions": "tools.prepare.tool",
+    "ReportOptions": "reporting.tool",
     "TrainOptions": "training.tool",
     "automask": "losses.functional",
     "backproject": "geometry.warp",
+    "benchmark": "tools.benchmark.tool",
     "calibrate": "tools.calibrate.tool",
     "combine_sources": "losses.functional",
     "crop_intrinsics": "geometry.camera",
@@ -91,6 +98,7 @@ _LAZY = {
     "predict": "prediction.tool",
     "prepare": "tools.prepare.tool",
     "project": "geometry.warp",
+    "report": "reporting.tool",
     "scale_intrinsics": "geometry.camera",
     "sigmoid_to_disparity": "geometry.depth",
     "smoothness_loss": "losses.functional",

@@ -51,9 +51,14 @@ class Model:
         parts = {
             kind: Spec.of(kind, part) for each in content["defaults"] for kind, part in each.items() if kind[0] != "_"
         }
-        own = {key: value for key, value in content.items() if key != "defaults" and not isinstance(value, dict)}
         changed = {kind: spec.changed(**content.get(kind, {})) for kind, spec in parts.items()}
-        return cls(**changed, **own)
+        return cls(
+            encoder=changed["encoder"],
+            decoder=changed["decoder"],
+            pose=changed.get("pose"),
+            min_depth=content.get("min_depth", cls.min_depth),
+            max_depth=content.get("max_depth", cls.max_depth),
+        )
 
     def networks(self) -> Networks:
         """Build the networks with random weights."""
