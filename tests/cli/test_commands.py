@@ -29,9 +29,12 @@ def test_a_run_leaves_checkpoints_logs_pictures_and_its_config(smoke_run: Path) 
         "checkpoints/last.ckpt",
         "csv/metrics.csv",
         "pictures/epoch_000.png",
-        ".hydra/config.yaml",
+        "run.json",
     } <= names
     assert any(name.startswith("tensorboard/events") for name in names)
+    record = json.loads((smoke_run / "run.json").read_text())
+    assert record["config"]["data"]["height"] == 64
+    assert "experiment=smoke" in record["overrides"]
     with (smoke_run / "csv" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {"train/loss", "train/photometric", "train/gradient", "val/abs_rel", "val/a1"} <= set(rows[0])

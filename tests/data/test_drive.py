@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +93,7 @@ def test_nothing_probes_a_recording():
             member = isinstance(node.args[1], ast.Constant) and node.args[1].value in MEMBERS - GENERIC
             probes = called in ("getattr", "hasattr") and (member or "drive" in target.lower())
             sorts = called in ("isinstance", "issubclass") and any(
-                each.endswith(("Drive", "Sequence")) and each != "Sequence" for each in word.strip("()").split(", ")
+                each.endswith(("Drive", "Sequence")) and each != "Sequence" for each in re.split(r"\W+", word)
             )
             if probes or sorts:
                 found.append(f"{path.relative_to(SOURCE)}: {ast.unparse(node)}")

@@ -24,7 +24,7 @@ def test_the_paper_s_best_ratios_are_a_band_from_95_to_105(monkeypatch: pytest.M
     drawn = []
     monkeypatch.setattr(figures, "comparable", lambda runs: scores)
     monkeypatch.setattr(figures, "ratio", ratios.get)
-    monkeypatch.setattr(figures, "_svg", lambda figure: drawn.append(figure) or b"")
+    monkeypatch.setattr(figures, "svg", lambda figure: drawn.append(figure) or b"")
     figures.draw_ratio(_Named())
     (figure,) = drawn
     for axis in figure.axes:

@@ -43,9 +43,8 @@ def test_one_factor_is_the_median_with_its_spread() -> None:
     assert estimate.names == ("frame 0", "frame 1", "frame 2", "frame 4", "frame 5")
     assert estimate.spread == pytest.approx(np.std([2, 3, 10, 4, 3.5]) / 3.5)
     assert estimate.scale() == Scale(3.5, "speed")
-    assert str(estimate) == (
-        "scale 3.5 from speed: median of 5 frames (1 more could not be measured), middle half 3 to 4, std/median 80.8 %"
-    )
+    assert str(estimate).startswith("scale 3.5 from speed: median of 5 frames (1 more could not be measured)")
+    assert "middle half 3 to 4, std/median 80.8 %" in str(estimate)
     plain = json.loads(json.dumps(estimate.as_json()))
     assert plain["per_frame"]["frame 2"] == 10.0
     assert plain["iqr"] == 1.0

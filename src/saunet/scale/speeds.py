@@ -37,10 +37,10 @@ class SpeedTable:
         if key not in self.ticks:
             return math.nan
         start, end = sorted((first, second))
-        seconds = (end - start) / fps if times is None else (times[end] or 0) - (times[start] or 0)
+        seconds = (end - start) / fps if times is None else (times[end] or 0.0) - (times[start] or 0.0)
         if self.unit == "frame":
-            return self._mean(key, start, end) * seconds
-        low, high = (start / fps, end / fps) if times is None else (times[start] or 0, times[end] or 0)
+            return self._mean(key, float(start), float(end)) * seconds
+        low, high = (start / fps, end / fps) if times is None else (times[start] or 0.0, times[end] or 0.0)
         return self._mean(key, low, high) * seconds
 
     def _mean(self, key: str, start: float, end: float) -> float:

@@ -40,7 +40,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            if isinstance(field.default, tuple) and not getattr(self, field.name):
+            if isinstance(field.default, tuple) and field.default and not getattr(self, field.name):
                 usual = field.default[0]
                 raise ConfigError(f"{field.name} is empty, so nothing would be measured; give some, such as {usual}")
         for size in self.sizes:
