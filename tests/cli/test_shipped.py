@@ -52,7 +52,9 @@ def test_init_from(tool: Tool, street: Path) -> None:
 def test_without_one(tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(locate, "BOX", tmp_path)
     (tmp_path / "x.png").touch()
-    tool("predict", f"input={tmp_path / 'x.png'}", "output=y").says("no model 'street' comes with this installation", "checkpoint=")
+    tool("predict", f"input={tmp_path / 'x.png'}", "output=y").says(
+        "no model 'street' comes with this installation", "checkpoint="
+    )
     tool("train", "experiment=smoke", "init_from=street").says("no model 'street' comes with this installation")
 
 

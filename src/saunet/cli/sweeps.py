@@ -101,7 +101,7 @@ def check_job(config: Mapping[str, object], job: str) -> None:
     if isinstance(trainer, Mapping) and _replays(trainer):
         raise ConfigError(
             "--multirun with several processes per job would replay the whole sweep on every process; "
-            "use one process per job, through a Hydra launcher where there are several devices"
+            "use one process per job, or start each training with a command of its own, such as in a shell loop"
         )
 
 
