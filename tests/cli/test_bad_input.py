@@ -208,6 +208,7 @@ def test_writing_where_nothing_can_be_written(tool: Tool, smoke_run: Path, tmp_p
     tool("train", "experiment=smoke", "output_dir=file/run").says("file")
 
 
-def test_an_unknown_device(tool: Tool, smoke_run: Path) -> None:
+def test_an_unknown_device(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.png").touch()
     checkpoint = f"checkpoint={smoke_run / 'checkpoints' / 'best.ckpt'}"
     tool("predict", checkpoint, "input=a.png", "output=out", "device=tpux").says("device 'tpux'", "available: cpu")

@@ -51,7 +51,8 @@ def test_a_run_with_a_folder_of_its_own_is_one_run_that_knows_itself(tool: Any, 
         *("model/pose=posecnn", "output_dir=runs/mine"),
     )
     assert outcome.code == 0, outcome.err
-    (read,) = collect([tmp_path / "outputs", tmp_path / "runs" / "mine"], jobs=read_plan).runs
+    assert not (tmp_path / "outputs").exists()
+    (read,) = collect([tmp_path / "runs" / "mine"], jobs=read_plan).runs
     assert (read.path, read.component("model/encoder"), read.overrides["model/pose"]) == (
         tmp_path / "runs" / "mine", "resnet18", "posecnn",
     )  # fmt: skip

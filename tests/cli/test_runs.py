@@ -106,9 +106,8 @@ def test_a_sweep_does_not_write_its_jobs_over_each_other(tool: Tool, tmp_path: P
     jobs = ("train", "--multirun", *QUICK, "trainer.limit_train_batches=1", "seed=1,2")
     outcome = tool(*jobs, "output_dir=runs/all", "hydra.sweep.dir=sweep")
     assert outcome.code == 1
-    last = outcome.err.strip().splitlines()[-1]
-    assert last.startswith("saunet train: output_dir is 'runs/all'")
-    assert "set hydra.sweep.dir=runs/all, below which each job gets its own" in last
+    assert "output_dir is 'runs/all'" in outcome.err
+    assert "set hydra.sweep.dir=runs/all, below which each job gets its own" in outcome.err
     assert "sweep:" not in outcome.out
     assert not (tmp_path / "runs").exists()
     outcome = tool(*jobs, "output_dir=${hydra:runtime.output_dir}/run", "hydra.sweep.dir=sweep")

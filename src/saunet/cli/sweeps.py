@@ -43,6 +43,7 @@ def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[bool, D
     if planned:
         write_plan(folder, planned)
     failed: Exception | None = None
+    stopped: SystemExit | None = None
     code = 0
     try:
         returned = hydra.multirun(name, functools.partial(task, not planned), overrides)
@@ -50,6 +51,8 @@ def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[bool, D
         code = 1 if any(isinstance(job.return_value, Failed) for job in jobs) else 0
     except KeyboardInterrupt:
         code = 130
+    except SystemExit as stop:  # a training that was asked to stop says how to resume; the sweep ends with it
+        stopped = stop
     except Exception as error:
         failed, code = error, 1
     if not any(folder.glob("**/.hydra")) and failed:
@@ -64,6 +67,8 @@ def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[bool, D
         finished = code == 0
         text = f"sweep: {f'{len(planned)} jobs finished' if finished else 'not all jobs finished'}; results: {folder}"
     print(text, file=sys.stdout if finished else sys.stderr)
+    if stopped is not None:
+        raise stopped
     return 0 if finished else code or 1
 
 
