@@ -9,18 +9,18 @@ from pathlib import Path
 from real import real_frames, score
 from train_pose import score as pose_score
 
-from saunet.runs.checkpoint import read_checkpoint
+from saunet.weights.files import read_model
 
 
 def main() -> None:
     """Print one line per clip, with and without the mirrored image, and one for the motion."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("checkpoint", help="a checkpoint, or the name of a shipped model")
     parser.add_argument(
         "root", type=Path, nargs="?", default=Path(os.environ.get("SAUNET_TEST_DATA", "../../../shared")) / "kitti_mini"
     )
     options = parser.parse_args()
-    found = read_checkpoint(options.checkpoint)
+    found = read_model(options.checkpoint)
     depth, pose = found.networks()
     size = (found.record.height, found.record.width)
     clips = real_frames(options.root)
