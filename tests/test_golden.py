@@ -29,7 +29,7 @@ def test_the_first_losses_of_a_seeded_training(objective: str) -> None:
         )
     torch.manual_seed(cfg.seed)
     data = instantiate(config.plain(cfg.data))
-    model = assemble(TrainOptions.from_plain(config.plain(cfg)), data)
+    model = assemble(TrainOptions.from_plain({key: config.plain(cfg[key]) for key in cfg if key != "plugins"}), data)
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
     data.setup("fit")
     losses = []

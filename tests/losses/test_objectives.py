@@ -13,6 +13,7 @@ import torch
 from omegaconf import OmegaConf
 
 import saunet
+from saunet.cli.compose import structured
 from saunet.errors import ConfigError
 from saunet.losses.base import Objective, Term, TermResult
 from saunet.losses.objectives.monodepth2 import Monodepth2Objective
@@ -94,7 +95,7 @@ def test_nothing_half_precision_inside_autocast(name: str, make_inputs: Make) ->
 
 
 def composed(name: str, *dotlist: str) -> dict[str, Any]:
-    node = OmegaConf.structured(objectives.node(name))
+    node = OmegaConf.structured(structured(objectives.node(name)))
     merged = OmegaConf.merge(node, OmegaConf.from_dotlist(list(dotlist)))
     container: Any = OmegaConf.to_container(merged, resolve=True)
     return container  # type: ignore[no-any-return]

@@ -208,14 +208,14 @@ def test_a_warm_start_from_a_shipped_model(
 ) -> None:
     from saunet.exporting.box import pack
     from saunet.runs.checkpoint import atomic_save
-    from saunet.training.tool import assemble
+    from saunet.training.tool import TrainOptions, assemble
     from saunet.weights import locate
 
     monkeypatch.setattr(locate, "BOX", tmp_path)
     atomic_save({"saunet": model.record, "state_dict": model.state_dict()}, tmp_path / "a.ckpt")
     pack(tmp_path / "a.ckpt", tmp_path / "street")
     model_config = config["model"]
-    other = assemble({**config, "model": {**model_config, "max_depth": 50.0}}, walls)
+    other = assemble(TrainOptions.from_plain({**config, "model": {**model_config, "max_depth": 50.0}}), walls)
     said = warm_start(other, "street")
     assert "starting from street: all " in said
     assert f"all {len(other.pose.state_dict())} tensors of the pose network" in said
@@ -225,7 +225,8 @@ def test_a_warm_start_from_a_shipped_model(
             assert own.dtype == torch.float32
             torch.testing.assert_close(own, theirs, rtol=1e-3, atol=1e-6)
     pose = node("pose", "efficientnet_lite0")
-    said = warm_start(assemble({**config, "model": {**model_config, "pose": pose}}, walls), "street")
+    options = TrainOptions.from_plain({**config, "model": {**model_config, "pose": pose}})
+    said = warm_start(assemble(options, walls), "street")
     assert f"0 of {len(poses.build('efficientnet_lite0').state_dict())} tensors of the pose network" in said
     assert "(left as they were: encoder.conv_stem.weight, not in it, and " in said
     assert "(unused: layers.0.bias, and " in said

@@ -15,7 +15,7 @@ from saunet.registry import decoders, encoders, objectives, poses
 from saunet.training.module import SelfSupervisedDepth
 
 HEIGHT, WIDTH = 32, 64
-FAMILIES = ("stratified_nano", "swin_tiny", "resnet18", "packnet", "lite_mono_tiny")
+FAMILIES = ("stratified_nano", "swin_tiny", "resnet18", "packnet", "lite_mono_tiny", "efficientnet_lite0")
 """One encoder of each family; the sisters are the same class with other numbers."""
 
 
