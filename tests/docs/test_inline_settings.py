@@ -26,7 +26,8 @@ WITH_DATA = ("train", "evaluate", "doctor")
 PYTHON = {"align_corners=True", "weights_only=True", "features=", "channels="}
 FORMS = {"key=value", "camera=[fx,fy,cx,cy]", "saunet predict ... outputs=[ply] camera=[fx,fy,cx,cy]"}
 MISTAKES = {"optim.lr=much", "model.encoder.dephts=..."}  # which the page shows as such
-OWN_COMPONENTS = ("model/encoder=plain", "+objective.extra.near_prior", "plugins=[my_")  # registered by the page itself
+# Registered by the page itself:
+OWN_COMPONENTS = ("model/encoder=plain", "+objective.extra.near_prior", "plugins=[my_", "saunet train plugins=[my_")
 SETTINGS = [
     (page, code)
     for page, code in inline()
