@@ -152,7 +152,8 @@ def test_an_unreadable_checkpoint(
         torch.save({"state_dict": {}}, path)
     else:
         path.write_bytes(content)
-    overrides = ("input=x", "output=out") if name == "predict" else ()
+    (tmp_path / "x.png").touch()
+    overrides = ("input=x.png", "output=out") if name == "predict" else ()
     outcome = tool(name, f"checkpoint={path}", *overrides)
     outcome.says("x.ckpt")
     assert any(word in outcome.err for word in (*words, "is not a checkpoint", "damaged"))

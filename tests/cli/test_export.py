@@ -38,7 +38,7 @@ def test_a_trained_model_becomes_a_folder(
     arguments = (f"checkpoint={checkpoint}", "output=model", "formats=[safetensors]")
     code, out, err = export(*arguments)
     assert code == 0, err
-    assert "so only random images are compared" in err
+    assert "so only random images were compared" in err
     assert re.search(r"model\.safetensors +\d+\.\d +any +0\.0e\+00 +2 +0 +\d+\.\d +\d+\.\d", out), out
     assert saunet.load(tmp_path / "model").fingerprint == saunet.load(checkpoint).fingerprint
     assert json.loads((tmp_path / "model" / "report.json").read_text())["files"][0]["difference"] == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -65,8 +66,7 @@ def test_a_run_with_a_folder_of_its_own_is_one_run_that_knows_itself(tool: Any, 
     ("given", "words"),
     [
         (("gone",), "there is nothing at gone"),
-        ((), "runs is empty"),
-        (("scenes=3", "."), "give images by condition"),
+        ((), "no run given; name folders of runs"),
         (("titel=x",), "did you mean 'title'"),
     ],
 )
@@ -78,6 +78,15 @@ def test_mistakes_are_one_sentence(
     assert code == 1
     assert words in err
     assert "Traceback" not in err
+
+
+def test_scenes_that_are_no_images(tmp_path: Path) -> None:
+    """In a process of its own: here the type checker of the tests would speak first."""
+    command = [sys.executable, "-m", "saunet", "report", "scenes=3", "."]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "give images by condition" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_plain_folders_become_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
