@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from saunet import __version__
 from saunet.errors import ConfigError, SaunetError
-from saunet.io.atomic import write_json
+from saunet.io.atomic import process_lives, write_json
 from saunet.metrics.functional import ERROR_NAMES, RISING
 from saunet.runs.files import read_json, read_mapping, read_numbers, read_yaml
 
@@ -215,17 +215,6 @@ def remove_partial_files(folder: str | Path) -> list[Path]:
                 path.unlink(missing_ok=True)
                 removed.append(path)
     return removed
-
-
-def process_lives(pid: int) -> bool:
-    """Return whether a process of this machine exists."""
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:  # it exists and belongs to someone else
-        return True
-    return True
 
 
 def read(folder: str | Path) -> dict[str, Any] | None:
