@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from pathlib import Path
 
 from saunet.cli.log import RunLog
@@ -26,3 +27,18 @@ def test_a_tool_that_makes_no_folder_leaves_none(tmp_path: Path) -> None:
     log.emit(_said("6 frames used"))
     log.close()
     assert not (tmp_path / "run").exists()
+
+
+def test_a_tool_that_is_refused_adds_no_line_to_the_log_of_an_earlier_run(tmp_path: Path) -> None:
+    file = tmp_path / "train.log"
+    file.write_text("of an earlier run\n")
+    os.utime(tmp_path, (0, 0))
+    log = RunLog(str(file))
+    log.emit(_said("6 frames used"))
+    log.close()
+    assert file.read_text() == "of an earlier run\n"
+    log = RunLog(str(file))
+    log.emit(_said("6 frames used"))
+    (tmp_path / "run.json").touch()  # the checks have passed
+    log.emit(_said("epoch 1"))
+    assert file.read_text().splitlines() == ["of an earlier run", "6 frames used", "epoch 1"]

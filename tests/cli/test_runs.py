@@ -155,6 +155,7 @@ def test_a_finished_run_is_not_replaced_by_mistake(tool: Tool, smoke_run: Path, 
         ((), "holds best.ckpt of an earlier run; continue it by resume=auto"),
         (("seed=-1", "resume=auto"), "seed is -1"),
         (("resume=run/checkpoints/lst.ckpt",), "no checkpoint at"),
+        (("resume=run/checkpoints/last.ckpt",), "checkpoint of another model"),  # refused once the data were set up
     ):
         outcome = tool("train", *QUICK, "hydra.run.dir=run", *mistake)
         outcome.says(words)

@@ -24,7 +24,6 @@ from saunet.runs.folder import (
     read,
     record_failed_start,
     recording,
-    remove_partial_files,
     versions,
 )
 
@@ -203,18 +202,3 @@ def test_the_other_processes_of_a_run_need_no_lock(tmp_path: Path, monkeypatch: 
     monkeypatch.setenv("LOCAL_RANK", "1")
     with locked(tmp_path / "new"):
         assert not (tmp_path / "new").exists()
-
-
-def test_partial_files_of_a_killed_run_are_removed_and_those_of_a_living_one_are_not(tmp_path: Path) -> None:
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    (tmp_path / "checkpoints").mkdir()
-    dead = tmp_path / "checkpoints" / f".last.{gone.pid}.partial.ckpt"
-    alive = tmp_path / "checkpoints" / f".best.{os.getpid()}.partial.ckpt"
-    own = tmp_path / ".notes.partial.txt"
-    for file in (dead, alive, own):
-        file.touch()
-    assert remove_partial_files(tmp_path) == []  # of an unknown machine
-    RunRecord(tmp_path, "trial").start()
-    assert remove_partial_files(tmp_path) == [dead]
-    assert (dead.exists(), alive.exists(), own.exists()) == (False, True, True)

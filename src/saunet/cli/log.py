@@ -10,7 +10,9 @@ from pathlib import Path
 
 
 class RunLog(logging.FileHandler):
-    """A log in a run's folder. It makes no folder: what is said before there is one is kept and written later.
+    """A log in a run's folder, begun by the first file that the tool writes there: what is said before is kept.
+
+    A tool that is refused leaves neither a folder nor a line in the log of an earlier run.
 
     Args:
         filename: The file; each further process of a run has its own.
@@ -20,22 +22,28 @@ class RunLog(logging.FileHandler):
         path, rank = Path(filename), os.environ.get("LOCAL_RANK", "0")
         super().__init__(path if rank == "0" else path.with_stem(f"{path.stem}_rank{rank}"), delay=True)
         self._early: list[logging.LogRecord] = []
+        self._before = self._changed() if rank == "0" else None  # the first process has started the others
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record, once the folder exists."""
+        """Write a record, once the tool has written to the folder."""
         self._early.append(record)
         self._write()
 
     def close(self) -> None:
-        """Write what is still kept: a tool may say nothing more once its folder exists."""
+        """Write what is still kept: a tool may say nothing more once it has written."""
         self._write()
         super().close()
 
     def _write(self) -> None:
-        if Path(self.baseFilename).parent.is_dir():
+        if self.stream is not None or self._changed() != self._before:
             early, self._early = self._early, []
             for each in early:
                 super().emit(each)
+
+    def _changed(self) -> int | None:
+        """Return when a file was last made in the folder or renamed; None while there is no folder."""
+        folder = Path(self.baseFilename).parent
+        return folder.stat().st_mtime_ns if folder.is_dir() else None
 
 
 class _NoAdvertisement(logging.Filter):

@@ -113,7 +113,5 @@ def check_job(config: Mapping[str, object], job: str) -> None:
 def _replays(trainer: Mapping[str, object]) -> bool:
     """Return whether a trainer will start further processes by running this command again."""
     strategy = str(trainer.get("strategy", "auto")).lower()  # a name, or a node with a _target_
-    if "spawn" in strategy or "fork" in strategy:
-        return False
     several = str(trainer.get("devices", 1)) not in ("1", "[0]", "auto") or trainer.get("num_nodes", 1) not in (1, None)
     return several or any(kind in strategy for kind in ("ddp", "fsdp", "deepspeed"))

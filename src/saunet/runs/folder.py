@@ -42,7 +42,6 @@ SUBJECTS = ("model", "predictions")
 """What an evaluation calls what it scores: a checkpoint's network, or another system's files."""
 SIGN_OF_LIFE = 600.0
 """Seconds: a run on another machine that wrote nothing for so long does not run any more."""
-_PARTIAL = re.compile(r"\..*\.(\d+)\.partial(\.\w+)?")
 
 
 class Stopped(SystemExit):
@@ -196,25 +195,6 @@ def locked(folder: str | Path) -> Iterator[None]:
         with suppress(OSError):
             path.unlink()
         file.close()
-
-
-def remove_partial_files(folder: str | Path) -> list[Path]:
-    """Remove half-written files that a killed run left in its folder, once its process is known to be gone.
-
-    Args:
-        folder: The folder, which this process has `locked`.
-
-    Returns:
-        What was removed.
-    """
-    removed = []
-    if first_process() and (read(folder) or {}).get("host") == socket.gethostname():
-        for path in Path(folder).rglob(".*.partial*"):
-            found = _PARTIAL.fullmatch(path.name)
-            if found and path.is_file() and not process_lives(int(found[1])):
-                path.unlink(missing_ok=True)
-                removed.append(path)
-    return removed
 
 
 def read(folder: str | Path) -> dict[str, Any] | None:

@@ -17,12 +17,13 @@ from lightning.pytorch.loggers import Logger
 from saunet import plugins
 from saunet.data.loading.module import DepthDataModule
 from saunet.errors import ConfigError, SaunetError, divisible, in_range, one_of, positive, suggest
+from saunet.io.atomic import remove_partial_files
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import protocol
 from saunet.registry import Spec
 from saunet.runs.checkpoint import build_networks, read_checkpoint
-from saunet.runs.folder import locked, recording, remove_partial_files
+from saunet.runs.folder import locked, recording
 from saunet.runs.record import ModelRecord, Scale
 from saunet.training.callbacks import AtomicCheckpointIO, BestCheckpoint
 from saunet.training.module import SelfSupervisedDepth
