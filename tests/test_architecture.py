@@ -12,6 +12,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "saunet"
 # room -> the rooms of saunet that it may import, beside itself
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
+    "lazy": set(),
     "schema": set(),
     "types": set(),
     "fingerprint": set(),
@@ -28,7 +29,7 @@ ALLOWED: dict[str, set[str]] = {
     "synthetic": {"errors", "io", "data"},
     "runs": {"plugins", "errors", "io", "registry", "metrics", "models", "__version__"},
     "weights": {"errors", "io", "runs"},
-    "scale": {"errors", "types", "io", "geometry", "runs"},
+    "scale": {"errors", "lazy", "types", "io", "geometry", "runs"},
     "training": {
         "plugins",
         "errors",
@@ -43,8 +44,20 @@ ALLOWED: dict[str, set[str]] = {
         "runs",
         "weights",
     },
-    "prediction": {"errors", "types", "io", "data", "metrics", "models", "runs", "scale", "weights", "exporting"},
-    "exporting": {"errors", "io", "metrics", "models", "prediction", "runs", "weights"},
+    "prediction": {
+        "errors",
+        "lazy",
+        "types",
+        "io",
+        "data",
+        "metrics",
+        "models",
+        "runs",
+        "scale",
+        "weights",
+        "exporting",
+    },
+    "exporting": {"errors", "lazy", "io", "metrics", "models", "prediction", "runs", "weights"},
     "evaluation": {
         "errors",
         "registry",

@@ -6,134 +6,79 @@ imported when they are first used, so ``import saunet`` stays cheap.
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saunet.errors import CheckpointError, ConfigError, DataError, SaunetError
+from saunet.lazy import lazily
 from saunet.registry import Spec, attentions, datamodules, decoders, encoders, objectives, poses, registry, terms
 from saunet.weights.locate import DEFAULT, shipped
 
 if TYPE_CHECKING:
-    from saunet.data.drive import Drive as Drive
-    from saunet.data.loading.module import DepthDataModule as DepthDataModule
-    from saunet.evaluation import EvaluateOptions as EvaluateOptions
-    from saunet.evaluation import OdometryOptions as OdometryOptions
-    from saunet.evaluation import evaluate as evaluate
-    from saunet.evaluation import odometry as odometry
-    from saunet.exporting.tool import ExportOptions as ExportOptions
-    from saunet.exporting.tool import export as export
-    from saunet.geometry.camera import crop_intrinsics as crop_intrinsics
-    from saunet.geometry.camera import flip_intrinsics as flip_intrinsics
-    from saunet.geometry.camera import scale_intrinsics as scale_intrinsics
-    from saunet.geometry.depth import disparity_to_depth as disparity_to_depth
-    from saunet.geometry.depth import sigmoid_to_disparity as sigmoid_to_disparity
-    from saunet.geometry.pose import invert_pose as invert_pose
-    from saunet.geometry.pose import pose_matrix as pose_matrix
-    from saunet.geometry.warp import backproject as backproject
-    from saunet.geometry.warp import project as project
-    from saunet.geometry.warp import synthesize as synthesize
-    from saunet.losses.functional import automask as automask
-    from saunet.losses.functional import combine_sources as combine_sources
-    from saunet.losses.functional import gradient_loss as gradient_loss
-    from saunet.losses.functional import photometric_error as photometric_error
-    from saunet.losses.functional import smoothness_loss as smoothness_loss
-    from saunet.losses.functional import ssim_loss as ssim_loss
-    from saunet.metrics.depth import DepthMetrics as DepthMetrics
-    from saunet.models.depth import DepthNet as DepthNet
-    from saunet.prediction.prediction import Prediction as Prediction
-    from saunet.prediction.predictor import Predictor as Predictor
-    from saunet.prediction.tool import PredictOptions as PredictOptions
-    from saunet.prediction.tool import predict as predict
-    from saunet.reporting.tool import ReportOptions as ReportOptions
-    from saunet.reporting.tool import report as report
-    from saunet.tools.benchmark.tool import BenchmarkOptions as BenchmarkOptions
-    from saunet.tools.benchmark.tool import benchmark as benchmark
-    from saunet.tools.calibrate.tool import CalibrateOptions as CalibrateOptions
-    from saunet.tools.calibrate.tool import calibrate as calibrate
-    from saunet.tools.doctor.tool import DoctorOptions as DoctorOptions
-    from saunet.tools.doctor.tool import doctor as doctor
-    from saunet.tools.prepare.tool import PrepareOptions as PrepareOptions
-    from saunet.tools.prepare.tool import prepare as prepare
-    from saunet.training.tool import ModelOptions as ModelOptions
-    from saunet.training.tool import TrainOptions as TrainOptions
-    from saunet.training.tool import train as train
+    from saunet.data.drive import Drive
+    from saunet.data.loading.module import DepthDataModule
+    from saunet.evaluation import EvaluateOptions, OdometryOptions, evaluate, odometry
+    from saunet.exporting.tool import ExportOptions, export
+    from saunet.geometry.camera import crop_intrinsics, flip_intrinsics, scale_intrinsics
+    from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
+    from saunet.geometry.pose import invert_pose, pose_matrix
+    from saunet.geometry.warp import backproject, project, synthesize
+    from saunet.losses.functional import (
+        automask,
+        combine_sources,
+        gradient_loss,
+        photometric_error,
+        smoothness_loss,
+        ssim_loss,
+    )
+    from saunet.metrics.depth import DepthMetrics
+    from saunet.models.depth import DepthNet
+    from saunet.prediction.prediction import Prediction
+    from saunet.prediction.predictor import Predictor
+    from saunet.prediction.tool import PredictOptions, predict
+    from saunet.reporting.tool import ReportOptions, report
+    from saunet.tools.benchmark.tool import BenchmarkOptions, benchmark
+    from saunet.tools.calibrate.tool import CalibrateOptions, calibrate
+    from saunet.tools.doctor.tool import DoctorOptions, doctor
+    from saunet.tools.prepare.tool import PrepareOptions, prepare
+    from saunet.training.tool import ModelOptions, TrainOptions, train
 
 __version__ = "0.1.0"
-
-_LAZY = {
-    "BenchmarkOptions": "tools.benchmark.tool",
-    "CalibrateOptions": "tools.calibrate.tool",
-    "DepthDataModule": "data.loading.module",
-    "DepthMetrics": "metrics.depth",
-    "DepthNet": "models.depth",
-    "DoctorOptions": "tools.doctor.tool",
-    "Drive": "data.drive",
-    "EvaluateOptions": "evaluation.tool",
-    "ExportOptions": "exporting.tool",
-    "ModelOptions": "training.tool",
-    "OdometryOptions": "evaluation.tool_odometry",
-    "PredictOptions": "prediction.tool",
-    "Prediction": "prediction.prediction",
-    "Predictor": "prediction.predictor",
-    "PrepareOptions": "tools.prepare.tool",
-    "ReportOptions": "reporting.tool",
-    "TrainOptions": "training.tool",
-    "automask": "losses.functional",
-    "backproject": "geometry.warp",
-    "benchmark": "tools.benchmark.tool",
-    "calibrate": "tools.calibrate.tool",
-    "combine_sources": "losses.functional",
-    "crop_intrinsics": "geometry.camera",
-    "disparity_to_depth": "geometry.depth",
-    "doctor": "tools.doctor.tool",
-    "evaluate": "evaluation.tool",
-    "export": "exporting.tool",
-    "flip_intrinsics": "geometry.camera",
-    "gradient_loss": "losses.functional",
-    "invert_pose": "geometry.pose",
-    "odometry": "evaluation.tool_odometry",
-    "photometric_error": "losses.functional",
-    "pose_matrix": "geometry.pose",
-    "predict": "prediction.tool",
-    "prepare": "tools.prepare.tool",
-    "project": "geometry.warp",
-    "report": "reporting.tool",
-    "scale_intrinsics": "geometry.camera",
-    "sigmoid_to_disparity": "geometry.depth",
-    "smoothness_loss": "losses.functional",
-    "ssim_loss": "losses.functional",
-    "synthesize": "geometry.warp",
-    "train": "training.tool",
-}
-"""Name -> the module that it is imported from when it is first used."""
 __all__ = [
-    "CheckpointError",
-    "ConfigError",
-    "DataError",
-    "SaunetError",
-    "Spec",
-    "__version__",
-    "attentions",
-    "available",
-    "build",
-    "datamodules",
-    "decoders",
-    "encoders",
-    "load",
-    "objectives",
-    "poses",
-    "terms",
-    *_LAZY,
-]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module 'saunet' has no attribute '{name}'")
-    value = getattr(importlib.import_module(f"saunet.{_LAZY[name]}"), name)
-    globals()[name] = value
-    return value
+    "BenchmarkOptions", "CalibrateOptions", "CheckpointError", "ConfigError", "DataError", "DepthDataModule",
+    "DepthMetrics", "DepthNet", "DoctorOptions", "Drive", "EvaluateOptions", "ExportOptions", "ModelOptions",
+    "OdometryOptions", "PredictOptions", "Prediction", "Predictor", "PrepareOptions", "ReportOptions", "SaunetError",
+    "Spec", "TrainOptions", "__version__", "attentions", "automask", "available", "backproject", "benchmark", "build",
+    "calibrate", "combine_sources", "crop_intrinsics", "datamodules", "decoders", "disparity_to_depth", "doctor",
+    "encoders", "evaluate", "export", "flip_intrinsics", "gradient_loss", "invert_pose", "load", "objectives",
+    "odometry", "photometric_error", "pose_matrix", "poses", "predict", "prepare", "project", "report",
+    "scale_intrinsics", "sigmoid_to_disparity", "smoothness_loss", "ssim_loss", "synthesize", "terms", "train",
+]  # fmt: skip
+__getattr__ = lazily(
+    __name__,
+    {
+        "data.drive": "Drive",
+        "data.loading.module": "DepthDataModule",
+        "evaluation": "EvaluateOptions OdometryOptions evaluate odometry",
+        "exporting.tool": "ExportOptions export",
+        "geometry.camera": "crop_intrinsics flip_intrinsics scale_intrinsics",
+        "geometry.depth": "disparity_to_depth sigmoid_to_disparity",
+        "geometry.pose": "invert_pose pose_matrix",
+        "geometry.warp": "backproject project synthesize",
+        "losses.functional": "automask combine_sources gradient_loss photometric_error smoothness_loss ssim_loss",
+        "metrics.depth": "DepthMetrics",
+        "models.depth": "DepthNet",
+        "prediction.prediction": "Prediction",
+        "prediction.predictor": "Predictor",
+        "prediction.tool": "PredictOptions predict",
+        "reporting.tool": "ReportOptions report",
+        "tools.benchmark.tool": "BenchmarkOptions benchmark",
+        "tools.calibrate.tool": "CalibrateOptions calibrate",
+        "tools.doctor.tool": "DoctorOptions doctor",
+        "tools.prepare.tool": "PrepareOptions prepare",
+        "training.tool": "ModelOptions TrainOptions train",
+    },
+)
 
 
 def __dir__() -> list[str]:

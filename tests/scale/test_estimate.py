@@ -14,8 +14,7 @@ from saunet.errors import ConfigError, DataError
 from saunet.geometry.pose import pose_matrix
 from saunet.runs.record import Scale
 from saunet.scale import MetricDepth, MetricMotion, ScaleEstimate, estimate_scale
-from saunet.scale.clips import clip_batches
-from saunet.scale.speeds import read_speeds
+from saunet.scale.recorded import clip_batches, read_speeds
 from saunet.types import DepthPyramid
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from saunet.geometry.pose import pose_matrix
-from saunet.scale.factors import height_factors, speed_factors, stereo_factors
+from saunet.scale.estimate import height_factors, speed_factors, stereo_factors
 from saunet.synthetic import SyntheticDrive
 
 UNKNOWN = 0.042  # what the true depth is multiplied by before anything looks at it

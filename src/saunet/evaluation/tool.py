@@ -40,7 +40,7 @@ from saunet.runs.checkpoint import store_scale
 from saunet.runs.record import ModelRecord, Scale
 from saunet.scale import MetricDepth, MetricMotion, ScaleEstimate, estimate_scale
 from saunet.scale.options import ScaleOptions
-from saunet.scale.speeds import read_speeds
+from saunet.scale.recorded import read_speeds
 from saunet.types import EvalBatch
 from saunet.weights.files import read_model
 from saunet.weights.locate import shipped

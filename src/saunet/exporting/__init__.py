@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from saunet.lazy import lazily
 
 if TYPE_CHECKING:
     from saunet.exporting.tool import ExportOptions, ExportResult, export
 
 __all__ = ["ExportOptions", "ExportResult", "export"]
-
-
-def __getattr__(name: str) -> Any:
-    """Import on first use: prediction with an exported model must not pay for torch."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.tool"), name)
+__getattr__ = lazily(__name__, {"tool": "ExportOptions ExportResult export"})

@@ -61,8 +61,7 @@ def apply_scale(
 def _batches(
     options: ScaleOptions, predictor: ImagePredictor, source: Input, camera: Camera | None, offsets: Sequence[int]
 ) -> Iterator[Iterator[TrainBatch]]:
-    from saunet.scale.clips import clip_batches
-    from saunet.scale.speeds import read_speeds
+    from saunet.scale.recorded import clip_batches, read_speeds
 
     method = options.method
     if camera_number(source) is not None:

@@ -1,4 +1,4 @@
-"""From factors of single frames to one factor for a model, with how far the frames agree."""
+"""One factor a frame from what is known in meters, and one for a model, with how far the frames agree."""
 
 from __future__ import annotations
 
@@ -7,20 +7,32 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
-from torch import Tensor
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from saunet.errors import ConfigError, DataError, one_of, positive
+from saunet.geometry.ground import fit_ground
 from saunet.runs.record import Scale
-from saunet.scale.factors import height_factors, speed_factors, stereo_factors
 from saunet.scale.options import METHODS
-from saunet.types import TrainBatch
+from saunet.types import DepthPyramid, TrainBatch
 
 DepthOf = Callable[[Tensor], Tensor]
 """Gives the depth (b 1 h w, any unit) of images (b 3 h w)."""
 MotionOf = Callable[[Tensor, Tensor], Tensor]
 """Gives T_src_tgt (b s 4 4, the depth's unit) of targets (b 3 h w) and sources (b s 3 h w)."""
+
+MIN_SUPPORT = 0.4
+"""Fraction of the road region that must lie on the plane; with less, a frame's plane is not taken for the road."""
+MIN_DISTANCE = 0.1
+"""Meters traveled below which a frame says nothing about scale: the motion drowns in its error."""
+MIN_MATCHES = 100
+"""Pixels of a stereo pair that must be matched."""
+_MIN_DISPARITY = 1.5  # pixels; an eighth of a pixel of matching error is then 8 % of depth at most
+_LARGEST_DISPARITY = 0.15  # of the image's width
 
 _WHY_NOT = {
     "camera_height": "in none of the {count} frames the lower part of the depth map is a level plane; the road is not "
@@ -36,7 +48,6 @@ class ScaleEstimate:
     """The factor to meters that many frames agree on, and how well they do."""
 
     method: str
-    """One of `METHODS`."""
     source: str
     """What it follows from, such as ``camera height 1.65 m``."""
     names: tuple[str, ...]
@@ -59,12 +70,12 @@ class ScaleEstimate:
 
     @property
     def spread(self) -> float:
-        """Standard deviation over frames, as a share of the median."""
+        """Standard deviation over frames, as a fraction of the median."""
         return float(np.std(self.factors)) / self.factor
 
     @property
     def uncertainty(self) -> float:
-        """Standard error of the median for independent frames, as a share of it; NaN for a single frame."""
+        """Standard error of the median for independent frames, as a fraction of it; NaN for a single frame."""
         count = len(self.factors)
         return 1.2533 * self.spread * math.sqrt(count / (count - 1)) / math.sqrt(count) if count > 1 else math.nan
 
@@ -89,13 +100,12 @@ class ScaleEstimate:
 
     def __str__(self) -> str:
         low, high = self.quartiles
+        count = len(self.factors)
         rest = f" ({self.left_out} more could not be measured)" if self.left_out else ""
-        known = (
-            f"known to about {100 * self.uncertainty:.1g} %" if len(self.factors) > 1 else "one frame shows no spread"
-        )
-        more = "; measure on more frames" if len(self.factors) < 10 else ""
+        known = f"known to about {100 * self.uncertainty:.1g} %" if count > 1 else "one frame shows no spread"
+        more = "; measure on more frames" if count < 10 else ""
         return (
-            f"scale {self.factor:.4g} from {self.source}: median of {len(self.factors)} frames{rest}, "
+            f"scale {self.factor:.4g} from {self.source}: median of {count} frames{rest}, "
             f"middle half {low:.4g} to {high:.4g}, std/median {100 * self.spread:.1f} %, {known}{more}"
         )
 
@@ -124,18 +134,15 @@ def estimate_scale(
     """
     one_of("scale.method", method, METHODS)
     source, measure = _measurement(method, depth, motion, camera_height)
-    names: list[str] = []
-    factors: list[float] = []
+    names, factors = list[str](), list[float]()
     for batch in batches:
         names += batch["name"]
         factors += measure(batch).tolist()
-    usable = [math.isfinite(factor) and factor > 0 for factor in factors]
-    if not any(usable):
+    usable = [(n, f) for n, f in zip(names, factors, strict=True) if math.isfinite(f) and f > 0]
+    if not usable:
         raise DataError(f"the scale cannot be measured by {method}: {_WHY_NOT[method].format(count=len(factors))}")
-    kept = [(name, factor) for name, factor, good in zip(names, factors, usable, strict=True) if good]
-    return ScaleEstimate(
-        method, source, tuple(name for name, _ in kept), tuple(factor for _, factor in kept), len(names) - len(kept)
-    )
+    kept_names, kept = zip(*usable, strict=True)
+    return ScaleEstimate(method, source, kept_names, kept, len(names) - len(kept))
 
 
 def _measurement(
@@ -159,3 +166,83 @@ def _measurement(
     return "stereo baseline", lambda batch: stereo_factors(
         depth(batch["target"]), batch["target"], batch["sources"][:, -1], batch["K"], batch["T_stereo_tgt"]
     )
+
+
+def height_factors(
+    depth: Float[Tensor, "b 1 h w"], K: Float[Tensor, "b 3 3"], camera_height: float
+) -> Float[Tensor, " b"]:
+    """Camera height in meters over its height above the road in the predicted depth; NaN where no road is found."""
+    plane = fit_ground(depth, K)
+    return torch.where(plane.support >= MIN_SUPPORT, camera_height / plane.height, math.nan)
+
+
+def speed_factors(T_src_tgt: Float[Tensor, "b s 4 4"], distance: Float[Tensor, "b s"]) -> Float[Tensor, " b"]:
+    """Meters traveled over the predicted motion, all sources of a frame together; NaN where unknown or standing."""
+    predicted = torch.linalg.vector_norm(T_src_tgt[..., :3, 3].double(), dim=-1)
+    counts = distance.isfinite() & (distance >= MIN_DISTANCE)
+    meters, length = (torch.where(counts, values, 0.0).sum(1) for values in (distance.double(), predicted))
+    return torch.where((meters > 0) & (length > 0), meters / length, math.nan).to(distance)
+
+
+def stereo_factors(
+    depth: Float[Tensor, "b 1 h w"],
+    image: Float[Tensor, "b 3 h w"],
+    partner: Float[Tensor, "b 3 h w"],
+    K: Float[Tensor, "b 3 3"],
+    T_stereo_tgt: Float[Tensor, "b 4 4"],
+) -> Float[Tensor, " b"]:
+    """Median of depth by stereo matching over predicted depth; NaN where too few pixels match."""
+    factors = []
+    for i in range(len(depth)):
+        across = float(T_stereo_tgt[i, 0, 3])
+        disparity = _match(_gray(image[i]), _gray(partner[i]), partner_is_left=across > 0)
+        found = disparity >= _MIN_DISPARITY
+        predicted = depth[i, 0].detach().double().cpu().numpy()
+        ratios = (float(K[i, 0, 0]) * abs(across) / disparity[found]) / predicted[found]
+        factors.append(float(np.median(ratios)) if found.sum() >= MIN_MATCHES else math.nan)
+    return depth.new_tensor(factors)
+
+
+def _match(image: NDArray[np.uint8], partner: NDArray[np.uint8], partner_is_left: bool) -> NDArray[np.float64]:
+    """Return the disparity of ``image`` by semi-global matching, pixels, 0 or less where unknown."""
+    if partner_is_left:  # matching goes from the left image to the right one
+        return _match(image[:, ::-1], partner[:, ::-1], False)[:, ::-1]
+    block = 3 if image.shape[1] < 400 else 5
+    count = 16 * max(1, round(_LARGEST_DISPARITY * image.shape[1] / 16))
+    smoothness = {"P1": 8 * block**2, "P2": 32 * block**2}
+    checks = {"disp12MaxDiff": 1, "uniquenessRatio": 10, "speckleWindowSize": 50, "speckleRange": 2}
+    matcher = cv2.StereoSGBM.create(0, count, block, mode=cv2.STEREO_SGBM_MODE_HH, **smoothness, **checks)
+    disparity = matcher.compute(np.ascontiguousarray(image), np.ascontiguousarray(partner))
+    return np.asarray(disparity, np.float64) / 16
+
+
+def _gray(image: Float[Tensor, "3 h w"]) -> NDArray[np.uint8]:
+    picture = (image.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+class MetricDepth(nn.Module):
+    """A depth network with its scale applied: image to disparity in 1/meter."""
+
+    def __init__(self, network: nn.Module, scale: Scale) -> None:
+        super().__init__()
+        self.network, self.scale = network, scale
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+        pyramid: DepthPyramid = self.network(image)
+        return pyramid.disparity[0] / self.scale.factor
+
+
+class MetricMotion(nn.Module):
+    """A pose network with the scale of its depth network applied: frames to T_src_tgt in meters."""
+
+    def __init__(self, network: nn.Module, scale: Scale) -> None:
+        super().__init__()
+        self.network, self.scale = network, scale
+
+    def forward(
+        self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b s 3 h w"]
+    ) -> Float[Tensor, "b s 4 4"]:
+        T: Tensor = self.network(target, sources).clone()
+        T[..., :3, 3] *= self.scale.factor
+        return T

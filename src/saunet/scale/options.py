@@ -66,11 +66,9 @@ class ScaleOptions:
 
     def chosen(self, known: Scale | None) -> Scale | None:
         """Return the scale to apply, given the measured or stored one."""
-        if self.method == "none":
-            return None
         if self.method == "stored" and known is None:
             raise ConfigError(
                 "scale.method=stored and the checkpoint stores no scale; measure one, "
                 "such as with scale.method=camera_height, and keep it with scale.store=true"
             )
-        return known
+        return None if self.method == "none" else known
