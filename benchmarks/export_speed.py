@@ -23,7 +23,8 @@ from saunet.exporting.exporters import export_onnx, run_eager, run_onnx
 from saunet.exporting.parity import milliseconds
 from saunet.io.images import write_image
 from saunet.registry import REGISTRIES
-from saunet.runs.checkpoint import ModelRecord, atomic_save, build_networks
+from saunet.runs.checkpoint import atomic_save, build_networks
+from saunet.runs.record import ModelRecord
 
 MODELS = ("resnet18+unet", "stratified_nano+aunet")
 START = "import sys, saunet; saunet.load(sys.argv[1]).predict(sys.argv[2]); print('torch' in sys.modules)"

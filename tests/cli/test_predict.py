@@ -17,7 +17,8 @@ import saunet
 from saunet.io.images import read_image
 from saunet.io.video import VideoReader, VideoWriter
 from saunet.prediction.pointcloud import Camera, point_cloud, write_ply
-from saunet.runs.checkpoint import ModelRecord, atomic_save, build_networks
+from saunet.runs.checkpoint import atomic_save, build_networks
+from saunet.runs.record import ModelRecord
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,8 @@ from saunet.io.images import write_image
 from saunet.models.depth import DepthNet
 from saunet.prediction.predictor import Predictor
 from saunet.registry import decoders, encoders
-from saunet.runs.checkpoint import ModelRecord, Scale, atomic_save, build_networks
+from saunet.runs.checkpoint import atomic_save, build_networks
+from saunet.runs.record import ModelRecord, Scale
 
 Picture = NDArray[np.uint8]
 Node = Callable[..., dict[str, Any]]

@@ -12,7 +12,8 @@ import yaml
 
 from saunet.fingerprint import fingerprint
 from saunet.metrics.functional import ERROR_NAMES
-from saunet.runs.checkpoint import ModelRecord, atomic_save, build_networks
+from saunet.runs.checkpoint import atomic_save, build_networks
+from saunet.runs.record import ModelRecord
 
 ERRORS = (0.2, 1.5, 6.0, 0.3, 0.7, 0.9, 0.95)
 ENCODERS = {

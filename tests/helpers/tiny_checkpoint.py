@@ -10,7 +10,8 @@ from torch import nn
 
 from saunet.cli.compose import structured
 from saunet.registry import REGISTRIES
-from saunet.runs.checkpoint import ModelRecord, atomic_save, build_networks
+from saunet.runs.checkpoint import atomic_save, build_networks
+from saunet.runs.record import ModelRecord
 
 
 def _node(kind: str, name: str) -> dict[str, Any]:

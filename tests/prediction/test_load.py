@@ -17,7 +17,8 @@ import torch
 import saunet
 from saunet.errors import CheckpointError, ConfigError
 from saunet.prediction.pointcloud import Camera
-from saunet.runs.checkpoint import ModelRecord, atomic_save, build_networks
+from saunet.runs.checkpoint import atomic_save, build_networks
+from saunet.runs.record import ModelRecord
 from saunet.weights.files import read_model, write_safetensors
 from saunet.weights.locate import locate
 

@@ -16,8 +16,8 @@ from saunet.errors import CheckpointError, ConfigError, DataError
 from saunet.io.images import write_image
 from saunet.models.depth import DepthNet
 from saunet.prediction.predictor import Predictor
-from saunet.runs.checkpoint import ModelRecord, atomic_save, build_networks
-from saunet.runs.record import Scale
+from saunet.runs.checkpoint import atomic_save, build_networks
+from saunet.runs.record import ModelRecord, Scale
 
 Picture = NDArray[np.uint8]
 

@@ -17,7 +17,8 @@ import torch
 from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, ConfigError
-from saunet.runs.checkpoint import ModelRecord, Scale, atomic_save, build_networks, load_weights, read_checkpoint
+from saunet.runs.checkpoint import atomic_save, build_networks, load_weights, read_checkpoint
+from saunet.runs.record import ModelRecord, Scale
 
 Node = Callable[..., dict[str, Any]]
 

@@ -85,7 +85,7 @@ def test_a_run_that_vanished_is_marked_failed_once(tmp_path: Path) -> None:
     assert "killed" in content(tmp_path)["error"]
     assert not mark_lost(tmp_path)
     (tmp_path / "run.json").write_text("half a rec")
-    assert read(tmp_path) is None
+    assert read(tmp_path) == {}
     assert not mark_lost(tmp_path / "nowhere")
 
 

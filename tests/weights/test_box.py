@@ -18,7 +18,8 @@ import saunet
 from saunet.errors import CheckpointError, ConfigError, DataError
 from saunet.exporting import box
 from saunet.exporting.box import Rounding, pack
-from saunet.runs.checkpoint import ModelRecord, Scale, atomic_save, build_networks, read_checkpoint
+from saunet.runs.checkpoint import atomic_save, build_networks, read_checkpoint
+from saunet.runs.record import ModelRecord, Scale
 from saunet.weights import locate as locating
 from saunet.weights.files import read_model
 from saunet.weights.locate import BOX, locate, shipped

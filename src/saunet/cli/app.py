@@ -249,8 +249,8 @@ def resumed(words: Sequence[str]) -> list[str]:
     from saunet.runs.folder import read
 
     folder = Path(words[0]).absolute() if words else Path()
-    content = read(folder) if words else None
-    if content is None:
+    content = read(folder) if words else {}
+    if not content:
         raise ConfigError(
             f"saunet resume takes the folder of a run, with its run.json; got {' '.join(words) or 'none'}"
         )

@@ -12,8 +12,18 @@ from typing import Any
 from saunet.errors import CheckpointError, DataError, one_of
 from saunet.io.torch_files import read_plain
 from saunet.metrics.functional import ERROR_NAMES
-from saunet.runs.files import read_json, read_mapping
-from saunet.runs.folder import Explained, Run, Score, Status, began, home, read_run, split_overrides
+from saunet.runs.folder import (
+    Explained,
+    Run,
+    Score,
+    Status,
+    began,
+    home,
+    read_hydra,
+    read_mapping,
+    read_run,
+    split_overrides,
+)
 
 Jobs = Callable[[Path], "list[list[str]] | None"]
 """Returns the overrides of every job that a sweep folder was to hold; None where that cannot be told."""
@@ -147,9 +157,9 @@ def _find(path: Path, depth: int = 3) -> list[tuple[str, Path]]:
 def _read_sweep(folder: Path, checkpoint: str, jobs: Jobs | None) -> Sweep:
     found: dict[int, Run] = {}
     for place in sorted(path.parent for path in folder.rglob(".hydra") if path.is_dir()):
-        if "optim" not in read_mapping(place / ".hydra" / "config.yaml"):
+        config, hydra = read_hydra(place)
+        if "optim" not in config:
             continue  # an evaluation inside a run
-        hydra = read_mapping(place / ".hydra" / "hydra.yaml").get("hydra") or {}
         number = (hydra.get("job") or {}).get("num")
         number = number if isinstance(number, int) and number not in found else len(found)
         led = home(place)
@@ -203,10 +213,7 @@ class Evaluation:
 
 def read_evaluation(folder: Path) -> Evaluation:
     """Read the scores of an evaluation and find out which checkpoint they belong to."""
-    content: Any = read_json(folder / "metrics.json")
-    content = content if isinstance(content, dict) else {}
-    config = read_mapping(folder / ".hydra" / "config.yaml")
-    hydra = read_mapping(folder / ".hydra" / "hydra.yaml").get("hydra") or {}
+    content, (config, hydra) = read_mapping(folder / "metrics.json"), read_hydra(folder)
     runtime = hydra.get("runtime") or {}
     settings = content.get("settings")  # all there is where `output_dir` led the results out of the run's folder
     settings = settings if isinstance(settings, dict) else {}

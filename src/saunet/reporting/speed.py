@@ -10,16 +10,14 @@ from saunet.published import published
 from saunet.reporting.groups import Groups, chosen, comparable
 from saunet.reporting.page import Missing
 from saunet.reporting.scenes import Seen
-from saunet.runs.files import read_json
-from saunet.runs.folder import Run
+from saunet.runs.folder import Run, read_mapping
 from saunet.tables import Column, Row, Table
 from saunet.tables.drawing import Point
 
 
 def read_benchmark(folder: Path) -> list[dict[str, object]]:
     """Return the measurements of a ``benchmark.json``."""
-    content = read_json(folder / "benchmark.json")
-    rows = content.get("results") if isinstance(content, dict) else None
+    rows = read_mapping(folder / "benchmark.json").get("results")
     keys = ("model", "size", "device", "precision", "mode", "batch_size", "depth_parameters", "median")
     if not isinstance(rows, list) or not all(isinstance(row, dict) and all(key in row for key in keys) for row in rows):
         raise DataError(f"{folder / 'benchmark.json'} is not a result of saunet benchmark; measure again")

@@ -1,7 +1,6 @@
-"""What a trained model is on disk: weights beside a plain record of the architecture; reading runs nothing of it.
+"""A trained model on disk: ``state_dict`` (keys ``depth.*`` and ``pose.*``) beside ``saunet``, the plain `ModelRecord`.
 
-A checkpoint is a dictionary with ``state_dict`` (keys ``depth.*`` and ``pose.*``) and ``saunet``, the `ModelRecord` as
-plain containers. It is read with ``weights_only=True``, and only registered components are ever built from it.
+It is read with ``weights_only=True``, and only registered components are ever built from it: reading runs nothing.
 """
 
 from __future__ import annotations
@@ -21,17 +20,6 @@ from saunet.models.depth import DepthNet
 from saunet.registry import instantiate
 from saunet.runs.record import ModelRecord, Scale
 
-__all__ = [
-    "Checkpoint",
-    "ModelRecord",
-    "Scale",
-    "atomic_save",
-    "build_networks",
-    "load_weights",
-    "read_checkpoint",
-    "store_scale",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
@@ -47,16 +35,12 @@ class Checkpoint:
     """All else that the file holds: what a training needs to be resumed."""
 
     def weights(self, part: str) -> dict[str, Tensor]:
-        """Return the weights of ``"depth"`` or ``"pose"``, without prefix and without what ``torch.compile`` adds."""
+        """Return the weights of ``"depth"`` or ``"pose"`` without prefix, and without what ``torch.compile`` adds."""
         named = {key.replace("_orig_mod.", ""): value for key, value in self.state.items()}
         return {key[len(part) + 1 :]: value for key, value in named.items() if key.startswith(f"{part}.")}
 
     def networks(self) -> tuple[DepthNet, nn.Module | None]:
-        """Build the recorded networks and give them the file's weights.
-
-        Raises:
-            CheckpointError: if the architecture cannot be built or the weights do not fit it.
-        """
+        """Build the recorded networks, depth and pose, and give them the file's weights."""
         try:
             depth, pose = build_networks(self.record)
             load_weights(depth, self.weights("depth"), "depth network")
@@ -70,26 +54,23 @@ class Checkpoint:
 def build_networks(record: ModelRecord, pretrained: bool = False) -> tuple[DepthNet, nn.Module | None]:
     """Build the networks that a record describes; the global random state is left as it was.
 
-    Args:
-        record: The description.
-        pretrained: Start from the public weights that the record names, which may have to be fetched. False draws all
-            weights at random: enough where a checkpoint's are loaded next.
-
-    Returns:
-        The depth network, and the pose network where the record has one.
+    With ``pretrained`` they start from the public weights that the record names, which may have to be fetched.
+    Otherwise no file makes us fetch another: enough where a checkpoint's weights are loaded next.
 
     Raises:
         CheckpointError: if a component is not registered, or public weights cannot be had.
         ConfigError: if a component refuses its recorded parameters.
     """
     record.check_registered()
+
+    def started(node: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in node.items() if pretrained or key != "weights"}
+
     with torch.random.fork_rng(devices=[]):
         try:
-            encoder = instantiate(record.encoder if pretrained else _without_pretraining(record.encoder))
-            decoder = instantiate({**record.decoder, "_partial_": True})
+            encoder, decoder = instantiate(started(record.encoder)), instantiate({**record.decoder, "_partial_": True})
             depth = DepthNet(encoder, decoder, record.min_depth, record.max_depth)
-            node = record.pose if pretrained or record.pose is None else _without_pretraining(record.pose)
-            pose = instantiate(node) if node is not None else None
+            pose = instantiate(started(record.pose)) if record.pose is not None else None
         except (CheckpointError, ConfigError):
             raise
         except (TypeError, ValueError, RuntimeError) as reason:
@@ -97,22 +78,8 @@ def build_networks(record: ModelRecord, pretrained: bool = False) -> tuple[Depth
     return depth, pose
 
 
-def _without_pretraining(node: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out what training started from: it is in the file already, and no file makes us fetch another."""
-    return {key: value for key, value in node.items() if key != "weights"}
-
-
 def load_weights(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
-    """Give ``module`` the weights ``state``, all of them, or change nothing.
-
-    Args:
-        module: The network.
-        state: Weights by name.
-        what: What the module is, for the message.
-
-    Raises:
-        CheckpointError: if names or shapes differ; the message names the first of each.
-    """
+    """Give ``module`` all weights of ``state``, or change nothing and name the first of each that differs."""
     expected = module.state_dict()
     differences = []
     missing, extra = sorted(expected.keys() - state.keys()), sorted(state.keys() - expected.keys())
@@ -138,11 +105,8 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     """
     path = Path(path)
     content = _load_plain(path)
-    if (
-        not isinstance(content, Mapping)
-        or "saunet" not in content
-        or not isinstance(content.get("state_dict"), Mapping)
-    ):
+    content = content if isinstance(content, Mapping) else {}
+    if "saunet" not in content or not isinstance(content.get("state_dict"), Mapping):
         raise CheckpointError(
             f"{path} is not a saunet checkpoint (no model record and weights); give a file written by saunet train"
         )
@@ -157,11 +121,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def store_scale(path: str | Path, scale: Scale) -> None:
-    """Write a measured factor to meters into a checkpoint; everything else in the file stays as it is.
-
-    Raises:
-        CheckpointError: if the file is no saunet checkpoint or cannot be written; it then stays as it was.
-    """
+    """Write a measured factor to meters into a checkpoint; everything else in the file stays as it is."""
     read_checkpoint(path)
     content = _load_plain(Path(path))
     content["saunet"]["scale"] = asdict(scale)
@@ -169,11 +129,7 @@ def store_scale(path: str | Path, scale: Scale) -> None:
 
 
 def atomic_save(obj: Any, path: str | Path) -> None:
-    """Save plain data and tensors to ``path``, whole or not at all.
-
-    Raises:
-        CheckpointError: if the system refuses; nothing is left behind and an older file stays as it was.
-    """
+    """Save plain data and tensors, whole or not at all: if the system refuses, an older file stays as it was."""
     with replacing(path, CheckpointError) as temporary:
         try:
             with temporary.open("wb") as stream:

@@ -5,6 +5,7 @@ A run that is killed leaves ``running`` behind with its process number; every ot
 
 from __future__ import annotations
 
+import csv
 import math
 import os
 import platform
@@ -22,9 +23,9 @@ from typing import Any, Literal
 
 from saunet import __version__
 from saunet.errors import ConfigError, SaunetError
+from saunet.io import plain
 from saunet.io.atomic import process_lives, write_json
 from saunet.metrics.functional import ERROR_NAMES, RISING
-from saunet.runs.files import read_json, read_mapping, read_numbers, read_yaml
 
 try:
     import fcntl
@@ -36,12 +37,12 @@ LOCK = ".lock"
 PACKAGES = ("torch", "lightning", "torchmetrics", "numpy", "hydra-core", "kornia", "opencv-python-headless")
 """Libraries whose versions can change what a training computes."""
 Status = Literal["finished", "running", "failed", "interrupted", "unfinished", "unknown"]
-BROKEN: tuple[Status, ...] = ("failed", "interrupted", "unfinished")
-"""How a run can end without having trained to its end."""
 SUBJECTS = ("model", "predictions")
 """What an evaluation calls what it scores: a checkpoint's network, or another system's files."""
 SIGN_OF_LIFE = 600.0
 """Seconds: a run on another machine that wrote nothing for so long does not run any more."""
+Describe = Callable[[Exception], "str | None"]
+"""Says in one sentence what went wrong; None for a defect of the program."""
 
 
 class Stopped(SystemExit):
@@ -87,23 +88,14 @@ class RunRecord:
         }
 
     def start(self) -> None:
-        """Write the file, in place of one that an earlier run in this folder left.
-
-        Raises:
-            ConfigError: if the folder cannot be written to.
-        """
+        """Write the file, in place of one that an earlier run in this folder left."""
         if first_process():
-            _write(self.path.parent, self.content)
+            write_json(self.path, self.content, ConfigError)
 
     def write(self, **changes: Any) -> None:
-        """Change keys of the file; what other processes of the run wrote stays.
-
-        Raises:
-            ConfigError: if the folder cannot be written to.
-        """
-        self.content = {**self.content, **(read(self.path.parent) or {}), **_finite(changes)}
-        if first_process():
-            _write(self.path.parent, self.content)
+        """Change keys of the file; what other processes of the run wrote stays."""
+        self.content = {**self.content, **read(self.path.parent), **_finite(changes)}
+        self.start()
 
     def end(self, status: Status, error: str | None = None) -> None:
         """Say how the run ended."""
@@ -112,19 +104,9 @@ class RunRecord:
 
 @contextmanager
 def recording(
-    folder: str | Path,
-    name: str,
-    describe: Callable[[Exception], str | None] = lambda error: None,
-    **known: Any,
+    folder: str | Path, name: str, describe: Describe = lambda error: None, **known: Any
 ) -> Iterator[RunRecord]:
-    """Keep ``run.json`` while the block runs, however it ends.
-
-    Args:
-        folder: The run's folder.
-        name: The run's name.
-        describe: Says in one sentence what went wrong, or None for a defect of the program.
-        known: What is known of the run at its start, by key of the file.
-    """
+    """Keep ``run.json`` while the block runs, however it ends; for ``known`` see `RunRecord`."""
     record = RunRecord(folder, name, **known)
     try:
         record.start()
@@ -139,9 +121,7 @@ def recording(
     record.end("finished")
 
 
-def record_failed_start(
-    folder: str | Path, name: str, error: Exception, describe: Callable[[Exception], str | None], **known: Any
-) -> None:
+def record_failed_start(folder: str | Path, name: str, error: Exception, describe: Describe, **known: Any) -> None:
     """Write down why a job of a sweep did not start, unless its folder has a record already."""
     record = RunRecord(folder, name, **known)
     if not record.path.exists():
@@ -149,7 +129,7 @@ def record_failed_start(
             record.end("failed", _sentence(error, describe))
 
 
-def _sentence(error: Exception, describe: Callable[[Exception], str | None]) -> str:
+def _sentence(error: Exception, describe: Describe) -> str:
     sentence = str(error) if isinstance(error, SaunetError) else describe(error)
     return sentence or " ".join(f"{type(error).__name__}: {error}".split())[:500]
 
@@ -159,9 +139,6 @@ def locked(folder: str | Path) -> Iterator[None]:
     """Make a run's folder and hold it, so that no second run writes there; the lock dies with its process.
 
     Of the processes of one run, the first one holds it.
-
-    Raises:
-        ConfigError: if another run holds it, or the folder cannot be made.
     """
     path = Path(folder) / LOCK
     if fcntl is None or not first_process():
@@ -178,8 +155,8 @@ def locked(folder: str | Path) -> Iterator[None]:
             fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except (BlockingIOError, PermissionError) as reason:
             file.close()
-            pid = (read(folder) or {}).get("pid")
-            of = f" (process {pid} on {(read(folder) or {}).get('host')})" if pid else ""
+            other = read(folder)
+            of = f" (process {other['pid']} on {other.get('host')})" if other.get("pid") else ""
             raise ConfigError(
                 f"another run{of} is writing to {folder}; wait until it ends, or choose another output_dir"
             ) from reason
@@ -197,10 +174,9 @@ def locked(folder: str | Path) -> Iterator[None]:
         file.close()
 
 
-def read(folder: str | Path) -> dict[str, Any] | None:
-    """Return the record of a run's folder; None where there is none that can be read."""
-    content = read_json(Path(folder) / FILE)
-    return content if isinstance(content, dict) else None
+def read(folder: str | Path) -> dict[str, Any]:
+    """Return the record of a run's folder; empty where there is none that can be read."""
+    return read_mapping(Path(folder) / FILE)
 
 
 def mark_lost(
@@ -208,9 +184,9 @@ def mark_lost(
 ) -> bool:
     """Mark a run as failed that still claims to run though nobody runs it; return whether it did."""
     content = read(folder)
-    if content is None or content.get("status") != "running":
+    if content.get("status") != "running":
         return False
-    _write(Path(folder), {**content, "status": "failed", "error": error, "ended": _now()})
+    write_json(Path(folder) / FILE, {**content, "status": "failed", "error": error, "ended": _now()}, ConfigError)
     return True
 
 
@@ -232,29 +208,25 @@ def versions() -> dict[str, str]:
 
 
 def git_state(file: str | Path = __file__) -> Mapping[str, Any] | None:
-    """Return the commit that the code belongs to, and whether it was changed since; None outside a checkout.
+    """Return the commit that a file of the code belongs to, and whether tracked files were changed since.
 
-    Args:
-        file: A file of the code; it counts only if git tracks it, so a package installed below another project's
-            folder does not take that project's commit for its own.
+    None where git does not track the file: a package installed below another project's folder does not take that
+    project's commit for its own.
     """
+    file = Path(file).resolve()
 
     def git(*arguments: str) -> str | None:
-        command = ["git", "-C", str(Path(file).resolve().parent), *arguments]
+        command = ["git", "-C", str(file.parent), *arguments]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
         except (OSError, subprocess.SubprocessError):
             return None
         return done.stdout.strip() if done.returncode == 0 else None
 
-    if git("ls-files", "--error-unmatch", str(Path(file).resolve())) is None:
+    if git("ls-files", "--error-unmatch", str(file)) is None:
         return None
     commit, changes = git("rev-parse", "HEAD"), git("status", "--porcelain", "--untracked-files=no")
     return {"commit": commit, "dirty": bool(changes)} if commit else None
-
-
-def _write(folder: Path, content: Mapping[str, Any]) -> None:
-    write_json(folder / FILE, content, ConfigError)
 
 
 def _finite(value: Any) -> Any:
@@ -305,15 +277,13 @@ class Explained:
     condition: str
     images: int
     warped: float
-    """Photometric error after warping the neighbors, SAU-Net eqs. (8) to (10)."""
+    """Photometric error after warping the neighbors, SAU-Net eqs. (8) to (10); ``unwarped``: the same without."""
     unwarped: float
-    """The same without warping."""
     explained: float
-    """Share of pixels that warping brings closer."""
+    """Fraction of pixels that warping brings closer."""
     fingerprint: str = ""
-    """SHA-256 of the names of the images of all conditions; empty where it was not recorded."""
+    """Of the images of all conditions, as in `Score`; so is ``how``."""
     how: str = ""
-    """Settings that change the numbers, as in `Score`."""
 
 
 @dataclass(frozen=True)
@@ -346,37 +316,28 @@ class Run:
     def seconds(self) -> float | None:
         """How long it took, by its own record."""
         try:
-            ends = [datetime.fromisoformat(self.record[key]) for key in ("started", "ended")]
+            began, ended = (datetime.fromisoformat(self.record[key]) for key in ("started", "ended"))
         except (KeyError, TypeError, ValueError):
             return None
-        return (ends[1] - ends[0]).total_seconds()
+        return (ended - began).total_seconds()
 
     def component(self, slot: str) -> str:
         """Return the registered name of what fills ``model/encoder``, ``objective`` and so on; its class if unknown."""
-        if slot in self.choices:
-            return self.choices[slot]
-        node: Any = self.config
-        for key in slot.split("/"):
-            node = node.get(key) if isinstance(node, Mapping) else None
-        target = node.get("_target_", "") if isinstance(node, Mapping) else ""
-        return str(target).rpartition(".")[2]
+        target = _at(self.config, [*slot.split("/"), "_target_"], "")
+        return self.choices.get(slot) or str(target).rpartition(".")[2]
 
 
 def read_run(folder: Path, checkpoint: str = "best", job: int | None = None) -> Run:
-    """Read the folder of a training, whatever of it there is.
+    """Read whatever there is in the folder of a training.
 
-    Args:
-        folder: The run's folder.
-        checkpoint: Which of its checkpoints is wanted, ``best`` or ``last``; the other one where it is missing.
-        job: Its number in a sweep.
+    Of its checkpoints ``best`` or ``last`` is wanted, and the other one taken where it is missing.
     """
-    record = read(folder) or {}
-    hydra = read_mapping(folder / ".hydra" / "hydra.yaml").get("hydra") or {}
-    choices = record.get("choices") or (hydra.get("runtime") or {}).get("choices") or {}
-    config = record.get("config") or read_mapping(folder / ".hydra" / "config.yaml")
-    overrides = record.get("overrides") or read_yaml(folder / ".hydra" / "overrides.yaml") or []
+    record, (config, hydra) = read(folder), read_hydra(folder)
+    choices = record.get("choices") or _at(hydra, ["runtime", "choices"], {})
+    config = record.get("config") or config
+    overrides = record.get("overrides") or read_file(folder / ".hydra" / "overrides.yaml") or []
     status, error = _state(folder, record)
-    history = read_numbers(folder / "csv" / "metrics.csv")
+    history = _read_numbers(folder / "csv" / "metrics.csv")
     score = _validation(history, config, choices, record)
     files = [folder / "checkpoints" / f"{name}.ckpt" for name in (checkpoint, "best", "last")]
     return Run(
@@ -404,25 +365,28 @@ def home(folder: Path) -> Path:
     """Return where the run is whose config Hydra left in a folder: elsewhere where ``output_dir`` led it."""
     if began(folder):
         return folder
-    config = read_mapping(folder / ".hydra" / "config.yaml")
-    hydra = read_mapping(folder / ".hydra" / "hydra.yaml").get("hydra") or {}
+    config, hydra = read_hydra(folder)
 
     def looked_up(reference: re.Match[str]) -> str:
         if reference[0] == "${hydra:runtime.output_dir}":
             return str(folder)  # which may have been moved since
-        node: Any = hydra if reference[1] else config
-        for key in reference[2].split("."):
-            node = node.get(key) if isinstance(node, Mapping) else None
-        return reference[0] if node is None else str(node)
+        return str(_at(hydra if reference[1] else config, reference[2].split("."), reference[0]))
 
     given = re.sub(r"\$\{(hydra:)?([\w.]+)\}", looked_up, str(config.get("output_dir") or folder))
-    return Path((hydra.get("runtime") or {}).get("cwd") or "", given).resolve()
+    return Path(_at(hydra, ["runtime", "cwd"], ""), given).resolve()
 
 
 def split_overrides(overrides: Sequence[str]) -> dict[str, str]:
     """Return what ``key=value`` overrides set, without Hydra's leading ``+`` and ``~``."""
     pairs = [str(text).lstrip("+~").partition("=") for text in overrides]
     return {key: value for key, _, value in pairs}
+
+
+def _at(node: Any, keys: Sequence[str], default: Any) -> Any:
+    """Return what stands in nested mappings under these keys; the default where there is nothing."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, Mapping) else None
+    return default if node is None else node
 
 
 def _state(folder: Path, record: Mapping[str, Any]) -> tuple[Status, str | None]:
@@ -462,3 +426,40 @@ def _validation(
     protocol = str(record.get("protocol") or config.get("protocol") or "of the data")
     images, fingerprint = int(best.get("val/images", 0)), (record.get("splits") or {}).get("val", "")
     return Score("model", protocol, data, images, errors, validation=True, fingerprint=fingerprint)
+
+
+def read_file(path: Path) -> Any:
+    """Return what a JSON or YAML file holds; None if it is missing, or a killed run left it half-written."""
+    try:
+        return (plain.read_json if path.suffix == ".json" else plain.read_yaml)(path)
+    except (OSError, ValueError):
+        return None
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Return the mapping that a JSON or YAML file holds; an empty one where there is none."""
+    content = read_file(path)
+    return content if isinstance(content, dict) else {}
+
+
+def read_hydra(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the config that Hydra left in a folder, and what it wrote about itself."""
+    config, hydra = (read_mapping(folder / ".hydra" / f"{name}.yaml") for name in ("config", "hydra"))
+    return config, hydra.get("hydra") or {}
+
+
+def _read_numbers(path: Path) -> list[dict[str, float]]:
+    """Return the rows of a CSV file, each with the cells that hold a finite number."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [_numbers(row) for row in csv.DictReader(file)]
+    except (OSError, csv.Error, UnicodeDecodeError):
+        return []
+
+
+def _numbers(row: Mapping[str | Any, str | Any]) -> dict[str, float]:
+    found = {}
+    for key, text in row.items():
+        with suppress(TypeError, ValueError):  # an empty cell, or a line that was cut short
+            found[key] = float(text)
+    return {key: value for key, value in found.items() if math.isfinite(value)}

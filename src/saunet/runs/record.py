@@ -1,6 +1,6 @@
-"""The plain record of a model: everything but the weights that using it again needs, checked when it is read.
+"""The plain record of a model: all but the weights that using it again needs; reading it needs no torch.
 
-It stands under ``"saunet"`` in every checkpoint and as JSON beside every exported model. Reading it needs no torch.
+It stands under ``"saunet"`` in every checkpoint and as JSON beside every exported model.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from saunet.registry import find
 FORMAT = 1
 """Version of the record's layout; raised when an older reader would misunderstand a newer file."""
 
-_SLOTS = {"encoder": ("encoder",), "decoder": ("decoder",), "pose": ("pose",)}
-_NESTED = ("encoder", "decoder", "attention", "pose")
+_SLOTS = ("encoder", "decoder", "pose")
+_NESTED = (*_SLOTS, "attention")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,35 +36,25 @@ class Scale:
 
 @dataclass(frozen=True, slots=True)
 class ModelRecord:
-    """Everything but the weights that prediction needs, as plain data.
-
-    Args:
-        encoder: Config node of the depth encoder (``_target_`` and its parameters).
-        decoder: Config node of the depth decoder.
-        pose: Config node of the pose network; None where the model has none.
-        min_depth: Depth at sigmoid 1, meters up to scale.
-        max_depth: Depth at sigmoid 0, meters up to scale.
-        height: Height of the network's input in pixels.
-        width: Width of the network's input in pixels.
-        offsets: Time offsets of the sources that the pose network was trained with.
-        scale: Factor to meters, where known.
-        data: Facts about the training data, free-form.
-        version: saunet version that wrote it.
-        plugins: Modules outside saunet that register its components.
-    """
+    """Everything but the weights that prediction needs, as plain data; networks as config nodes with ``_target_``."""
 
     encoder: Mapping[str, Any]
     decoder: Mapping[str, Any]
     pose: Mapping[str, Any] | None
     min_depth: float
+    """Depth at sigmoid 1, meters up to scale; ``max_depth`` is that at sigmoid 0."""
     max_depth: float
     height: int
+    """Of the network's input in pixels."""
     width: int
     offsets: tuple[int, ...] = (-1, 1)
+    """Time offsets of the sources that the pose network was trained with."""
     scale: Scale | None = None
     data: Mapping[str, Any] = field(default_factory=dict)
+    """Facts about the training data, free-form."""
     version: str = __version__
     plugins: tuple[str, ...] = ()
+    """Modules outside saunet that register its components."""
 
     def __post_init__(self) -> None:
         if not 0 < self.min_depth < self.max_depth < math.inf:
@@ -75,17 +65,12 @@ class ModelRecord:
             raise CheckpointError(f"the model record's size is {self.height}x{self.width}; both must be above 0")
 
     def to_plain(self) -> dict[str, Any]:
-        """Return the record as plain containers: what stands under ``"saunet"`` in a checkpoint."""
+        """Return what stands under ``"saunet"`` in a checkpoint."""
+        nodes = {slot: _plain(getattr(self, slot)) for slot in _SLOTS}
         return {
             "format": FORMAT,
             "version": self.version,
-            "model": {
-                "encoder": _plain(self.encoder),
-                "decoder": _plain(self.decoder),
-                "pose": _plain(self.pose),
-                "min_depth": float(self.min_depth),
-                "max_depth": float(self.max_depth),
-            },
+            "model": {**nodes, "min_depth": float(self.min_depth), "max_depth": float(self.max_depth)},
             "height": self.height,
             "width": self.width,
             "offsets": list(self.offsets),
@@ -96,11 +81,7 @@ class ModelRecord:
 
     @classmethod
     def from_plain(cls, plain: Any) -> ModelRecord:
-        """Read a record from plain containers.
-
-        Raises:
-            CheckpointError: if a key is missing, a value cannot work, or the layout is newer than this version.
-        """
+        """Read a record, checking that no key is missing, every value can work, and this version knows the layout."""
         if not isinstance(plain, Mapping) or not isinstance(plain.get("format"), int):
             raise CheckpointError(f"the model record is {_short(plain)}; it must be a mapping with a 'format' number")
         if plain["format"] > FORMAT:
@@ -125,14 +106,7 @@ class ModelRecord:
         )
 
     def check_same_training(self, plain: Mapping[str, Any]) -> None:
-        """Check that a training about to resume from this record's checkpoint sees the same images and depths.
-
-        Args:
-            plain: The new training's record.
-
-        Raises:
-            CheckpointError: naming the first setting that differs.
-        """
+        """Check that a training with another plain record sees the same images and depths, so that it can resume."""
         new = ModelRecord.from_plain(plain)
         for name in ("height", "width", "offsets", "min_depth", "max_depth"):
             before, now = getattr(self, name), getattr(new, name)
@@ -143,17 +117,13 @@ class ModelRecord:
                 )
 
     def check_registered(self) -> None:
-        """Check that every component is registered, in the place of its kind.
-
-        Raises:
-            CheckpointError: naming the first ``_target_`` that is not.
-        """
-        for slot, kinds in _SLOTS.items():
+        """Check that every component is registered, in the place of its kind."""
+        for slot in _SLOTS:
             node = getattr(self, slot)
             if node is not None and "_target_" not in node:
                 raise CheckpointError(f"the recorded {slot} has no '_target_', so nothing is built")
             for depth, target in enumerate(_targets(node)):
-                if find(target, kinds if depth == 0 else _NESTED) is None:
+                if find(target, (slot,) if depth == 0 else _NESTED) is None:
                     what = slot if depth == 0 else "part of a model"
                     raise CheckpointError(
                         f"the recorded {slot} asks for '{target}', which is not a registered {what}, "
@@ -184,11 +154,6 @@ def _plain(value: Any) -> Any:
 
 
 def _get(plain: Mapping[str, Any], key: str, kind: Any) -> Any:
-    """Return ``plain[key]`` if it has the right type.
-
-    Raises:
-        CheckpointError: if it is missing or has another type.
-    """
     if key not in plain:
         raise CheckpointError(f"the model record lacks '{key}'; the file is damaged or was edited")
     value = plain[key]

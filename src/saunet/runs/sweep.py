@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from saunet.io.atomic import write_json
-from saunet.runs.files import read_mapping, read_yaml
-from saunet.runs.folder import FILE, Run, mark_lost, read
+from saunet.runs.folder import FILE, Run, mark_lost, read, read_file, read_mapping
 
 PLAN = "sweep.json"
 """In a sweep's folder: the jobs that it was to have."""
@@ -20,8 +19,6 @@ _UNKNOWN = "overrides unknown"
 _SLOTS = ("model/encoder", "model/decoder", "model/pose", "objective", "data", "loss")
 _UNTOLD = ("output_dir", "callbacks", "logger", "resume", "name")
 """Keys of a config that say where a run writes and what it is called, not what it computes."""
-
-
 _OFF = (None, "null", "false", "[]", "{}", "0.0", "0")
 """What a key that is not there may as well be."""
 
@@ -36,18 +33,17 @@ def settings(run: Run) -> dict[str, str]:
 def differing(runs: Sequence[Run], *, by_overrides: bool = False) -> list[str]:
     """Return the keys whose values are not the same for all runs, in the order they are first met.
 
-    Parameters of components of different names are left out: they say nothing beyond the names.
-
-    Args:
-        runs: The runs.
-        by_overrides: Compare what the command lines said; for the jobs of one sweep that is what was swept.
+    Parameters of components of different names are left out: they say nothing beyond the names. ``by_overrides``
+    compares what the command lines said; for the jobs of one sweep that is what was swept.
     """
     tables = [dict(run.overrides) if by_overrides else settings(run) for run in runs]
     tables = [table for table in tables if table]  # a job that left nothing says nothing
     keys = dict.fromkeys(key for table in tables for key in table)
-    different = [key for key in keys if len({_given(table, key) for table in tables}) > 1]
-    chosen = [slot.replace("/", ".") for slot in _SLOTS if slot.replace("/", ".") in different]
-    return [key for key in different if not any(key.startswith(f"{slot}.") for slot in chosen)]
+    # Older versions lack keys that newer ones leave off.
+    given = {key: {None if table.get(key) in _OFF else table.get(key) for table in tables} for key in keys}
+    different = [key for key in keys if len(given[key]) > 1]
+    chosen = tuple(f"{slot.replace('/', '.')}." for slot in _SLOTS if slot.replace("/", ".") in different)
+    return [key for key in different if not key.startswith(chosen)]
 
 
 def values(run: Run, keys: Sequence[str]) -> list[str]:
@@ -66,62 +62,46 @@ def ratio(run: Run) -> float | None:
 
 
 def sweeps_ratio(runs: Sequence[Run]) -> bool:
-    """Tell whether the runs differ in the ratio of eq. (14) and in nothing else that was swept."""
+    """Return whether the runs differ in the ratio of eq. (14) and in nothing else that was swept."""
     keys = set(differing(runs, by_overrides=True))
     ratios = {round(value, 6) for value in map(ratio, runs) if value is not None}
     return bool(keys) and keys <= {"objective.alpha", "objective.beta"} and len(ratios) > 1
 
 
 def labels(groups: Sequence[Sequence[Run]]) -> list[list[str]]:
-    """Return a short name for every run, unlike all others, made of what sets it apart within its group.
-
-    Args:
-        groups: The single runs, then the jobs of each sweep.
-    """
+    """Return a short name for every run, unlike all others, made of what sets it apart within its group."""
     named = [_labels(group) for group in groups]
     counts = Counter(name for names in named for name in names)
     taken: Counter[str] = Counter()
-    result = []
-    for group, names in zip(groups, named, strict=True):
-        row = []
-        for run, name in zip(group, names, strict=True):
-            unique = name if counts[name] == 1 else f"{name} ({run.name})"
-            taken[unique] += 1
-            row.append(unique if taken[unique] == 1 else f"{unique} {taken[unique]}")
-        result.append(row)
-    return result
 
+    def unique(run: Run, name: str) -> str:
+        name = name if counts[name] == 1 else f"{name} ({run.name})"
+        taken[name] += 1
+        return name if taken[name] == 1 else f"{name} {taken[name]}"
 
-def _given(table: Mapping[str, str], key: str) -> str | None:
-    """Return a value; None where it is absent or off, for older versions lack keys that newer ones leave off."""
-    value = table.get(key)
-    return None if value in _OFF else value
+    return [list(map(unique, group, names)) for group, names in zip(groups, named, strict=True)]
 
 
 def _labels(runs: Sequence[Run]) -> list[str]:
-    if sweeps_ratio(runs):
-        ratios = [ratio(run) for run in runs]
-        if None not in ratios:
-            return [f"{RATIO} = {value:.4g}" for value in ratios]
-    swept = bool(runs) and all(run.job is not None for run in runs)
-    keys = differing(runs, by_overrides=swept)
+    ratios = [ratio(run) for run in runs]
+    if sweeps_ratio(runs) and None not in ratios:
+        return [f"{RATIO} = {value:.4g}" for value in ratios]
+    keys = differing(runs, by_overrides=all(run.job is not None for run in runs))
     return [_label(run, keys) for run in runs]
 
 
 def _label(run: Run, keys: Sequence[str]) -> str:
     if not run.config and not run.overrides:  # another system's predictions, or a checkpoint alone
         return run.name
-    networks = [key for key in ("model.encoder", "model.decoder", "model/encoder", "model/decoder") if key in keys]
+    slots = ("model/encoder", "model/decoder")
+    others = [key for key in keys if key.replace(".", "/") not in slots]
     parts = []
-    if networks:  # always named in full: encoder + decoder
-        parts.append(" + ".join(run.component(slot) or "?" for slot in ("model/encoder", "model/decoder")))
-    table = settings(run) | dict(run.overrides)
-    others = [key for key in keys if key not in networks]
-    for key in others[:3]:
-        if key in table:
-            short = key.replace("/", ".").rpartition(".")[2]
+    if len(others) < len(keys):  # always named in full: encoder + decoder
+        parts.append(" + ".join(run.component(slot) or "?" for slot in slots))
+    for key, value in zip(others[:3], values(run, others[:3]), strict=True):
+        if value:
             named = key in ("loss", "objective", "data", "experiment", "model")
-            parts.append(table[key] if named else f"{short} = {table[key]}")
+            parts.append(value if named else f"{key.replace('/', '.').rpartition('.')[2]} = {value}")
     return ", ".join(parts) or run.name
 
 
@@ -150,18 +130,19 @@ def read_plan(folder: Path) -> list[list[str]] | None:
 def summary(folder: Path, planned: Sequence[Sequence[str]] | None = None) -> tuple[str, bool]:
     """Say how the jobs of a sweep ended, one line for each that did not finish; jobs that vanished are marked failed.
 
-    Args:
-        folder: The sweep's folder, with one ``run.json`` in each job's.
-        planned: The overrides of every job that was to run, where they are known: those that never started count too.
-
-    Returns:
-        The text, and whether there were jobs and all of them finished.
+    Of the jobs that were to run, where they are known, those that never started count too. Also returned is whether
+    there were jobs and all of them finished.
     """
-    jobs = [path.parent for path in sorted(folder.glob(f"**/{FILE}"), key=_in_order)]
+
+    def in_order(path: Path) -> tuple[int, str]:
+        name = path.parent.name
+        return (int(name) if name.isdecimal() else -1, str(path))
+
+    jobs = [path.parent for path in sorted(folder.glob(f"**/{FILE}"), key=in_order)]
     lines, finished = [], 0
     for job in jobs:
         mark_lost(job)
-        content = read(job) or {}
+        content = read(job)
         if content.get("status") == "finished":
             finished += 1
         else:
@@ -176,11 +157,6 @@ def summary(folder: Path, planned: Sequence[Sequence[str]] | None = None) -> tup
     return "\n".join([head, *lines]), 0 < finished == count
 
 
-def _in_order(path: Path) -> tuple[int, str]:
-    name = path.parent.name
-    return (int(name) if name.isdecimal() else -1, str(path))
-
-
 def _overrides(job: Path) -> str:
-    given = read_yaml(job / ".hydra" / "overrides.yaml")
+    given = read_file(job / ".hydra" / "overrides.yaml")
     return ", ".join(map(str, given)) if isinstance(given, list) else _UNKNOWN
