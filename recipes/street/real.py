@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from saunet.data.kitti.lidar import lidar_depth, read_scan
+from saunet.data.kitti.files import lidar_depth, read_scan
 from saunet.metrics.protocols import evaluate_image, protocol
 
 Frame = tuple[np.ndarray, Tensor, str]

@@ -13,8 +13,7 @@ import pytest
 
 import saunet
 from saunet.data.kitti.raw import KittiRaw
-from saunet.data.video.camera_file import CameraFile, write_camera
-from saunet.data.video.lens import Lens
+from saunet.data.video.camera import CameraFile, Lens, write_camera
 from saunet.io.images import read_image
 from saunet.tools.calibrate.boards import Board
 

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 import saunet
-from saunet.data.video.camera_file import CameraFile, write_camera
+from saunet.data.video.camera import CameraFile, write_camera
 from saunet.errors import CheckpointError, ConfigError
 from saunet.evaluation.tool import EvaluateOptions, _scaled
 from saunet.geometry.pose import pose_matrix

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from kitti_tree import CALIBRATION, SCANNER
 
-from saunet.data.kitti.calibration import read_calibration
+from saunet.data.kitti.files import read_calibration
 from saunet.errors import DataError
 
 

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from saunet.data.video.camera_file import CameraFile, read_camera, write_camera
-from saunet.data.video.lens import Lens
+from saunet.data.video.camera import CameraFile, Lens, read_camera, write_camera
 from saunet.errors import DataError
 
 GOOD = "image_size: [640, 480]\nK: [500, 510, 321, 242]\n"

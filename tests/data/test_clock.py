@@ -11,7 +11,7 @@ from clip_tree import CAMERA, frames, make_clip
 from drives import NumberDrive
 from kitti_tree import make_drive, name
 
-from saunet.data.kitti.oxts import read_timestamps
+from saunet.data.kitti.files import read_timestamps
 from saunet.data.kitti.raw import KittiRaw
 from saunet.data.loading.windows import Selection, find_windows
 from saunet.data.video.clips import find_clips, frame_paths, read_clip

@@ -7,7 +7,7 @@ import json
 import pytest
 from drives import NumberDrive
 
-from saunet.data.loading.depth_maps import DepthMaps
+from saunet.data.loading.stored import DepthMaps
 from saunet.errors import DataError
 
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from saunet.data.kitti.calibration import read_calibration
-from saunet.data.kitti.lidar import lidar_depth, read_scan
+from saunet.data.kitti.files import lidar_depth, read_calibration, read_scan
 from saunet.errors import ConfigError, DataError
 
 

@@ -7,7 +7,7 @@ import pytest
 from drives import NumberDrive
 from kitti_tree import make_drive, name
 
-from saunet.data.loading.manifest import Manifest, read_manifest, write_manifest
+from saunet.data.loading.selecting import Manifest, read_manifest, write_manifest
 from saunet.data.loading.windows import Selection
 from saunet.errors import DataError
 from saunet.registry import datamodules

@@ -5,8 +5,8 @@ import torch
 from drives import NumberDrive
 
 from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.sampling import available_cores
 from saunet.data.loading.windows import Selection
-from saunet.data.loading.workers import available_cores
 from saunet.errors import ConfigError, DataError
 
 

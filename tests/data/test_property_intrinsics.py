@@ -9,7 +9,7 @@ from drives import NumberDrive
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from saunet.data.kitti.calibration import read_calibration
+from saunet.data.kitti.files import read_calibration
 from saunet.data.loading.transforms import Augment, Prepare
 from saunet.data.loading.windows import Item, WindowDataset, collate
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from saunet.data.loading.resize import resize_depth
+from saunet.data.loading.windows import resize_depth
 
 
 def test_sparse_depth_moves_with_its_pixel_and_the_nearest_wins():

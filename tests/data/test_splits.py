@@ -7,8 +7,8 @@ import pytest
 from published_splits import PUBLISHED
 
 from saunet.data.kitti import splits
-from saunet.data.loading import holdout
-from saunet.data.loading.holdout import Frame
+from saunet.data.loading import selecting
+from saunet.data.loading.selecting import Frame
 from saunet.errors import ConfigError, DataError
 from saunet.fingerprint import fingerprint
 
@@ -60,7 +60,7 @@ def frames(drives, count, sides="l"):
 
 
 def test_few_drives_hold_out_their_tails_with_a_gap():
-    train, val = holdout.hold_out(frames(2, 20, "lr"), 0.1, gap=2, seed=0)
+    train, val = selecting.hold_out(frames(2, 20, "lr"), 0.1, gap=2, seed=0)
     assert {frame.number for frame in val} == {18, 19}
     assert {frame.number for frame in train} == set(range(16))
     assert {frame.side for frame in val} == {"l", "r"}
@@ -68,22 +68,22 @@ def test_few_drives_hold_out_their_tails_with_a_gap():
 
 def test_no_share_holds_nothing_out():
     everything = frames(2, 5)
-    assert holdout.hold_out(everything, 0.0, gap=2, seed=0) == (everything, [])
+    assert selecting.hold_out(everything, 0.0, gap=2, seed=0) == (everything, [])
 
 
 def test_many_drives_hold_out_whole_drives():
-    train, val = holdout.hold_out(frames(20, 10), 0.1, gap=2, seed=0)
+    train, val = selecting.hold_out(frames(20, 10), 0.1, gap=2, seed=0)
     assert len(val) == 20
     assert not {frame.drive for frame in train} & {frame.drive for frame in val}
-    assert holdout.hold_out(frames(20, 10), 0.1, gap=2, seed=1)[1] != val
+    assert selecting.hold_out(frames(20, 10), 0.1, gap=2, seed=1)[1] != val
 
 
 def test_named_drives_are_held_out_and_unknown_ones_refused():
-    train, val = holdout.hold_out_drives(frames(3, 4), ["1"])
+    train, val = selecting.hold_out_drives(frames(3, 4), ["1"])
     assert {frame.drive for frame in val} == {"d/1"}
     assert len(train) == 8
     with pytest.raises(ConfigError, match="no drive '7' to hold out; drives: d/0, d/1, d/2"):
-        holdout.hold_out_drives(frames(3, 4), ["7"])
+        selecting.hold_out_drives(frames(3, 4), ["7"])
 
 
 def test_unknown_names_are_refused():

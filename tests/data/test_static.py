@@ -6,9 +6,9 @@ import pytest
 from drives import NumberDrive
 from kitti_tree import make_drive, name
 
-from saunet.data.kitti.oxts import oxts_speed
+from saunet.data.kitti.files import oxts_speed
 from saunet.data.kitti.raw import KittiRaw
-from saunet.data.loading.static import median_flow, static_by_flow
+from saunet.data.loading.selecting import median_flow, static_by_flow
 from saunet.errors import DataError
 from saunet.registry import datamodules
 

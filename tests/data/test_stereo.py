@@ -13,11 +13,9 @@ import torch
 from drives import NumberDrive
 
 from saunet.data.kitti.module import KittiDataModule
-from saunet.data.kitti.odometry import OdometrySequence
-from saunet.data.kitti.odometry_module import KittiOdometryDataModule
+from saunet.data.kitti.odometry import KittiOdometryDataModule, OdometrySequence
 from saunet.data.kitti.raw import KittiRaw
-from saunet.data.loading.stereo import measured_distance, other_view
-from saunet.data.loading.windows import Selection, WindowDataset, collate, find_windows
+from saunet.data.loading.windows import Selection, WindowDataset, collate, find_windows, measured_distance, other_view
 from saunet.data.synthetic import SyntheticDataModule
 from saunet.errors import ConfigError, DataError
 from saunet.geometry.warp import synthesize

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from saunet.data.loading.transforms import Augment, Prepare, flip_motion, jitter_color
-from saunet.errors import ConfigError, DataError
+from saunet.errors import DataError
 
 H, W = 8, 12
 
@@ -124,12 +124,6 @@ def test_single_frames_give_no_sources():
 def test_too_small_frames_are_refused(transform):
     with pytest.raises(DataError, match=r"frames of 8x12 are smaller than"):
         transform(frame_batch())
-
-
-@pytest.mark.parametrize("option", [{"flip_prob": 1.5}, {"color_jitter_prob": -0.1}, {"hue": 0.6}, {"contrast": 2.0}])
-def test_impossible_ranges_are_refused(option):
-    with pytest.raises(ConfigError, match=next(iter(option))):
-        Augment(H, W, **option)
 
 
 def test_transforms_pickle():

@@ -11,7 +11,7 @@ import pytest
 
 from saunet.data.drive import Drive
 from saunet.data.kitti.raw import KittiRaw
-from saunet.data.loading.truth_cache import CachedTruth, cache_truths
+from saunet.data.loading.stored import CachedTruth, cache_truths
 from saunet.errors import DataError
 from saunet.synthetic import SyntheticDrive
 from saunet.synthetic.kitti_writer import write_raw

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 import saunet
-from saunet.data.loading.stereo import measured_distance
-from saunet.data.loading.windows import WindowDataset, collate
+from saunet.data.loading.windows import WindowDataset, collate, measured_distance
 from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.geometry.warp import synthesize

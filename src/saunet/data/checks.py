@@ -15,10 +15,14 @@ from saunet.io.images import image_size
 
 FOCAL = (0.15, 10.0)
 """Focal lengths in image widths (or heights) that a camera may have: a fisheye lens, a long telephoto lens."""
-CENTRE = (0.15, 0.85)
-"""Shares of the width between which the center lies, also where a side was cut off."""
+CENTER = (0.15, 0.85)
+"""Fractions of the width between which the center lies, also where a side was cut off."""
 SHRUNK = 0.3
-"""A center nearer than this share to a corner, both ways, is that of K of another image size; crops move it one way."""
+"""A center nearer than this to a corner, both ways, is that of K of another image size; crops move it one way."""
+ROTATION_ERROR = 1e-3
+"""Largest difference of R R^T from 1; matrices printed with seven digits, as KITTI's, are within 2e-7."""
+LOOKED_AT = 5
+"""Frames whose size is looked at: a broken or odd one among them decides nothing."""
 
 
 def check_intrinsics(
@@ -28,17 +32,9 @@ def check_intrinsics(
     where: str,
     fix: str = "is the calibration that of images of this size?",
 ) -> None:
-    """Check that K can belong to an image: upper triangular, a possible field of view, the center where one can be.
+    """Check that K, 3 x 3, can belong to an image: upper triangular, a possible field of view and center.
 
-    Args:
-        K: 3 x 3, pixels.
-        height: Of the image in pixels; None where nobody says, and then only what needs no size is checked.
-        width: Of the image in pixels; None likewise.
-        where: File and key that K comes from, for the message.
-        fix: What to look at, for the message.
-
-    Raises:
-        DataError: naming what cannot be.
+    Without a size only what needs none is checked. ``where`` (file and key) and ``fix`` are for the message.
     """
     if not np.isfinite(K).all() or not np.allclose(K[2], [0, 0, 1]) or K[1, 0] != 0:
         raise DataError(f"{where} has K {K.tolist()}; expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
@@ -53,18 +49,12 @@ def check_intrinsics(
     if not (low * width < fx < high * width and low * height < fy < high * max(height, width)):
         raise DataError(f"{told}; a focal length is some 0.3 to 3 image widths: {fix}")
     right, down = (cx + 0.5) / width, (cy + 0.5) / height
-    if not (0 < down < 1 and CENTRE[0] < right < CENTRE[1]):
+    if not (0 < down < 1 and CENTER[0] < right < CENTER[1]):
         raise DataError(f"{told}; the center must lie inside, not near the left or right edge: {fix}")
     if max(right, down) < SHRUNK or min(right, down) > 1 - SHRUNK:
         raise DataError(
             f"{told}; the center must lie inside, and near a corner it is that of images of another size: {fix}"
         )
-
-
-ROTATION_ERROR = 1e-3
-"""Largest difference of R R^T from 1; matrices printed with seven digits, as KITTI's, are within 2e-7."""
-LOOKED_AT = 5
-"""Frames whose size is looked at: a broken or odd one among them decides nothing."""
 
 
 def common_size(paths: Sequence[Path]) -> tuple[Path, tuple[int, int]]:

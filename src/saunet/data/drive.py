@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,11 +163,7 @@ class Drive(ABC):
 
 
 class DriveProxy(Drive):
-    """A recording that passes every question on to another; a subclass overrides what differs.
-
-    Args:
-        drive: The recording to ask.
-    """
+    """A recording that passes every question on to another; a subclass overrides what differs."""
 
     def __init__(self, drive: Drive) -> None:
         self._drive = drive
@@ -183,72 +182,18 @@ class DriveProxy(Drive):
     def intrinsics(self, index: int) -> NDArray[np.float64]:
         return self._drive.intrinsics(index)
 
-    def has_depth(self, index: int) -> bool:
-        return self._drive.has_depth(index)
 
-    def depth(self, index: int) -> NDArray[np.float32] | None:
-        return self._drive.depth(index)
+def _passed_on(name: str, member: Any) -> Any:
+    if isinstance(member, property):
+        return property(attrgetter(f"_drive.{name}"), doc=member.__doc__)
 
-    def depth_key(self, index: int) -> str | None:
-        return self._drive.depth_key(index)
+    @functools.wraps(member)
+    def ask(self: DriveProxy, *args: Any, **kwargs: Any) -> Any:
+        return attrgetter(f"_drive.{name}")(self)(*args, **kwargs)
 
-    def pose(self, index: int) -> NDArray[np.float64] | None:
-        return self._drive.pose(index)
+    return ask
 
-    def time(self, index: int) -> float | None:
-        return self._drive.time(index)
 
-    @property
-    def timestamps(self) -> NDArray[np.float64] | None:
-        return self._drive.timestamps
-
-    @property
-    def fps(self) -> float | None:
-        return self._drive.fps
-
-    @property
-    def gaps(self) -> frozenset[int]:
-        return self._drive.gaps
-
-    def speed(self, index: int) -> float | None:
-        return self._drive.speed(index)
-
-    def distance(self, first: int, second: int) -> float | None:
-        return self._drive.distance(first, second)
-
-    def stereo(self) -> Drive | None:
-        return self._drive.stereo()
-
-    @property
-    def T_stereo_cam(self) -> NDArray[np.float64] | None:  # noqa: N802 (frames in names)
-        return self._drive.T_stereo_cam
-
-    def path(self, index: int) -> Path | None:
-        return self._drive.path(index)
-
-    @property
-    def folder(self) -> Path | None:
-        return self._drive.folder
-
-    @property
-    def frame_size(self) -> tuple[int, int] | None:
-        return self._drive.frame_size
-
-    def recorded(self, index: int) -> int:
-        return self._drive.recorded(index)
-
-    @property
-    def numbering(self) -> str:
-        return self._drive.numbering
-
-    @property
-    def origin(self) -> str:
-        return self._drive.origin
-
-    @property
-    def camera_height(self) -> float | None:
-        return self._drive.camera_height
-
-    @property
-    def condition(self) -> str | None:
-        return self._drive.condition
+for _name, _member in vars(Drive).items():  # the rest of the contract, so that no member can be forgotten
+    if not _name.startswith("_") and _name not in vars(DriveProxy):
+        setattr(DriveProxy, _name, _passed_on(_name, _member))

@@ -13,24 +13,12 @@ from saunet import schema
 from saunet.data.drive import Drive, DriveProxy
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
-from saunet.data.loading.stereo import measured_distance
-from saunet.data.loading.windows import Selection
+from saunet.data.loading.windows import Selection, measured_distance
 from saunet.errors import ConfigError
 from saunet.registry import datamodules
 
-SHARED = (
-    "height",
-    "width",
-    "offsets",
-    "batch_size",
-    "workers",
-    "crop_margin",
-    "seed",
-    "target_depth",
-    "with_pose",
-    "stereo",
-    "on_error",
-)
+SHARED = ("height", "width", "offsets", "batch_size", "workers", "crop_margin", "seed")
+SHARED += ("target_depth", "with_pose", "stereo", "on_error")
 """Settings that belong to the mixture; its sources take them over."""
 AUGMENTATION = ("flip_prob", "color_jitter_prob")
 """Settings that only the mixture's own augmentation reads."""
@@ -67,10 +55,7 @@ class MixedDataModule(DepthDataModule):
         target_depth: bool = False,
         **loading: Unpack[Loading],
     ) -> None:
-        super().__init__(
-            target_depth=target_depth,
-            **loading,
-        )
+        super().__init__(target_depth=target_depth, **loading)
         if not sources:
             raise ConfigError(
                 "data=mixed has no sources; add them with +data@data.sources.NAME=kitti (or video, ...) and set "
@@ -141,7 +126,8 @@ class MixedDataModule(DepthDataModule):
             defaults += [preset[key] for preset in presets if key in preset]
             holders = (source.augment, self.augment) if key in AUGMENTATION else (source, self)
             given, ours = (getattr(holder, key) for holder in holders)
-            if key in parameters and given not in (ours, *(_as_kept(each) for each in defaults)):
+            defaults = [tuple(each) if isinstance(each, list) else each for each in defaults]
+            if key in parameters and given not in (ours, *defaults):
                 has = key in schema.parameters(type(self))
                 advice = f"set data.{key} only, which holds for all sources" if has else "leave it out"
                 raise ConfigError(f"data.sources.{name}.{key} is {given} and the mixture's is {ours}; {advice}")
@@ -160,10 +146,6 @@ class _Named(DriveProxy):
     @property
     def name(self) -> str:
         return self._name
-
-
-def _as_kept(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
 
 
 def _distance(with_speed: frozenset[str], drive: Drive, first: int, second: int) -> float:

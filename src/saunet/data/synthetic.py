@@ -72,12 +72,7 @@ class SyntheticDataModule(DepthDataModule):
         stereo: bool = False,
         **loading: Unpack[Loading],
     ) -> None:
-        super().__init__(
-            target_depth=target_depth,
-            with_pose=with_pose,
-            stereo=stereo,
-            **loading,
-        )
+        super().__init__(target_depth=target_depth, with_pose=with_pose, stereo=stereo, **loading)
         self.counts = {"train": train_drives, "val": val_drives, "test": test_drives}
         for split, count in self.counts.items():
             positive(f"{split}_drives", count)

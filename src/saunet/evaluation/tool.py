@@ -12,9 +12,9 @@ import torch
 from torch import nn
 
 from saunet.data.drive import Drive
-from saunet.data.loading.neighbors import surroundings
-from saunet.data.loading.stereo import measured_distance
-from saunet.data.loading.truth_cache import cache_truths
+from saunet.data.loading.module import surroundings
+from saunet.data.loading.stored import cache_truths
+from saunet.data.loading.windows import measured_distance
 from saunet.errors import ConfigError, DataError, one_of, usable_device
 from saunet.evaluation.buckets import Buckets
 from saunet.evaluation.files import read_rows, write_results

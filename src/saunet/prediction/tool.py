@@ -372,8 +372,7 @@ def _camera(options: PredictOptions, recording: Recording, predictor: ImagePredi
     if given is None or isinstance(given, Camera):
         return given
     if isinstance(given, str | Path) and not _numbers(given):
-        from saunet.data.video.camera_file import read_camera
-        from saunet.data.video.lens import Undistorter
+        from saunet.data.video.camera import Undistorter, read_camera
 
         file = read_camera(given)
         if options.undistort is not None:

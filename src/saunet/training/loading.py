@@ -10,7 +10,7 @@ from typing import Any
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_info
 
-from saunet.data.loading.workers import available_cores
+from saunet.data.loading.sampling import available_cores
 from saunet.errors import in_range, positive
 
 

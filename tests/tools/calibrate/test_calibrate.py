@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from board_views import SIZE, K, views
 
-from saunet.data.video.camera_file import read_camera, write_camera
+from saunet.data.video.camera import read_camera, write_camera
 from saunet.errors import ConfigError, DataError
 from saunet.tools.calibrate.boards import Board
 from saunet.tools.calibrate.solve import check_picture, solve

@@ -11,9 +11,9 @@ from kitti_tree import make_drive, name
 from tiny import Wall
 
 from saunet.data.kitti import splits
-from saunet.data.loading.image_cache import CacheSettings
-from saunet.data.loading.manifest import read_manifest, write_manifest
 from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.selecting import read_manifest, write_manifest
+from saunet.data.loading.stored import CacheSettings
 from saunet.data.loading.windows import Selection
 from saunet.io.video import VideoReader
 from saunet.registry import datamodules

@@ -15,7 +15,7 @@ import pytest
 from drives import NumberDrive
 from prepare_tree import name
 
-from saunet.data.loading.image_cache import CacheSettings, ImageCache
+from saunet.data.loading.stored import CacheSettings, ImageCache
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import read_image, resize
 from saunet.tools.prepare.cache import build_cache

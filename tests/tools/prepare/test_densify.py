@@ -8,7 +8,7 @@ import scipy.spatial
 import torch
 from prepare_tree import name
 
-from saunet.data.loading.depth_maps import DepthMaps
+from saunet.data.loading.stored import DepthMaps
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import read_depth
 from saunet.tools.prepare.densify import densify, densify_map, interpolate

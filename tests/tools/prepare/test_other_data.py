@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from saunet.cli import app
-from saunet.data.loading.image_cache import CacheSettings, ImageCache
+from saunet.data.loading.stored import CacheSettings, ImageCache
 from saunet.errors import DataError
 from saunet.registry import datamodules
 from saunet.tools.prepare.cache import build_cache

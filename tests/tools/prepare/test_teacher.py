@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from prepare_tree import name
 
-from saunet.data.loading.depth_maps import DepthMaps
+from saunet.data.loading.stored import DepthMaps
 from saunet.errors import DataError
 from saunet.prediction.prediction import ImagePredictor
 from saunet.tools.prepare.recordings import kitti_recordings

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from prepare_tree import name
 
-from saunet.data.loading.depth_maps import DepthMaps
-from saunet.data.loading.image_cache import CacheSettings
-from saunet.data.loading.resize import resize_depth
+from saunet.data.loading.stored import CacheSettings, DepthMaps
+from saunet.data.loading.windows import resize_depth
 from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 from saunet.tools.prepare.cache import build_cache

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -11,13 +11,11 @@ from typing_extensions import Unpack
 
 from saunet.data.kitti import splits
 from saunet.data.kitti.raw import CAMERA_HEIGHT, CAMERAS, DEPTH_KINDS, DepthKind, KittiRaw
-from saunet.data.loading.depth_maps import DENSE_KINDS, DepthMaps
-from saunet.data.loading.holdout import Frame, Parts, hold_out, hold_out_drives
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
-from saunet.data.loading.static import has_speed, moving
-from saunet.data.loading.stereo import measured_distance
-from saunet.data.loading.windows import Selection, reach
+from saunet.data.loading.selecting import Frame, has_speed, hold_out, hold_out_drives, moving
+from saunet.data.loading.stored import DENSE_KINDS, DepthMaps
+from saunet.data.loading.windows import Selection, measured_distance, reach
 from saunet.errors import ConfigError, DataError, in_range, one_of, suggest
 from saunet.registry import datamodules
 
@@ -83,12 +81,7 @@ class KittiDataModule(DepthDataModule):
         with_speed: bool = False,
         **loading: Unpack[Loading],
     ) -> None:
-        super().__init__(
-            target_depth=target_depth or dense != "none",
-            stereo=stereo,
-            cache=cache,
-            **loading,
-        )
+        super().__init__(target_depth=target_depth or dense != "none", stereo=stereo, cache=cache, **loading)
         self.root = root
         self.split = _known(split, "split", (*splits.TRAINING, "all"))
         self.test_split = test_split and _known(test_split, "test_split", (*splits.TEST, "all"))
@@ -113,16 +106,30 @@ class KittiDataModule(DepthDataModule):
         """Return the frames of a split, grouped by drive and camera."""
         raw = self._raw = self._raw or KittiRaw(self.root)
         skip = self.on_error == "skip"
+        between: Counter[tuple[str, str]] = Counter()
         if split in ("train", "val"):
+            train, val, unused = self._training(raw)
             sides = {CAMERAS[camera][1] for camera in self.cameras}
-            frames = [frame for frame in self._training(raw)[split == "val"] if frame.side in sides]
-            between = self._between(raw) if split == "train" else {}
+            frames = [frame for frame in (train if split == "train" else val) if frame.side in sides]
+            if split == "train":
+                between.update((frame.drive, frame.side) for frame in unused)
         else:
-            frames, between = self._test(raw), {}
+            frames = self._test(raw)
         self._check_drives(raw, split, frames)
         # Losses compare with the camera's depth, whatever the evaluation reads.
         kind: DepthKind = "camera_z" if split == "train" and self._depth == "lidar_x" else self._depth
-        selections = _group(raw, frames, kind, between)
+        numbers: dict[tuple[str, str], list[int]] = {}
+        for frame in frames:
+            numbers.setdefault((frame.drive, frame.side), []).append(frame.number)
+        cameras = {side: camera for camera, (_, side) in CAMERAS.items()}
+        selections = [
+            Selection(
+                raw.drive(drive, cameras[side], kind),
+                wanted,
+                {"between training and validation": between[drive, side]},
+            )
+            for (drive, side), wanted in numbers.items()
+        ]
         if self.static != "keep" and split in ("train", "val"):
             selections = [moving(each, by_speed=self.static == "speed", skip_unreadable=skip) for each in selections]
         if split == "test":
@@ -154,44 +161,44 @@ class KittiDataModule(DepthDataModule):
             maps.check(wanted, f"saunet prepare {what} root={self.root}{folder}")
 
     def listed(self, split: str) -> list[str]:
-        """Return the names of all images that a split lists, in its order, also of those that the root lacks."""
+        """Return the names of all images that a split lists, in its order, also those that the root lacks."""
         if split != "test":
             return super().listed(split)
         return [str(frame) for frame in self._test(self._raw or KittiRaw(self.root))]
 
-    def _training(self, raw: KittiRaw) -> Parts:
+    def _training(self, raw: KittiRaw) -> tuple[list[Frame], list[Frame], set[Frame]]:
+        """Return training and validation frames, and those between them, which are in neither."""
+        folder, unused = Path(self.split), set[Frame]()
         if self.split in splits.TRAINING:
             parts = splits.training_split(self.split, self.seed)
-        elif self.split != "all" and Path(self.split).is_dir():
-            folder = Path(self.split)
+        elif self.split != "all" and folder.is_dir():
             parts = splits.read_split(folder / "train_files.txt"), splits.read_split(folder / "val_files.txt")
+        elif self.val_drives:
+            parts = self._listed(raw, self.split), []
         else:
-            frames, gap = self._pool(raw), reach(self.offsets)
-            parts = (frames, []) if self.val_drives else hold_out(frames, self.val_share, gap, self.seed)
-        return hold_out_drives([*parts[0], *parts[1]], self.val_drives) if self.val_drives else parts
-
-    def _pool(self, raw: KittiRaw) -> list[Frame]:
-        return _everything(raw, self.cameras) if self.split == "all" else splits.read_split(Path(self.split))
-
-    def _between(self, raw: KittiRaw) -> Mapping[tuple[str, str], int]:
-        """Count the frames of each drive and side that lie between training and held-out tail, and in neither."""
-        if self.split in splits.TRAINING or (self.split != "all" and Path(self.split).is_dir()):
-            return {}
-        train, val = self._training(raw)
-        unused = set(self._pool(raw)) - set(train) - set(val)
-        return Counter((frame.drive, frame.side) for frame in unused)
+            frames = self._listed(raw, self.split)
+            parts = hold_out(frames, self.val_share, reach(self.offsets), self.seed)
+            unused = set(frames).difference(*parts)
+        if self.val_drives:
+            parts = hold_out_drives([*parts[0], *parts[1]], self.val_drives)
+        return *parts, unused
 
     def _test(self, raw: KittiRaw) -> list[Frame]:
-        split = self.test_split
-        if split is None and self.split in splits.TRAINING:
-            split = "eigen_test"
-        if split is None and (Path(self.split) / "test_files.txt").is_file():
-            split = str(Path(self.split) / "test_files.txt")
+        split, file = self.test_split, Path(self.split) / "test_files.txt"
         if split is None:
-            return self._training(raw)[1]
-        if split == "all":
-            return _everything(raw, self.cameras)
-        return splits.test_split(split) if split in splits.TEST else splits.read_split(Path(split))
+            split = "eigen_test" if self.split in splits.TRAINING else str(file) if file.is_file() else None
+        return self._training(raw)[1] if split is None else self._listed(raw, split)
+
+    def _listed(self, raw: KittiRaw, split: str) -> list[Frame]:
+        """Return every frame found for ``all``, those of a named test split, or those of a file."""
+        if split != "all":
+            return splits.test_split(split) if split in splits.TEST else splits.read_split(Path(split))
+        return [
+            Frame(name, number, CAMERAS[camera][1])
+            for name in raw.drives
+            for camera in self.cameras
+            for number in raw.drive(name, camera).indices
+        ]
 
     def _check_drives(self, raw: KittiRaw, split: str, frames: Sequence[Frame]) -> None:
         wanted = {frame.drive for frame in frames}
@@ -210,31 +217,6 @@ def _known(value: str, name: str, words: Sequence[str]) -> str:
         return value
     hint = suggest(value, words)
     raise ConfigError(f"{name} is '{value}'{hint or ','} allowed: {', '.join(words)}, or the path of an existing file")
-
-
-def _everything(raw: KittiRaw, cameras: Sequence[str]) -> list[Frame]:
-    found = []
-    for name in raw.drives:
-        for camera in cameras:
-            found += [Frame(name, number, CAMERAS[camera][1]) for number in raw.drive(name, camera).indices]
-    return found
-
-
-def _group(
-    raw: KittiRaw, frames: Sequence[Frame], kind: DepthKind, between: Mapping[tuple[str, str], int]
-) -> list[Selection]:
-    numbers: dict[tuple[str, str], list[int]] = {}
-    for frame in frames:
-        numbers.setdefault((frame.drive, frame.side), []).append(frame.number)
-    cameras = {side: camera for camera, (_, side) in CAMERAS.items()}
-    return [
-        Selection(
-            raw.drive(drive, cameras[side], kind),
-            wanted,
-            {"between training and validation": between.get((drive, side), 0)},
-        )
-        for (drive, side), wanted in numbers.items()
-    ]
 
 
 def _has_truth(selection: Selection) -> bool:

@@ -1,44 +1,48 @@
-"""Sequences of the KITTI odometry benchmark, with calibration and true poses."""
+"""The KITTI odometry benchmark: its sequences with calibration and true poses, and their data module."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from saunet.data.checks import check_intrinsics, check_rotation, common_size
 from saunet.data.drive import Drive
-from saunet.data.kitti.calibration import read_matrices, zero_based
+from saunet.data.kitti.files import read_matrices, read_times, scaled, zero_based
 from saunet.data.kitti.raw import CAMERA_HEIGHT, frame_files
-from saunet.errors import DataError, one_of
-from saunet.geometry.camera import scale_intrinsics
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.options import Loading
+from saunet.data.loading.selecting import Frame, hold_out_tails
+from saunet.data.loading.windows import Selection, reach
+from saunet.errors import DataError, in_range, one_of
 from saunet.io.images import read_image
 from saunet.io.trajectories import read_kitti
+from saunet.registry import datamodules
 
 _SIZES = {(607.19, 185.22): (376, 1241), (609.56, 172.85): (375, 1242), (601.89, 183.11): (370, 1226)}
 """Principal point in the benchmark's calibration files -> (height, width) of its images."""
-
 CAMERAS = {"gray_left": (0, "l"), "gray_right": (1, "r"), "color_left": (2, "l"), "color_right": (3, "r")}
 """Camera name -> its number on disk and its letter in names."""
 
 
 class OdometrySequence(Drive):
-    """One camera of one sequence."""
+    """One camera of one sequence; gray cameras give three equal channels."""
 
     camera_height = CAMERA_HEIGHT
-    """Meters from the road to the camera."""
 
     def __init__(self, root: Path, sequence: str, camera: str = "color_left") -> None:
         number, side = CAMERAS[one_of("camera", camera, CAMERAS)]
         self._given = (root, sequence, camera)
         folder = root / "sequences" / sequence
         if not folder.is_dir():
-            there = ", ".join(sequences(root)) or "none"
-            raise DataError(f"no sequence '{sequence}' at {folder.parent.absolute()}; sequences there: {there}")
+            there = [entry.name for entry in folder.parent.glob("*") if entry.is_dir()]
+            listed = ", ".join(sorted(there)) or "none"
+            raise DataError(f"no sequence '{sequence}' at {folder.parent.absolute()}; sequences there: {listed}")
         self._name = f"odometry/{sequence} {side}"
         self._images = folder / f"image_{number}"
         self._files = frame_files(self._images)
@@ -46,28 +50,23 @@ class OdometrySequence(Drive):
             cameras = ", ".join(name for name, (n, _) in CAMERAS.items() if (folder / f"image_{n}").is_dir()) or "none"
             raise DataError(f"{self._images} holds no images; cameras of sequence '{sequence}' there: {cameras}")
         self._indices = sorted(self._files)
-        key = f"P{number}"
-        matrices = read_matrices(folder / "calib.txt", {key: (3, 4)})
+        key, path = f"P{number}", folder / "calib.txt"
+        matrices = read_matrices(path, {key: (3, 4)})
         if key not in matrices:
-            raise DataError(f"{folder / 'calib.txt'} lacks {key}; expected a line '{key}: ' with 12 numbers")
-        self._K = matrices[key][:, :3]
+            raise DataError(f"{path} lacks {key}; expected a line '{key}: ' with 12 numbers")
+        K = matrices[key][:, :3]
         _, self._size = common_size([self.path(index) for index in self._indices])
-        self._native = _native_size(self._K, self._size)
-        if abs(self._size[0] / self._native[0] * self._native[1] / self._size[1] - 1) > 0.02:
-            raise DataError(
-                f"{self._images} has images of {self._size[0]}x{self._size[1]} (height x width) but "
-                f"{folder / 'calib.txt'} is for {self._native[0]}x{self._native[1]}; use the original images or ones "
-                "scaled as a whole"
-            )
-        check_intrinsics(self._K, *self._native, f"{folder / 'calib.txt'}: {key}")
+        native = next((each for center, each in _SIZES.items() if np.abs(K[:2, 2] - center).max() < 0.05), self._size)
+        self._K = scaled(zero_based(K), native, self._size, self._images, path)
+        check_intrinsics(K, *native, f"{path}: {key}")
         # P = K [I | t] maps points of camera 0, so t is where camera 0 lies seen from this camera
         self._T_cam_cam0 = np.eye(4)
-        self._T_cam_cam0[:3, 3] = np.linalg.solve(self._K, matrices[key][:, 3])
+        self._T_cam_cam0[:3, 3] = np.linalg.solve(K, matrices[key][:, 3])
         poses = root / "poses" / f"{sequence}.txt"
-        self._poses = read_kitti(poses) if poses.is_file() else None
-        for number, T_world_cam in enumerate(() if self._poses is None else self._poses, 1):
-            check_rotation(T_world_cam[:3, :3], f"{poses}, line {number}")
-        self._times = _read_times(folder / "times.txt")
+        self._poses = read_kitti(poses) if poses.is_file() else np.empty((0, 4, 4))
+        for line, T_world_cam in enumerate(self._poses, 1):
+            check_rotation(T_world_cam[:3, :3], f"{poses}, line {line}")
+        self._times = read_times(folder / "times.txt")
 
     @property
     def name(self) -> str:
@@ -86,31 +85,24 @@ class OdometrySequence(Drive):
         return self._indices
 
     def path(self, index: int) -> Path:
-        """Return the file of a frame."""
         return self._images / self._files[index]
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """Return the frame, h x w x 3, RGB; gray cameras give three equal channels."""
         return read_image(self.path(index))
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
-        """Return K of this camera, 3 x 3, in pixels counted from zero."""
-        K = torch.from_numpy(zero_based(self._K))
-        return scale_intrinsics(K, self._size[1] / self._native[1], self._size[0] / self._native[0]).numpy()
+        return self._K.copy()
 
     def time(self, index: int) -> float | None:
-        """Return the seconds at which a frame was taken, by ``times.txt``; None where that is missing or shorter."""
         return float(self._times[index]) if 0 <= index < len(self._times) else None
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
-        """Return T_world_cam of this camera, 4 x 4, meters; None where the file of poses is missing or shorter."""
-        if self._poses is None or not 0 <= index < len(self._poses):
+        if not 0 <= index < len(self._poses):
             return None
         pose: NDArray[np.float64] = self._poses[index] @ np.linalg.inv(self._T_cam_cam0)
         return pose
 
     def stereo(self) -> OdometrySequence:
-        """Return the other camera's recording of this sequence, of the same color."""
         return self._stereo
 
     @functools.cached_property
@@ -121,7 +113,6 @@ class OdometrySequence(Drive):
 
     @functools.cached_property
     def T_stereo_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
-        """By the sequence's calibration."""
         T: NDArray[np.float64] = self._stereo._T_cam_cam0 @ np.linalg.inv(self._T_cam_cam0)
         return T
 
@@ -135,33 +126,70 @@ def find_root(root: str | Path) -> Path:
     raise DataError(f"no folder 'sequences' at {folder.absolute()}; set data.root to the KITTI odometry data")
 
 
-def sequences(root: Path) -> list[str]:
-    """Return the names of the sequences on disk, sorted."""
-    folder = root / "sequences"
-    return sorted(entry.name for entry in folder.iterdir() if entry.is_dir()) if folder.is_dir() else []
+@datamodules.register("kitti_odometry")
+class KittiOdometryDataModule(DepthDataModule):
+    """KITTI odometry sequences with true camera motion: color or gray, standard or chosen sequences.
 
+    Args:
+        root: Folder that holds ``sequences`` and ``poses``.
+        train_sequences: Sequences to train on.
+        test_sequences: Sequences to test and predict.
+        val_share: Share of each training sequence, its end, that validates.
+        camera: ``color_left``, ``color_right``, ``gray_left`` or ``gray_right``.
+        with_pose: Batches carry the true motion.
+        stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
+            ``offsets: []`` it is the only one.
+        cache: Folder of smaller copies made by ``saunet prepare cache``; training and validation read images from it.
+        **loading: Loader settings, as in `LoadOptions`.
 
-def _native_size(K: NDArray[np.float64], size: tuple[int, int]) -> tuple[int, int]:
-    """Return the (height, width) that K belongs to: the benchmark's own, where it is its K, else that of the images."""
-    for (cx, cy), native in _SIZES.items():
-        if abs(K[0, 2] - cx) < 0.05 and abs(K[1, 2] - cy) < 0.05:
-            return native
-    return size
+    Raises:
+        ConfigError: if a parameter is out of range or a word unknown.
+    """
 
+    neighbors = ("train", "val", "test")
+    camera_height = CAMERA_HEIGHT
 
-def _read_times(path: Path) -> NDArray[np.float64]:
-    if not path.is_file():
-        return np.empty(0)
-    words = path.read_text(encoding="utf-8", errors="replace").split()
-    times = np.empty(len(words))
-    for number, word in enumerate(words):
-        try:
-            times[number] = float(word)
-        except ValueError:
-            times[number] = np.nan
-        if not np.isfinite(times[number]):
-            raise DataError(
-                f"{path}, line {number + 1}: expected seconds, got the non-numeric value '{word[:40]}'; "
-                "copy the file again"
-            )
-    return times
+    root: str
+
+    def __init__(
+        self,
+        *,
+        root: str = "data/kitti_odometry",
+        train_sequences: Sequence[str] = ("00", "01", "02", "03", "04", "05", "06", "07", "08"),
+        test_sequences: Sequence[str] = ("09", "10"),
+        val_share: float = 0.05,
+        camera: Literal["color_left", "color_right", "gray_left", "gray_right"] = "color_left",
+        with_pose: bool = False,
+        stereo: bool = False,
+        cache: str | None = None,
+        **loading: Unpack[Loading],
+    ) -> None:
+        super().__init__(with_pose=with_pose, stereo=stereo, cache=cache, **loading)
+        self.root = root
+        self.train_sequences, self.test_sequences = tuple(train_sequences), tuple(test_sequences)
+        self.val_share = in_range("val_share", val_share, 0.0, 0.9)
+        self.camera = one_of("camera", camera, CAMERAS)
+
+    def select(self, split: str) -> Sequence[Selection]:
+        """Return the frames of a split, a sequence each."""
+        root, training = find_root(self.root), split in ("train", "val")
+        selections = []
+        for name in self.train_sequences if training else self.test_sequences:
+            drive = OdometrySequence(root, name, self.camera)
+            frames: Sequence[int] = drive.indices
+            left_out = {}
+            if training:
+                listed = [Frame(name, index, "l") for index in frames]
+                train, val = hold_out_tails(listed, self.val_share, gap=reach(self.offsets))
+                if split == "train":
+                    left_out = {"between training and validation": len(frames) - len(train) - len(val)}
+                frames = [frame.number for frame in (train if split == "train" else val)]
+                if not frames:
+                    continue
+            if self.with_pose and split in self.neighbors:  # of the frame, and of those neighbors that exist
+                unknown = {index for index in drive.indices if drive.pose(index) is None}
+                known = [i for i in frames if not unknown & {i + offset for offset in (0, *self.offsets)}]
+                left_out["without pose"] = len(frames) - len(known)
+                frames = known
+            selections.append(Selection(drive, frames, left_out))
+        return selections

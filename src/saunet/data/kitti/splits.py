@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from typing import NamedTuple
 
-from saunet.data.loading.holdout import Frame, Parts, hold_out_drives, hold_out_random
+from saunet.data.loading.selecting import Frame, Parts, hold_out_drives, hold_out_random
 from saunet.errors import DataError, one_of
 
 VAL_DRIVES = (
@@ -28,27 +28,26 @@ VAL_DRIVES = (
 """Eigen training drives held out by drive: city, residential and road, about a tenth of the frames."""
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(NamedTuple):
     """One drive of the Eigen table."""
 
     drive: str
     frames: int
     """Number of frames in the drive."""
-    listed: tuple[int, ...]
+    listed: list[int]
     """Test frames of a test drive, static frames of a training drive."""
 
 
 @functools.cache
-def eigen_table() -> Mapping[str, tuple[Row, ...]]:
+def eigen_table() -> Mapping[str, list[Row]]:
     """Return the rows of the Eigen split by kind: ``eigen_test`` and ``eigen_train_drive``."""
     text = files("saunet.data").joinpath("tables", "kitti_eigen.tsv").read_text(encoding="utf-8")
     rows: dict[str, list[Row]] = {}
     for line in text.splitlines():
         if line and not line.startswith("#"):
             kind, drive, count, ranges = [*line.split("\t"), ""][:4]
-            rows.setdefault(kind, []).append(Row(f"{drive[:10]}/{drive}", int(count), tuple(parse_ranges(ranges))))
-    return {kind: tuple(drives) for kind, drives in rows.items()}
+            rows.setdefault(kind, []).append(Row(f"{drive[:10]}/{drive}", int(count), parse_ranges(ranges)))
+    return rows
 
 
 def parse_ranges(text: str) -> list[int]:
@@ -68,12 +67,8 @@ def eigen_test() -> list[Frame]:
 
 def eigen_benchmark_test() -> list[Frame]:
     """Return the 652 test frames of Eigen with improved ground truth: five frames or more from the ends of a drive."""
-    return [
-        Frame(row.drive, number, "l")
-        for row in eigen_table()["eigen_test"]
-        for number in row.listed
-        if 5 <= number <= row.frames - 6
-    ]
+    length = {row.drive: row.frames for row in eigen_table()["eigen_test"]}
+    return [frame for frame in eigen_test() if 5 <= frame.number <= length[frame.drive] - 6]
 
 
 def eigen_full() -> list[Frame]:
@@ -84,12 +79,12 @@ def eigen_full() -> list[Frame]:
 
 def eigen_zhou() -> list[Frame]:
     """Return the 44 234 frames of the training drives that have both neighbors and are not static, both cameras."""
-    frames = []
-    for row in eigen_table()["eigen_train_drive"]:
-        static = set(row.listed)
-        moving = (number for number in range(1, row.frames - 1) if number not in static)
-        frames += [Frame(row.drive, number, side) for number in moving for side in "lr"]
-    return frames
+    rows = {row.drive: (row.frames - 1, set(row.listed)) for row in eigen_table()["eigen_train_drive"]}
+    return [
+        frame
+        for frame in eigen_full()
+        if 0 < frame.number < rows[frame.drive][0] and frame.number not in rows[frame.drive][1]
+    ]
 
 
 TRAINING: Mapping[str, Callable[[int], Parts]] = {
@@ -98,10 +93,7 @@ TRAINING: Mapping[str, Callable[[int], Parts]] = {
     "eigen_zhou_random": lambda seed: hold_out_random(eigen_zhou(), 0.1, seed),
 }
 """Name of a training split -> its training and validation frames for a seed."""
-TEST: Mapping[str, Callable[[], list[Frame]]] = {
-    "eigen_test": eigen_test,
-    "eigen_benchmark_test": eigen_benchmark_test,
-}
+TEST: Mapping[str, Callable[[], list[Frame]]] = {"eigen_test": eigen_test, "eigen_benchmark_test": eigen_benchmark_test}
 """Name of a test split -> its frames."""
 
 

@@ -5,6 +5,7 @@ A data set subclasses `DepthDataModule`, names its own parameters beside the sha
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence, Set
 from typing import Any
 
@@ -17,16 +18,20 @@ from torch.utils.data import DataLoader
 from typing_extensions import Unpack
 
 from saunet.data.drive import Drive
-from saunet.data.loading.depth_maps import DepthMaps
-from saunet.data.loading.image_cache import ImageCache, check_enlarged
-from saunet.data.loading.manifest import read_manifest
 from saunet.data.loading.options import Loading, LoadOptions
-from saunet.data.loading.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, evenly, share
-from saunet.data.loading.stereo import Odometer
+from saunet.data.loading.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, evenly, processes, share
+from saunet.data.loading.selecting import read_manifest, readable
+from saunet.data.loading.stored import DepthMaps, ImageCache, check_enlarged
 from saunet.data.loading.transforms import Augment, Prepare
-from saunet.data.loading.unreadable import SkippingWindows, readable
-from saunet.data.loading.windows import Selection, Usage, WindowDataset, collate, find_windows
-from saunet.data.loading.workers import processes
+from saunet.data.loading.windows import (
+    Odometer,
+    Selection,
+    SkippingWindows,
+    Usage,
+    WindowDataset,
+    collate,
+    find_windows,
+)
 from saunet.errors import ConfigError, DataError
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
 
@@ -137,11 +142,10 @@ class DepthDataModule(LightningDataModule):
     def summary(self, split: str) -> str:
         """Return what a split uses and leaves out, readable, with the fingerprint of its frames."""
         dataset, usage = self.datasets[split], self.usage[split]
-        reasons: dict[str, int] = {}
+        reasons = Counter[str]()
         for drive in usage:
-            for reason, count in drive.left_out.items():
-                reasons[reason] = reasons.get(reason, 0) + count
-        sources = sum(1 for drive in usage if drive.used)
+            reasons.update(drive.left_out)
+        sources = sum(drive.used > 0 for drive in usage)
         total = Usage(f"{split} ({sources} of {len(usage)} drives)", len(dataset), reasons)
         lines = [str(drive) for drive in usage if len(usage) <= 8 or not drive.used]
         more = [f"... and {len(lines) - 12} drives more"] if len(lines) > 12 else []
@@ -165,16 +169,16 @@ class DepthDataModule(LightningDataModule):
         return selection
 
     def _dataset(self, split: str, selections: Sequence[Selection]) -> WindowDataset:
-        offsets = self.offsets if split in self.neighbors else ()
-        stereo = self.stereo and split in self.neighbors
+        together = split in self.neighbors
+        offsets = self.offsets if together else ()
+        stereo = self.stereo and together
         windows, usage = find_windows(selections, offsets, stereo)
         if not windows:
-            found = "; ".join(str(drive) for drive in usage[:3]) or "no drives"
+            found = "; ".join(map(str, usage[:3])) or "no drives"
             needed = [f"neighbors at {list(offsets)}"] * bool(offsets) + ["a stereo view"] * stereo
+            advice = "check the data root and the split"
             if needed:
                 advice = f"frames need {' and '.join(needed)}: check the data root, the split and the offsets"
-            else:
-                advice = "check the data root and the split"
             raise DataError(f"split '{split}' has no usable frame ({found}); {advice}")
         self.usage[split] = usage
         kind = SkippingWindows if self.on_error == "skip" and split == "train" else WindowDataset
@@ -186,11 +190,11 @@ class DepthDataModule(LightningDataModule):
             width=self.width,
             margin=self._margin(split),
             with_depth=split in ("val", "test"),
-            with_target_depth=self.target_depth and split in self.neighbors and "target_depth" not in self.maps,
-            with_pose=self.with_pose and split in self.neighbors,
+            with_target_depth=self.target_depth and together and "target_depth" not in self.maps,
+            with_pose=self.with_pose and together,
             stereo=stereo,
-            odometer=self.odometer if split in self.neighbors else None,
-            maps=self.maps if split in self.neighbors else {},
+            odometer=self.odometer if together else None,
+            maps=self.maps if together else {},
         )
 
     def _margin(self, split: str) -> tuple[int, int]:
@@ -207,11 +211,9 @@ class DepthDataModule(LightningDataModule):
         if self.on_error == "raise":  # else a copy that is missing is a sample to skip
             for position, frame in windows:
                 needed[position].update(frame + offset for offset in (0, *self.offsets))
-        cached = {
-            position: self.copies.drive(selections[position].drive, frames) for position, frames in needed.items()
-        }
-        check_enlarged(self.copies, cached.values(), (self.height, self.width), self._margin(split))
-        return [cached.get(place, selection.drive) for place, selection in enumerate(selections)]
+        copies = {place: self.copies.drive(selections[place].drive, frames) for place, frames in needed.items()}
+        check_enlarged(self.copies, copies.values(), (self.height, self.width), self._margin(split))
+        return [copies.get(place, selection.drive) for place, selection in enumerate(selections)]
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Return shuffled training batches, the same for any number of devices."""
@@ -270,3 +272,38 @@ class DepthDataModule(LightningDataModule):
 
     def _loading(self) -> Mapping[str, Any]:
         return {**processes(self.workers), "batch_size": None, "collate_fn": collate}  # samplers yield whole batches
+
+
+def surroundings(
+    data: DepthDataModule,
+    split: str,
+    device: str | torch.device,
+    *,
+    offsets: Sequence[int] = (),
+    stereo: bool = False,
+    odometer: Odometer | None = None,
+    most: int = 100,
+) -> Iterator[EvalBatch]:
+    """Yield frames of a split one by one, as the networks want them, with the sources that measuring scale needs."""
+    dataset = data._set_up(split)
+    wanted: dict[int, list[int]] = {}
+    for position, frame in dataset.windows:
+        wanted.setdefault(position, []).append(frame)
+    selections = [Selection(dataset.drives[position], frames) for position, frames in wanted.items()]
+    windows, usage = find_windows(selections, offsets, stereo)
+    if not windows:
+        raise DataError(
+            f"no frame of split '{split}' has neighbors at {list(offsets)}{' and a stereo view' if stereo else ''} "
+            f"({'; '.join(map(str, usage[:3]))}); measure the scale in another way"
+        )
+    samples = WindowDataset(
+        [selection.drive for selection in selections],
+        [windows[place] for place in evenly(len(windows), most)],
+        offsets=offsets,
+        height=data.height,
+        width=data.width,
+        stereo=stereo,
+        odometer=odometer,
+    )
+    for index in range(len(samples)):
+        yield data.prepare(move_data_to_device(collate(samples[index]), torch.device(device)))

@@ -1,22 +1,26 @@
 """Which sample goes where: samplers of whole batches, the same for any number of devices, and a loader that resumes.
 
-A sampler here yields lists of items, one list a batch, to a loader with ``batch_size=None``. So training draws one
-global permutation and cuts each global batch into equal parts, and evaluation gives every device the same number of
-batches without repeating or dropping a sample.
+A sampler yields lists of items, one list a batch, to a loader with ``batch_size=None``.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Iterator
 from typing import Any
 
+import cv2
 import numpy as np
+import torch
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from saunet.data.loading.windows import Item
 from saunet.errors import ConfigError, SaunetError
+
+AHEAD = 4
+"""Batches that each loader process keeps ready: enough that one slow file, or a validation, is not felt."""
 
 
 class TrainBatches(DistributedSampler[Any]):
@@ -46,8 +50,8 @@ class TrainBatches(DistributedSampler[Any]):
         first = self.rank * self.share
         start, self.start = self.start, 0
         for step in range(start, len(self)):
-            places = range(step * self.batch_size + first, step * self.batch_size + first + self.share)
-            yield [Item(int(order[place]), int(seeds[place])) for place in places]
+            part = slice(step * self.batch_size + first, step * self.batch_size + first + self.share)
+            yield [Item(*each) for each in zip(order[part].tolist(), seeds[part].tolist(), strict=True)]
 
 
 class EvalBatches(DistributedSampler[Any]):
@@ -72,7 +76,7 @@ class EvalBatches(DistributedSampler[Any]):
 
     def __iter__(self) -> Iterator[list[int]]:
         for part in np.array_split(self.indices, self.batches):
-            yield [int(index) for index in part]
+            yield part.tolist()
 
 
 def evenly(count: int, most: int) -> list[int]:
@@ -89,6 +93,30 @@ def share(batch_size: int, world_size: int) -> int:
             f"and must be a positive multiple of their number, such as {nearest}"
         )
     return batch_size // world_size
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use: fewer than the machine has, under a scheduler or in a container."""
+    allowed = getattr(os, "sched_getaffinity", None)  # Linux only
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
+
+
+def processes(wanted: int) -> dict[str, Any]:
+    """Return the settings of a `torch.utils.data.DataLoader` for so many processes, but at most one a core."""
+    workers = min(wanted, available_cores())
+    return {
+        "num_workers": workers,
+        "prefetch_factor": AHEAD if workers else None,
+        "pin_memory": torch.cuda.is_available(),
+        "persistent_workers": workers > 0,
+        "worker_init_fn": _single_threaded,
+    }
+
+
+def _single_threaded(worker: int) -> None:
+    """Keep a loader process to one thread: the processes are the parallelism."""
+    cv2.setNumThreads(0)
+    torch.set_num_threads(1)
 
 
 class Loader(DataLoader[Any]):
@@ -114,7 +142,7 @@ class Loader(DataLoader[Any]):
 
 
 class ResumableLoader(Loader):
-    """A loader over `TrainBatches` that can be saved in the middle of an epoch and go on with the next batch."""
+    """A loader over `TrainBatches` that can be saved in the middle of an epoch and resume with the next batch."""
 
     _done = 0
 

@@ -1,7 +1,7 @@
 """From decoded bytes to network input, on the device: crop, flip and color, with intrinsics and truth that follow.
 
-The random numbers come with the batch (``draws``), not from the device: the same sample is augmented the same way
-whatever the number of devices or workers, and nothing here waits for the device.
+The random numbers come with the batch (``draws``): a sample is augmented the same way on any number of devices or
+workers, and nothing here waits for the device.
 """
 
 from __future__ import annotations
@@ -18,12 +18,16 @@ from kornia.enhance.adjust import (
 )
 from torch import Tensor, nn
 
-from saunet.errors import DataError, in_range
+from saunet.errors import DataError
 from saunet.geometry.camera import crop_intrinsics, flip_intrinsics
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
 
 TARGETS: tuple[Literal["target_depth", "target_teacher"], ...] = ("target_depth", "target_teacher")
 """Depth maps at the size of the frames, which follow crops and flips."""
+JITTER = 0.2
+"""Factors of brightness, contrast and saturation are drawn from 1 ± this."""
+HUE = 0.1
+"""Part of the color circle by which hue turns at most."""
 
 
 def crop(
@@ -57,18 +61,10 @@ def jitter_color(
     saturation: Float[Tensor, " b"],
     hue: Float[Tensor, " b"],
 ) -> Float[Tensor, "b n 3 h w"]:
-    """Change the colors of the chosen samples; all frames of a sample change in the same way.
+    """Change the colors (RGB in [0, 1]) of the chosen samples; all frames of a sample change in the same way.
 
-    The frames of a sample are treated as one tall picture, so that they share even the mean gray that contrast turns
-    around.
-
-    Args:
-        frames: RGB in [0, 1].
-        which: Samples to change.
-        brightness: Factor, 1 changes nothing.
-        contrast: Factor, 1 changes nothing.
-        saturation: Factor, 1 changes nothing.
-        hue: Turn of the color circle in radians, 0 changes nothing.
+    Brightness, contrast and saturation are factors; hue turns the color circle, in radians. The frames of a sample are
+    treated as one tall picture, so that they share even the mean gray that contrast turns around.
     """
     b, n, c, h, w = frames.shape
     tall = frames.transpose(1, 2).reshape(b, c, n * h, w)
@@ -83,43 +79,16 @@ def jitter_color(
 class Augment(nn.Module):
     """`FrameBatch` with ``draws`` -> `TrainBatch`: random window, flip, colors; one draw for all frames of a sample.
 
-    Args:
-        height: Height of the images made; the frames may be larger, a random window is cut.
-        width: Width of the images made.
-        flip_prob: Probability of mirroring.
-        color_jitter_prob: Probability of changing colors; the loss images keep theirs.
-        brightness: Factors are drawn from 1 ± this.
-        contrast: Factors are drawn from 1 ± this.
-        saturation: Factors are drawn from 1 ± this.
-        hue: Part of the color circle by which hue turns at most.
-
-    Raises:
-        ConfigError: if a probability or range is outside [0, 1].
+    The loss images keep their colors.
     """
 
-    def __init__(
-        self,
-        height: int,
-        width: int,
-        flip_prob: float = 0.5,
-        color_jitter_prob: float = 0.5,
-        brightness: float = 0.2,
-        contrast: float = 0.2,
-        saturation: float = 0.2,
-        hue: float = 0.1,
-    ) -> None:
+    def __init__(self, height: int, width: int, flip_prob: float = 0.5, color_jitter_prob: float = 0.5) -> None:
         super().__init__()
         self.height, self.width = height, width
-        self.flip_prob = in_range("flip_prob", flip_prob, 0, 1)
-        self.color_jitter_prob = in_range("color_jitter_prob", color_jitter_prob, 0, 1)
-        self.brightness = in_range("brightness", brightness, 0, 1)
-        self.contrast = in_range("contrast", contrast, 0, 1)
-        self.saturation = in_range("saturation", saturation, 0, 1)
-        self.hue = in_range("hue", hue, 0, 0.5)
+        self.flip_prob, self.color_jitter_prob = flip_prob, color_jitter_prob
 
     @torch.no_grad()
     def forward(self, batch: FrameBatch) -> TrainBatch:
-        """Return the augmented batch."""
         draws = batch["draws"]
         margin_y, margin_x = _margin(batch["frames"], self.height, self.width)
         top = (draws[:, 0] * (margin_y + 1)).long().clamp(max=margin_y)
@@ -132,10 +101,8 @@ class Augment(nn.Module):
         seen = jitter_color(
             frames,
             draws[:, 3] < self.color_jitter_prob,
-            1 + self.brightness * signed[:, 0],
-            1 + self.contrast * signed[:, 1],
-            1 + self.saturation * signed[:, 2],
-            2 * torch.pi * self.hue * signed[:, 3],
+            *(1 + JITTER * signed[:, :3]).unbind(1),
+            2 * torch.pi * HUE * signed[:, 3],
         )
         out = _split(seen, frames, K, batch["name"])
         for key in TARGETS:
@@ -160,7 +127,6 @@ class Prepare(nn.Module):
 
     @torch.no_grad()
     def forward(self, batch: FrameBatch) -> EvalBatch:
-        """Return the batch as the networks want it."""
         margin_y, margin_x = _margin(batch["frames"], self.height, self.width)
         top, left = margin_y // 2, margin_x // 2
         window = (..., slice(top, top + self.height), slice(left, left + self.width))
@@ -176,13 +142,13 @@ class Prepare(nn.Module):
 
 
 def _margin(frames: Tensor, height: int, width: int) -> tuple[int, int]:
-    margin = (frames.shape[-2] - height, frames.shape[-1] - width)
-    if min(margin) < 0:
+    rows, columns = frames.shape[-2:]
+    if rows < height or columns < width:
         raise DataError(
-            f"frames of {frames.shape[-2]}x{frames.shape[-1]} are smaller than the {height}x{width} images "
-            "to be cut from them; load them larger"
+            f"frames of {rows}x{columns} are smaller than the {height}x{width} images to be cut from them; "
+            "load them larger"
         )
-    return margin
+    return rows - height, columns - width
 
 
 def _split(seen: Tensor, compared: Tensor, K: Tensor, name: list[str]) -> dict[str, Any]:

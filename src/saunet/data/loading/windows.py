@@ -1,4 +1,4 @@
-"""Frame windows as samples: a target frame, its neighbors in time, and whatever truth the recording has.
+"""Frame windows as samples: a target frame, its neighbors in time, its stereo view, and what truth there is.
 
 A window is usable when the frames at all offsets exist. What is left out is counted, never silently dropped.
 """
@@ -6,12 +6,15 @@ A window is usable when the frames at all offsets exist. What is left out is cou
 from __future__ import annotations
 
 import math
+import warnings
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,10 +22,8 @@ from torch.utils.data import Dataset
 
 from saunet.data.checks import check_frame
 from saunet.data.drive import Drive
-from saunet.data.loading.depth_maps import DepthMaps
 from saunet.data.loading.options import check_offsets
-from saunet.data.loading.resize import resize_depth
-from saunet.data.loading.stereo import Odometer, other_view, stereo_image
+from saunet.data.loading.stored import DepthMaps
 from saunet.errors import DataError
 from saunet.fingerprint import fingerprint
 from saunet.geometry.camera import scale_intrinsics
@@ -31,6 +32,12 @@ from saunet.types import FrameBatch
 
 DRAWS = 8
 """Random numbers that come with each training sample; see `saunet.data.loading.transforms.Augment`."""
+Odometer = Callable[[Drive, int, int], float]
+"""Gives the meters traveled between two frames of a drive, NaN where unknown."""
+_SAME_K = 0.5
+"""Pixels by which the intrinsics of two cameras may differ and still be taken for one."""
+_PATIENCE = 100
+"""Samples in a row that may be broken before it is the data set that is, not a file."""
 
 
 class Selection(NamedTuple):
@@ -70,39 +77,29 @@ def find_windows(
 ) -> tuple[list[tuple[int, int]], list[Usage]]:
     """Find the frames whose neighbors at all offsets exist, with no gap in time between them.
 
-    Args:
-        selections: Drives with the frames wanted of each.
-        offsets: Time offsets of the source frames; empty for single frames.
-        stereo: Ask for the stereo view of each frame too.
-
-    Returns:
-        The windows as (position in ``selections``, frame number), and one `Usage` a drive.
-
-    Raises:
-        DataError: if a drive has no stereo view and one is asked for.
+    The windows are (position in ``selections``, frame number); there is one `Usage` per drive.
     """
     windows, usage = [], []
-    for position, selection in enumerate(selections):
-        drive = selection.drive
+    first, last = min((0, *offsets)), max((0, *offsets))
+    for position, (drive, frames, before) in enumerate(selections):
         existing = set(drive.indices)
         paired = set(other_view(drive)[0].indices) if stereo else existing
         gaps = sorted(drive.gaps) if offsets else []
-        first, last = min((0, *offsets)), max((0, *offsets))
-        left_out = dict(selection.left_out)
-        used = 0
-        for frame in selection.frames:
+        left_out = Counter(before)
+        used = []
+        for frame in frames:
             if frame not in existing:
-                left_out["missing"] = left_out.get("missing", 0) + 1
+                left_out["missing"] += 1
             elif any(frame + offset not in existing for offset in offsets):
-                left_out["without neighbor"] = left_out.get("without neighbor", 0) + 1
+                left_out["without neighbor"] += 1
             elif bisect_left(gaps, frame + first) != bisect_left(gaps, frame + last):
-                left_out["across a gap in time"] = left_out.get("across a gap in time", 0) + 1
+                left_out["across a gap in time"] += 1
             elif frame not in paired:
-                left_out["without stereo view"] = left_out.get("without stereo view", 0) + 1
+                left_out["without stereo view"] += 1
             else:
-                windows.append((position, frame))
-                used += 1
-        usage.append(Usage(drive.name, used, left_out))
+                used.append((position, frame))
+        windows += used
+        usage.append(Usage(drive.name, len(used), left_out))
     return windows, usage
 
 
@@ -126,9 +123,6 @@ class WindowDataset(Dataset[dict[str, Any]]):
         stereo: Yield the stereo view as the last source, and where it is.
         odometer: Gives the distance traveled; None yields none.
         maps: Depth maps made beforehand, by the key under which they are yielded at the size of the frames.
-
-    Raises:
-        ConfigError: if an offset is 0 or given twice.
     """
 
     def __init__(
@@ -148,26 +142,20 @@ class WindowDataset(Dataset[dict[str, Any]]):
         maps: Mapping[str, DepthMaps] = MappingProxyType({}),
     ) -> None:
         check_offsets(offsets)
-        self.drives = list(drives)
-        self.windows = list(windows)
-        self.offsets = tuple(offsets)
+        self.drives, self.windows, self.offsets = list(drives), list(windows), tuple(offsets)
         self.size = (height + margin[0], width + margin[1])
-        self.with_depth = with_depth
-        self.with_target_depth = with_target_depth
-        self.with_pose = with_pose
-        self.stereo = stereo
-        self.odometer = odometer
-        self.maps = dict(maps)
+        self.with_depth, self.with_target_depth, self.with_pose = with_depth, with_target_depth, with_pose
+        self.stereo, self.odometer, self.maps = stereo, odometer, dict(maps)
 
     def __len__(self) -> int:
         return len(self.windows)
 
     def __getitem__(self, item: int | Item | list[int] | list[Item]) -> Any:
-        """Return one sample, or a list of samples for a list."""
         if isinstance(item, list):
             return [self[one] for one in item]
         if isinstance(item, Item):
-            return {**self._sample(item.sample), "draws": draw(item.seed)}
+            draws = np.random.default_rng(item.seed).random(DRAWS, dtype=np.float32)
+            return {**self._sample(item.sample), "draws": torch.from_numpy(draws)}
         return self._sample(item)
 
     def name(self, index: int) -> str:
@@ -182,64 +170,92 @@ class WindowDataset(Dataset[dict[str, Any]]):
     def _sample(self, index: int) -> dict[str, Any]:
         position, frame = self.windows[index]
         drive = self.drives[position]
-        named = {f"frame {frame + offset}": drive.image(frame + offset) for offset in (0, *self.offsets)}
+        images = {f"frame {frame + offset}": drive.image(frame + offset) for offset in (0, *self.offsets)}
         if self.stereo:
-            named[f"the stereo view of frame {frame}"], T_stereo_tgt = stereo_image(drive, frame)
-        check_frame(drive, frame, named[f"frame {frame}"])
-        images = list(named.values())
-        native = images[0].shape
-        for what, image in named.items():
-            if image.ndim != 3 or image.shape != native:
+            images[f"the stereo view of frame {frame}"], T_stereo_tgt = stereo_image(drive, frame)
+        target = images[f"frame {frame}"]
+        check_frame(drive, frame, target)
+        for what, image in images.items():
+            if image.ndim != 3 or image.shape != target.shape:
                 raise DataError(
                     f"{what} of '{drive.name}' has shape {tuple(image.shape)} "
-                    f"where its neighbor {frame} has {tuple(native)}; frames of a drive share one size"
+                    f"where its neighbor {frame} has {tuple(target.shape)}; frames of a drive share one size"
                 )
         height, width = self.size
-        frames = np.stack([resize(image, height, width).transpose(2, 0, 1) for image in images])
+        frames = np.stack([resize(image, height, width).transpose(2, 0, 1) for image in images.values()])
         K = torch.from_numpy(np.asarray(drive.intrinsics(frame), dtype=np.float64))
         sample: dict[str, Any] = {
             "frames": torch.from_numpy(frames),
-            "K": scale_intrinsics(K, width / native[1], height / native[0]).float(),
+            "K": scale_intrinsics(K, width / target.shape[1], height / target.shape[0]).float(),
             "name": self.name(index),
         }
-        if self.with_depth or self.with_target_depth:
-            depth = drive.depth(frame)
-            if self.with_target_depth:
-                resized = np.zeros(self.size, np.float32) if depth is None else resize_depth(depth, height, width)
-                sample["target_depth"] = torch.from_numpy(resized)[None]
-            if self.with_depth and depth is not None:
-                sample["depth"] = torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32))[None]
+        depth = drive.depth(frame) if self.with_depth or self.with_target_depth else None
+        if self.with_target_depth:
+            sample["target_depth"] = self._sized(depth)
+        if self.with_depth and depth is not None:
+            sample["depth"] = torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32))[None]
         for key, maps in self.maps.items():
-            depth = maps.read(drive, frame)
-            resized = np.zeros(self.size, np.float32) if depth is None else resize_depth(depth, height, width)
-            sample[key] = torch.from_numpy(resized)[None]
+            sample[key] = self._sized(maps.read(drive, frame))
         if self.stereo:
             sample["T_stereo_tgt"] = torch.from_numpy(np.asarray(T_stereo_tgt, np.float64)).float()
         if self.with_pose:
-            known = self._motion(drive, frame)
-            motion = np.concatenate([known, T_stereo_tgt[None]]) if self.stereo else known
+            motion = self._motion(drive, frame)
+            motion = np.concatenate([motion, T_stereo_tgt[None]]) if self.stereo else motion
             sample["T_src_tgt"] = torch.from_numpy(motion).float()
         if self.odometer is not None:
             ways = [self.odometer(drive, frame, frame + offset) for offset in self.offsets]
             sample["distance"] = torch.tensor([*ways, *[math.nan] * self.stereo], dtype=torch.float32)
         return sample
 
+    def _sized(self, depth: NDArray[np.float32] | None) -> torch.Tensor:
+        sized = np.zeros(self.size, np.float32) if depth is None else resize_depth(depth, *self.size)
+        return torch.from_numpy(sized)[None]
+
     def _motion(self, drive: Drive, frame: int) -> NDArray[np.float64]:
-        T_world_tgt = drive.pose(frame)
-        T_world_src = [drive.pose(frame + offset) for offset in self.offsets]
-        if T_world_tgt is None or any(pose is None for pose in T_world_src):
+        T_world_tgt, *T_world_src = (drive.pose(frame + offset) for offset in (0, *self.offsets))
+        known = [pose for pose in T_world_src if pose is not None]
+        if T_world_tgt is None or len(known) < len(T_world_src):
             raise DataError(f"'{drive.name}' has no pose at frame {frame} or its neighbors; load it without poses")
-        return np.array([np.linalg.inv(pose) @ T_world_tgt for pose in T_world_src if pose is not None]).reshape(
-            -1, 4, 4
+        return np.array([np.linalg.inv(pose) @ T_world_tgt for pose in known]).reshape(-1, 4, 4)
+
+
+class SkippingWindows(WindowDataset):
+    """Training windows in which a sample that cannot be read is replaced by the next one, once named and counted.
+
+    The count is shared by all loader processes.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._broken = torch.zeros(len(self.windows), dtype=torch.uint8).share_memory_()  # type: ignore[no-untyped-call]
+
+    def skipped(self) -> list[str]:
+        """Return the names of the samples that could not be read so far."""
+        return [self.name(int(index)) for index in self._broken.nonzero()[:, 0]]
+
+    def _sample(self, index: int) -> dict[str, Any]:
+        problem: DataError | None = None
+        for step in range(min(_PATIENCE, len(self))):
+            place = (index + step) % len(self)
+            if self._broken[place]:
+                continue
+            try:
+                return super()._sample(place)
+            except DataError as error:
+                problem = error
+                self._broken[place] = 1
+                warnings.warn(f"sample skipped: {error}", stacklevel=2)
+        reason = f"; the last: {problem}" if problem else ""
+        raise DataError(
+            f"{min(_PATIENCE, len(self))} samples in a row cannot be read, so on_error=skip gives up{reason}"
         )
 
 
 def collate(samples: Sequence[Mapping[str, Any]] | Mapping[str, Any]) -> FrameBatch:
     """Stack samples to a batch; ground truth of different sizes is padded with 0 at the bottom and right."""
     rows = [samples] if isinstance(samples, Mapping) else list(samples)
-    keys = dict.fromkeys(key for row in rows for key in row)
     batch: dict[str, Any] = {}
-    for key in keys:
+    for key in dict.fromkeys(key for row in rows for key in row):
         if key == "name":
             batch[key] = [row[key] for row in rows]
         elif key == "depth":
@@ -250,22 +266,75 @@ def collate(samples: Sequence[Mapping[str, Any]] | Mapping[str, Any]) -> FrameBa
 
 
 def _pad(maps: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor, torch.Tensor]:
-    sizes = [(1, 1) if each is None else (int(each.shape[-2]), int(each.shape[-1])) for each in maps]
-    padded = torch.zeros(len(maps), 1, max(h for h, _ in sizes), max(w for _, w in sizes))
-    for row, (each, (h, w)) in enumerate(zip(maps, sizes, strict=True)):
+    sizes = torch.tensor([(1, 1) if each is None else each.shape[-2:] for each in maps])
+    padded = torch.zeros(len(maps), 1, *sizes.amax(dim=0).tolist())
+    for row, each in zip(padded, maps, strict=True):
         if each is not None:
-            padded[row, :, :h, :w] = each
-    return padded, torch.tensor(sizes)
+            row[:, : each.shape[-2], : each.shape[-1]] = each
+    return padded, sizes
+
+
+def resize_depth(depth: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
+    """Resize a depth map without mixing values.
+
+    A sparse map (less than half of it known) moves each measurement to the pixel where it now falls, the nearest wins;
+    a dense map is sampled at the new pixel centers.
+    """
+    if depth.shape == (height, width):
+        return np.ascontiguousarray(depth, dtype=np.float32)
+    rows, columns = np.nonzero(depth)
+    if 2 * rows.size > depth.size:
+        return np.asarray(cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT), dtype=np.float32)
+    values = depth[rows, columns]
+    rows = np.minimum(((rows + 0.5) * (height / depth.shape[0])).astype(np.int64), height - 1)
+    columns = np.minimum(((columns + 0.5) * (width / depth.shape[1])).astype(np.int64), width - 1)
+    return nearest_map(rows, columns, values, (height, width))
+
+
+def nearest_map(
+    rows: NDArray[np.int64], columns: NDArray[np.int64], values: NDArray[Any], size: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Scatter values into a map of zeros, height x width; where several fall on one pixel the smallest stays."""
+    order = np.argsort(-values, kind="stable")
+    out = np.zeros(size, np.float32)
+    out[rows[order], columns[order]] = values[order]
+    return out
+
+
+def other_view(drive: Drive) -> tuple[Drive, NDArray[np.float64]]:
+    """Return the recording of the other camera, and T_stereo_cam, 4 x 4, meters."""
+    other = drive.stereo()
+    T_stereo_cam = None if other is None else drive.T_stereo_cam
+    if other is None or T_stereo_cam is None:
+        raise DataError(
+            f"'{drive.name}' is a recording of one camera, so it has no stereo view; set data.stereo=false, or use "
+            "data of two calibrated cameras"
+        )
+    return other, T_stereo_cam
+
+
+def stereo_image(drive: Drive, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Return the other camera's frame, h x w x 3, RGB, and T_stereo_cam, 4 x 4, meters."""
+    other, T_stereo_cam = other_view(drive)
+    K, K_other = drive.intrinsics(index), other.intrinsics(index)
+    if np.abs(K - K_other).max() > _SAME_K:
+        ours, theirs = (f"fx {each[0, 0]:.1f}, cx {each[0, 2]:.1f}, cy {each[1, 2]:.1f}" for each in (K, K_other))
+        raise DataError(
+            f"'{drive.name}' and its stereo view '{other.name}' have different intrinsics ({ours} and {theirs}); "
+            "a stereo source needs rectified images with one K"
+        )
+    return other.image(index), T_stereo_cam
+
+
+def measured_distance(drive: Drive, first: int, second: int) -> float:
+    """Return the meters traveled between two frames as the recording itself knows them; NaN where it does not."""
+    known = drive.distance(first, second)
+    return math.nan if known is None else known
 
 
 def reach(offsets: Sequence[int]) -> int:
     """Return how many frames the last frame of a window lies behind its first."""
     return max((0, *offsets)) - min((0, *offsets))
-
-
-def draw(seed: int) -> torch.Tensor:
-    """Return the random numbers that belong to a seed: one row of `DRAWS`, uniform in [0, 1)."""
-    return torch.from_numpy(np.random.default_rng(seed).random(DRAWS, dtype=np.float32))
 
 
 def sample_name(drive: str, frame: int) -> str:

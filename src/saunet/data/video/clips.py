@@ -1,8 +1,7 @@
 """Clips of any camera on disk: which there are, and their frames in order; a video is decoded once into a cache.
 
-A clip is a folder that holds images or a video file; its camera is the nearest ``camera.yaml`` above it. Reading a
-video out of order is slow (every frame needs those before it), so its frames are kept as JPEGs in a cache folder. The
-originals are only ever read.
+Reading a video out of order is slow (every frame needs those before it), so its frames are kept as JPEGs in a cache
+folder. The originals are only ever read.
 """
 
 from __future__ import annotations
@@ -13,13 +12,13 @@ import itertools
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from saunet.data.video.camera_file import FILE_NAME, CameraFile, read_camera
+from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera
 from saunet.errors import DataError
 from saunet.io.atomic import write_json
 from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order, resize
@@ -45,11 +44,6 @@ class Clip:
     path: Path
     """A folder of images, or a video file."""
     camera: CameraFile
-
-    @property
-    def is_video(self) -> bool:
-        """Whether frames have to be decoded in order."""
-        return self.path.is_file()
 
 
 @dataclass(frozen=True)
@@ -90,7 +84,8 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
     base = root.parent if root.is_file() else root
     given = read_camera(camera) if camera else None
     known: dict[Path, CameraFile] = {}
-    return [Clip(_name(path, base), path, given or _camera_of(path, base, known)) for path in paths]
+    names = [path.absolute().name if path == base else path.relative_to(base).as_posix() for path in paths]
+    return [Clip(name, path, given or _camera_of(path, base, known)) for name, path in zip(names, paths, strict=True)]
 
 
 def frame_paths(folder: Path) -> list[Path]:
@@ -102,12 +97,9 @@ def frame_paths(folder: Path) -> list[Path]:
 
 
 def every(recorded: float | None, wanted: float | None) -> Iterator[int]:
-    """Yield the numbers of the frames to take for a frame rate: those nearest to equal steps of time."""
+    """Return the numbers of the frames to take for a frame rate: those nearest to equal steps of time."""
     ratio = max(1.0, recorded / wanted) if recorded and wanted else 1.0
-    step = 0
-    while True:
-        yield int(step * ratio + 0.5)
-        step += 1
+    return (int(step * ratio + 0.5) for step in itertools.count())
 
 
 def read_clip(
@@ -118,19 +110,8 @@ def read_clip(
     advance: Callable[[int, int | None], None] = lambda done, total: None,
 ) -> Recording:
     """Return a clip's frames; those of a video are decoded into the cache the first time."""
-    if not clip.is_video:
-        paths = frame_paths(clip.path)
-        stamps = name_times([path.stem for path in paths])
-        rate = clip.camera.fps or _rate(stamps)
-        if stamps is None or fps is None:
-            numbers = _below(every(rate, fps), len(paths))
-        else:
-            numbers = tuple(
-                number for number, _, _ in nearest_steps(zip(range(len(paths)), stamps, paths, strict=False), fps)
-            )
-        taken = tuple(paths[number] for number in numbers)
-        times = None if stamps is None else tuple(stamps[number] for number in numbers)
-        return Recording(taken, numbers, rate, passed_over=len(paths) - len(taken), times=times)
+    if clip.path.is_dir():
+        return _read_folder(clip, fps)
     folder = cache / f"{clip.path.stem[:60]}-{_key(clip.path, fps, max_width)}"
     if not (folder / "clip.json").is_file():
         _decode(clip.path, clip.camera.fps, fps, folder, max_width, advance)
@@ -149,9 +130,20 @@ def read_clip(
     return Recording(tuple(paths), numbers, rate, missing, count - len(numbers), times)
 
 
-def _rate(times: Sequence[float] | None) -> float | None:
-    """Return the frames per second of the median step; None if unknown."""
-    return None if times is None or len(times) < 2 else 1 / float(np.median(np.diff(times)))
+def _read_folder(clip: Clip, fps: float | None) -> Recording:
+    paths = frame_paths(clip.path)
+    stamps = name_times([path.stem for path in paths])
+    rate = clip.camera.fps
+    if rate is None and stamps is not None and len(stamps) > 1:
+        rate = 1 / float(np.median(np.diff(stamps)))
+    if stamps is None or fps is None:
+        numbers = tuple(itertools.takewhile(lambda number: number < len(paths), every(rate, fps)))
+    else:
+        steps = nearest_steps(zip(range(len(paths)), stamps, paths, strict=False), fps)
+        numbers = tuple(number for number, _, _ in steps)
+    times = None if stamps is None else tuple(stamps[number] for number in numbers)
+    taken = tuple(paths[number] for number in numbers)
+    return Recording(taken, numbers, rate, passed_over=len(paths) - len(taken), times=times)
 
 
 def default_cache() -> Path:
@@ -211,10 +203,6 @@ def _key(path: Path, fps: float | None, max_width: int) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
 
 
-def _below(numbers: Iterator[int], count: int) -> tuple[int, ...]:
-    return tuple(itertools.takewhile(lambda number: number < count, numbers))
-
-
 def _is_depth(folder: Path) -> bool:
     """Return whether the first image of a folder is a 16-bit PNG of one channel."""
     for path in frame_paths(folder)[:1]:
@@ -238,14 +226,10 @@ def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
             continue
         seen.add(os.path.realpath(place))
         links += [Path(place) / name for name in folders if os.path.islink(os.path.join(place, name))]
-        suffixes = {Path(name).suffix.lower() for name in files if not name.startswith(".")}
-        if suffixes & IMAGE_SUFFIXES:
+        shown = [Path(place) / name for name in files if not name.startswith(".")]
+        if any(path.suffix.lower() in IMAGE_SUFFIXES for path in shown):
             yield Path(place)
-        yield from (
-            Path(place) / name
-            for name in files
-            if not name.startswith(".") and Path(name).suffix.lower() in VIDEO_SUFFIXES
-        )
+        yield from (path for path in shown if path.suffix.lower() in VIDEO_SUFFIXES)
     for link in sorted(links):
         yield from _clip_paths(link, seen)
 
@@ -262,9 +246,3 @@ def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraF
         f"no {FILE_NAME} for {path}: put one beside it or at {base / FILE_NAME}, or set data.camera; "
         "saunet calibrate makes one (see docs/your_camera.md)"
     )
-
-
-def _name(path: Path, base: Path) -> str:
-    if path == base:
-        return path.absolute().name
-    return path.relative_to(base).as_posix()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Literal
@@ -11,14 +11,13 @@ from typing import Literal
 from rich.progress import Progress
 from typing_extensions import Unpack
 
-from saunet.data.loading.holdout import Frame, hold_out
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
+from saunet.data.loading.selecting import Frame, hold_out
 from saunet.data.loading.windows import Selection, reach
-from saunet.data.video.camera_file import check_crop
+from saunet.data.video.camera import check_crop
 from saunet.data.video.clips import Clip, FramesCacheError, default_cache, find_clips, read_clip
-from saunet.data.video.drive import ClipDrive
-from saunet.data.video.motion import measure
+from saunet.data.video.drive import ClipDrive, measure
 from saunet.errors import ConfigError, DataError, in_range, one_of, positive
 from saunet.io.progress import bar
 from saunet.registry import datamodules
@@ -81,10 +80,7 @@ class VideoDataModule(DepthDataModule):
         cache: str | None = None,
         **loading: Unpack[Loading],
     ) -> None:
-        super().__init__(
-            cache=cache,
-            **loading,
-        )
+        super().__init__(cache=cache, **loading)
         self.root, self.camera = root, camera
         self.conditions = tuple(conditions)
         self.val_clips, self.test_clips = tuple(val_clips), tuple(test_clips)
@@ -132,22 +128,13 @@ class VideoDataModule(DepthDataModule):
             raise DataError(f"the clips below {self.root} hold no usable frame, such as {example}")
         test = _matching(self.test_clips, list(drives), "test_clips")
         named = _matching(self.val_clips, [name for name in drives if name not in test], "val_clips")
-        rest = {name: drive for name, drive in drives.items() if name not in test and name not in named}
-        frames = [Frame(name, index, "l") for name, drive in rest.items() for index in drive.indices]
+        frames = _listed(drives, [name for name in drives if name not in test and name not in named])
         if named:
-            train, val = frames, [Frame(name, index, "l") for name in named for index in drives[name].indices]
+            train, val, unused = frames, _listed(drives, named), 0
         else:
             train, val = hold_out(frames, self.val_share, reach(self.offsets), self.seed)
-        if split in ("train", "val"):
-            chosen = train if split == "train" else val
-        else:
-            chosen = [Frame(name, index, "l") for name in test for index in drives[name].indices] if test else val
-        unused = len(frames) - len(train) - (0 if named else len(val))
-        return self._selections(drives, chosen, split, unused)
-
-    def _selections(
-        self, drives: dict[str, ClipDrive], chosen: Sequence[Frame], split: str, unused: int
-    ) -> list[Selection]:
+            unused = len(frames) - len(train) - len(val)
+        chosen = {"train": train, "val": val}.get(split, _listed(drives, test) if test else val)
         numbers: dict[str, list[int]] = {}
         for frame in chosen:
             numbers.setdefault(frame.drive, []).append(frame.number)
@@ -177,7 +164,7 @@ class VideoDataModule(DepthDataModule):
             return None
 
     def _drive(self, clip: Clip, shown: Progress) -> ClipDrive:
-        task = shown.add_task(f"decoding {clip.path.name}", total=None, visible=clip.is_video)
+        task = shown.add_task(f"decoding {clip.path.name}", total=None, visible=clip.path.is_file())
         recording = read_clip(
             clip,
             self.fps,
@@ -186,13 +173,12 @@ class VideoDataModule(DepthDataModule):
             lambda done, total: shown.update(task, completed=done, total=total),
         )
         shown.update(task, visible=False)
-        crop = clip.camera.crop if self.crop is None else self.crop
         motion = None
         if self.static == "drop" or self.parallax > 0:
             task = shown.add_task(f"measuring motion of {clip.path.name}", total=len(recording.paths))
             motion = measure(
                 recording.paths,
-                crop,
+                self.crop or clip.camera.crop,
                 skip_unreadable=self.on_error == "skip",
                 cache=self.frames_cache,
                 advance=lambda: shown.advance(task),
@@ -202,11 +188,15 @@ class VideoDataModule(DepthDataModule):
         return ClipDrive(clip, recording, self.crop, motion, self.parallax, settings, self._height)
 
 
+def _listed(drives: Mapping[str, ClipDrive], names: Sequence[str]) -> list[Frame]:
+    return [Frame(name, index, "l") for name in names for index in drives[name].indices]
+
+
 def _matching(patterns: Sequence[str], names: Sequence[str], what: str) -> list[str]:
-    found: dict[str, None] = {}
+    found: list[str] = []
     for pattern in patterns:
         fitting = [name for name in names if name == pattern or fnmatchcase(name, pattern)]
         if not fitting:
             raise ConfigError(f"{what} names '{pattern}', which fits no clip; clips: {', '.join(names[:20]) or 'none'}")
-        found.update(dict.fromkeys(fitting))
-    return list(found)
+        found += (name for name in fitting if name not in found)
+    return found

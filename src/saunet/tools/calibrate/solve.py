@@ -13,9 +13,8 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from saunet.data.loading.sampling import evenly
-from saunet.data.video.camera_file import CameraFile
+from saunet.data.video.camera import CameraFile, Lens
 from saunet.data.video.clips import frame_paths
-from saunet.data.video.lens import Lens
 from saunet.errors import DataError
 from saunet.io.images import read_image
 from saunet.io.video import VideoReader

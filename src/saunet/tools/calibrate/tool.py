@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from saunet.data.video.camera_file import MODELS, write_camera
+from saunet.data.video.camera import MODELS, write_camera
 from saunet.errors import ConfigError, one_of, positive
 from saunet.io.images import write_image
 from saunet.io.progress import bar

@@ -11,9 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from saunet.data.loading.manifest import UNREADABLE, Manifest
-from saunet.data.loading.static import MIN_FLOW
-from saunet.data.video.motion import SAME_PICTURE
+from saunet.data.loading.selecting import MIN_FLOW, UNREADABLE, Manifest
+from saunet.data.video.drive import SAME_PICTURE
 from saunet.errors import UnreadableError
 from saunet.tools.doctor.survey import ABSENT, BANDS, FrameFacts, Survey
 

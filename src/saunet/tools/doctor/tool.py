@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from saunet.data.loading.manifest import Manifest, write_manifest
+from saunet.data.loading.selecting import Manifest, write_manifest
 from saunet.errors import ConfigError, one_of, positive
 from saunet.io.images import write_image
 from saunet.io.progress import bar

@@ -18,7 +18,7 @@ import numpy as np
 
 from saunet.data.checks import check_frame
 from saunet.data.drive import Drive
-from saunet.data.loading.image_cache import FRAMES, SETTINGS, CacheSettings, ImageCache
+from saunet.data.loading.stored import FRAMES, SETTINGS, CacheSettings, ImageCache
 from saunet.errors import DataError
 from saunet.io.atomic import write_bytes, write_json
 from saunet.io.images import resize

@@ -13,7 +13,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
 
 from saunet.data.kitti.raw import KittiDrive
-from saunet.data.loading.depth_maps import DepthMaps
+from saunet.data.loading.stored import DepthMaps
 from saunet.errors import DataError
 from saunet.io.colormaps import depth_to_png16
 from saunet.io.images import resize, write_image

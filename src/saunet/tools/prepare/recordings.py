@@ -9,7 +9,7 @@ from saunet.data.drive import Drive
 from saunet.data.kitti import splits
 from saunet.data.kitti.raw import CAMERAS, DepthKind, KittiDrive, KittiRaw
 from saunet.data.loading.module import DepthDataModule
-from saunet.data.loading.stereo import other_view
+from saunet.data.loading.windows import other_view
 from saunet.errors import ConfigError, DataError, suggest
 
 Recording = tuple[KittiDrive, list[int]]

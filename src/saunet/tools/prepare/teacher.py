@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from saunet.data.kitti.raw import KittiDrive
-from saunet.data.loading.depth_maps import DepthMaps
+from saunet.data.loading.stored import DepthMaps
 from saunet.data.loading.windows import sample_name
 from saunet.errors import DataError
 from saunet.io.colormaps import depth_to_png16

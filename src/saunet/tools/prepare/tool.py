@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from saunet.data.kitti.raw import CAMERAS
-from saunet.data.loading.depth_maps import DENSE_KINDS
-from saunet.data.loading.image_cache import CacheSettings
-from saunet.data.loading.workers import available_cores
+from saunet.data.loading.sampling import available_cores
+from saunet.data.loading.stored import DENSE_KINDS, CacheSettings
 from saunet.errors import ConfigError, one_of, positive, usable_device
 from saunet.registry import Spec
 from saunet.tools.prepare.cache import CacheReport, build_cache

@@ -1,4 +1,4 @@
-"""``camera.yaml``: one camera's intrinsics, distortion, height and frame rate, as a user writes them down.
+"""One camera: its intrinsics, distortion, height and frame rate as a user writes them down, and straight images.
 
 ```yaml
 image_size: [1920, 1080]               # width, height of the images that K belongs to
@@ -19,13 +19,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 import yaml
+from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from saunet.data.checks import check_intrinsics
@@ -37,24 +39,10 @@ from saunet.io.plain import read_yaml
 FILE_NAME = "camera.yaml"
 MODELS = ("pinhole", "fisheye")
 _COUNTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (0, 4)}
-_KEYS = (
-    "K",
-    "image_size",
-    "normalized",
-    "distortion",
-    "model",
-    "fps",
-    "camera_height",
-    "condition",
-    "crop",
-    "reprojection_error",
-)
 FIX = "is K in pixels of images of this size, or normalized (then set normalized: true)?"
 """What to look at where K cannot belong to the images."""
 _SAME_SHAPE = 0.02
 """Relative difference of the two aspect ratios up to which a frame is the calibrated image at another size."""
-
-
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 _LARGEST = 1e300
 """Beyond it a whole number is no float; NaN and infinity are not within it either."""
@@ -65,7 +53,6 @@ class CameraFile:
     """One camera as its ``camera.yaml`` describes it."""
 
     path: Path
-    """The file, for messages."""
     K: NDArray[np.float64]
     """3 x 3; in pixels of `image_size` (integer coordinates are pixel centers), or normalized where that is None."""
     image_size: tuple[int, int] | None
@@ -112,14 +99,22 @@ def read_camera(path: str | Path) -> CameraFile:
         raise DataError(f"cannot read {path}: {reason.strerror or reason}; check its rights") from reason
     if not isinstance(plain, dict):
         raise DataError(f"{path} holds {type(plain).__name__}; expected keys such as 'K: [fx, fy, cx, cy]'")
+    keys = [*(each.name for each in fields(CameraFile) if each.name != "path"), "normalized"]
     for key in plain:
-        if key not in _KEYS:
-            hint = suggest(str(key), _KEYS)
-            raise DataError(f"{path}: unknown key '{key}'{hint or ';'} allowed: {', '.join(_KEYS)}")
+        if key not in keys:
+            hint = suggest(str(key), keys)
+            raise DataError(f"{path}: unknown key '{key}'{hint or ';'} allowed: {', '.join(keys)}")
     return _camera(path, plain)
 
 
 def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
+    def above_zero(key: str) -> float | None:
+        value = plain.get(key)
+        number = None if value is None else _numbers(path, key, [value], (1,))[0]
+        if number is not None and number <= 0:
+            raise DataError(f"{path}: {key} is {value}; it must be greater than 0")
+        return number
+
     normalized = plain.get("normalized", False)
     if not isinstance(normalized, bool):
         raise DataError(f"{path}: normalized is {normalized!r}; it must be true or false")
@@ -146,11 +141,11 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
         image_size=size,
         distortion=tuple(_numbers(path, "distortion", plain.get("distortion") or [], _COUNTS[model])),
         model=model,
-        fps=_positive(path, "fps", plain.get("fps")),
-        camera_height=_positive(path, "camera_height", plain.get("camera_height")),
+        fps=above_zero("fps"),
+        camera_height=above_zero("camera_height"),
         condition=None if plain.get("condition") is None else str(plain["condition"]),
         crop=(crop[0], crop[1], crop[2], crop[3]),
-        reprojection_error=_positive(path, "reprojection_error", plain.get("reprojection_error")),
+        reprojection_error=above_zero("reprojection_error"),
     )
     if size is not None:
         check_intrinsics(camera.K, *size, f"{path}: K", FIX)
@@ -173,57 +168,36 @@ def check_crop(crop: Sequence[float | int], what: str, error: type[SaunetError] 
 
 
 def _matrix(path: Path, value: Any) -> NDArray[np.float64]:
-    flat = [number for row in value for number in row] if _is_nested(value) else value
-    numbers = _numbers(path, "K", flat, (4, 9))
+    nested = isinstance(value, list) and bool(value) and all(isinstance(row, list) for row in value)
+    numbers = _numbers(path, "K", [number for row in value for number in row] if nested else value, (4, 9))
     if len(numbers) == 4:
         fx, fy, cx, cy = numbers
-        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
+        numbers = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
     K = np.array(numbers, dtype=np.float64).reshape(3, 3)
     if K[1, 0] or K[2, 0] or K[2, 1] or K[2, 2] != 1:
         raise DataError(f"{path}: K is {K.tolist()}; expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
     return K
 
 
-def _is_nested(value: Any) -> bool:
-    return isinstance(value, list) and bool(value) and all(isinstance(row, list) for row in value)
-
-
 def _numbers(path: Path, key: str, value: Any, counts: Sequence[int]) -> list[float]:
-    allowed = " or ".join(str(count) for count in counts)
+    allowed = " or ".join(map(str, counts))
     if not isinstance(value, list) or len(value) not in counts:
         got = f"{len(value)}" if isinstance(value, list) else repr(value)[:40]
         raise DataError(f"{path}: {key} needs a list of {allowed} numbers, got {got}")
-    value = [_as_number(number) for number in value]
+    numbers = []
     for number in value:
+        if isinstance(number, str) and _NUMBER.fullmatch(number.strip()):
+            number = float(number)  # YAML 1.1 reads ``1e-5`` and ``4.5e2`` as text
         if isinstance(number, bool) or not isinstance(number, int | float) or not abs(number) <= _LARGEST:
             raise DataError(f"{path}: {key} needs {allowed} finite numbers, got {str(number)[:40]!r} among them")
-    return [float(number) for number in value]
-
-
-def _as_number(value: Any) -> Any:
-    """Return text that is a number as one: YAML 1.1 reads ``1e-5`` and ``4.5e2`` as text."""
-    if not isinstance(value, str) or not _NUMBER.fullmatch(value.strip()):
-        return value
-    return float(value)
-
-
-def _positive(path: Path, key: str, value: Any) -> float | None:
-    if value is None:
-        return None
-    number = _numbers(path, key, [value], (1,))[0]
-    if number <= 0:
-        raise DataError(f"{path}: {key} is {value}; it must be greater than 0")
-    return number
+        numbers.append(float(number))
+    return numbers
 
 
 def write_camera(path: str | Path, camera: CameraFile, note: str = "") -> None:
     """Write a ``camera.yaml`` that `read_camera` reads, whole or not at all."""
-    plain: dict[str, Any] = {}
-    if camera.image_size is None:
-        plain["normalized"] = True
-    else:
-        plain["image_size"] = [camera.image_size[1], camera.image_size[0]]
-    K = camera.K
+    K, size = camera.K, camera.image_size
+    plain: dict[str, Any] = {"image_size": [size[1], size[0]]} if size else {"normalized": True}
     plain["K"] = [float(f"{number:.8g}") for number in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])]
     if camera.distortion:
         plain["distortion"] = [float(f"{number:.8g}") for number in camera.distortion]
@@ -238,3 +212,69 @@ def write_camera(path: str | Path, camera: CameraFile, note: str = "") -> None:
     comment = "".join(f"# {line}\n" for line in note.splitlines())
     text = yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, allow_unicode=True)
     write_bytes(path, (comment + text).encode())
+
+
+class Lens:
+    """Undistorts and crops the frames of one size of one camera."""
+
+    def __init__(
+        self,
+        camera: CameraFile,
+        height: int,
+        width: int,
+        crop: Sequence[float | int] | None = None,
+        what: str = "the frames",
+    ) -> None:
+        self.recorded = (height, width)
+        K = camera.intrinsics(height, width, what)
+        self._maps: tuple[NDArray[np.int16], NDArray[np.uint16]] | None = None
+        if any(camera.distortion):
+            K, self._maps = _undistortion(camera, K, height, width)
+            check_intrinsics(K, height, width, f"{camera.path}: K after undistortion", FIX)
+        shares = camera.crop if crop is None else tuple(crop)
+        check_crop(shares, "crop")
+        self._rows = slice(round(shares[0] * height), height - round(shares[1] * height))
+        self._columns = slice(round(shares[2] * width), width - round(shares[3] * width))
+        self.height, self.width = self._rows.stop - self._rows.start, self._columns.stop - self._columns.start
+        self.K = crop_intrinsics(torch.from_numpy(K), self._columns.start, self._rows.start).numpy()
+
+    def __call__(self, image: UInt8[np.ndarray, "_ _ 3"], name: str = "a frame") -> UInt8[np.ndarray, "_ _ 3"]:
+        if image.shape[:2] != self.recorded:
+            height, width = self.recorded
+            raise DataError(
+                f"{name} is {image.shape[1]}x{image.shape[0]} (width x height) where other frames of its clip are "
+                f"{width}x{height}; frames of a clip share one size"
+            )
+        if self._maps is not None:
+            image = np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        return np.ascontiguousarray(image[self._rows, self._columns])
+
+
+class Undistorter:
+    """Undistorts and crops images of any size that the camera takes, as training on its clips does."""
+
+    def __init__(self, camera: CameraFile, crop: Sequence[float | int] | None = None) -> None:
+        self.camera, self._crop = camera, crop
+        self._lenses: dict[tuple[int, int], Lens] = {}
+
+    def lens(self, height: int, width: int) -> Lens:
+        if (height, width) not in self._lenses:
+            self._lenses[height, width] = Lens(self.camera, height, width, self._crop, "the images")
+        return self._lenses[height, width]
+
+    def __call__(self, image: UInt8[np.ndarray, "_ _ 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+        return self.lens(image.shape[0], image.shape[1])(image)
+
+
+def _undistortion(
+    camera: CameraFile, K: NDArray[np.float64], height: int, width: int
+) -> tuple[NDArray[np.float64], tuple[NDArray[np.int16], NDArray[np.uint16]]]:
+    """Return K of the largest undistorted image without blank pixels, and where each of its pixels comes from."""
+    numbers, size = np.array(camera.distortion), (width, height)
+    if camera.model == "fisheye":
+        straight = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, numbers, size, np.eye(3), balance=0.0)
+        maps = cv2.fisheye.initUndistortRectifyMap(K, numbers, np.eye(3), straight, size, cv2.CV_16SC2)
+    else:
+        straight, _ = cv2.getOptimalNewCameraMatrix(K, numbers, size, 0.0, size)
+        maps = cv2.initUndistortRectifyMap(K, numbers, None, straight, size, cv2.CV_16SC2)
+    return np.asarray(straight, dtype=np.float64), (np.asarray(maps[0]), np.asarray(maps[1]))

@@ -1,0 +1,251 @@
+"""KITTI's files: calibration, laser scans, OXTS records and time stamps.
+
+The calibration counts pixels from one, which is why the field's LiDAR maps lie one pixel up and left of u and v.
+Everywhere else integer coordinates are pixel centers counted from zero; `zero_based` goes from one to the other.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from saunet.data.checks import check_intrinsics, check_rotation
+from saunet.data.loading.windows import nearest_map
+from saunet.errors import DataError, one_of
+from saunet.geometry.camera import scale_intrinsics
+from saunet.io.images import read_bytes
+
+Array = NDArray[np.float64]
+
+_CAMERA_KEYS = {"R_rect_00": (3, 3)}
+_CAMERA_KEYS |= {f"{key}_rect_{n:02d}": shape for n in range(4) for key, shape in (("P", (3, 4)), ("S", (2,)))}
+_LIDAR_KEYS = {"R": (3, 3), "T": (3,)}
+
+
+def read_matrices(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
+    """Read the matrices of a file of ``key: numbers`` lines."""
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except FileNotFoundError as reason:
+        raise DataError(
+            f"no calibration at {path}; KITTI's calibration files belong into the folder of the date"
+        ) from reason
+    except OSError as reason:
+        raise DataError(f"cannot read calibration {path}: {reason.strerror or reason}") from reason
+    found: dict[str, Array] = {}
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        key, colon, text = line.partition(":")
+        key = key.strip()
+        if not colon:
+            raise DataError(f"{path}, line {number}: expected 'key: numbers', got '{line.strip()[:60]}'")
+        if key in shapes:
+            where = f"{path}, line {number} ({key})"
+            if key in found:
+                raise DataError(f"{where}: this key is given twice; delete the wrong line")
+            found[key] = _numbers(text, shapes[key], where)
+            if shapes[key] == (3, 3):
+                check_rotation(found[key], where)
+    return found
+
+
+def _numbers(text: str, shape: tuple[int, ...], where: str) -> Array:
+    words, count = text.split(), math.prod(shape)
+    if len(words) != count:
+        raise DataError(f"{where}: expected {count} numbers, got {len(words)}")
+    values = np.empty(count)
+    for place, word in enumerate(words):
+        try:
+            values[place] = float(word)
+        except ValueError:
+            raise DataError(f"{where}: expected {count} numbers, got '{word[:40]}' among them") from None
+    if not np.isfinite(values).all():
+        raise DataError(f"{where}: expected {count} finite numbers, got {text.strip()[:60]}")
+    return values.reshape(shape)
+
+
+@dataclass(frozen=True, slots=True)
+class KittiCalibration:
+    """Calibration of one day of KITTI raw recordings."""
+
+    path: Path
+    """The ``calib_cam_to_cam.txt`` it comes from."""
+    projections: Mapping[int, Array]
+    """P_rect of each camera as printed, 3 x 4: rectified camera 0 to homogeneous pixels counted from one."""
+    sizes: Mapping[int, tuple[int, int]]
+    """(height, width) of the rectified images of each camera."""
+    rectification: Array
+    """R_rect_00, 3 x 3."""
+    T_cam_velo: Array | None
+    """Laser scanner to unrectified camera 0, 4 x 4; None without ``calib_velo_to_cam.txt``."""
+
+    def T_cam_cam(self, to: int, source: int) -> Array:  # noqa: N802 (frames in names)
+        """Return the motion between rectified cameras, 4 x 4, meters: maps points of ``source`` to points of ``to``."""
+        T = np.eye(4)
+        for camera, sign in ((to, 1), (source, -1)):
+            self.intrinsics(camera)  # P = K [I | t] is solved for t: K must be one
+            P = self.projections[camera]
+            T[:3, 3] += sign * np.linalg.solve(P[:, :3], P[:, 3])
+        return T
+
+    def intrinsics(self, camera: int) -> Array:
+        """Return K of a camera, 3 x 3, in pixels of its rectified image counted from zero."""
+        if camera not in self.projections:
+            known = ", ".join(f"{each:02d}" for each in self.projections) or "none"
+            raise DataError(f"{self.path} has no P_rect_{camera:02d}; cameras in it: {known}")
+        K = self.projections[camera][:, :3]
+        check_intrinsics(K, *self.sizes.get(camera, (None, None)), f"{self.path}: P_rect_{camera:02d}")
+        return zero_based(K)
+
+
+def zero_based(K: Array) -> Array:
+    """Return K for pixels counted from zero, given one for pixels counted from one."""
+    moved = K.copy()
+    moved[:2, 2] -= 1
+    return moved
+
+
+def scaled(K: Array, native: tuple[int, int], size: tuple[int, int], images: Path, calibration: Path) -> Array:
+    """Return K of images that may have been scaled, as a whole, from the (height, width) that a calibration is for."""
+    (height, width), (rows, columns) = size, native
+    if abs(height / rows * columns / width - 1) > 0.02:
+        raise DataError(
+            f"{images} has {height}x{width} (height x width) but {calibration} is for {rows}x{columns}; "
+            "use the original images or ones scaled as a whole"
+        )
+    return scale_intrinsics(torch.from_numpy(K), width / columns, height / rows).numpy()
+
+
+def read_calibration(folder: Path) -> KittiCalibration:
+    """Read the calibration of a date."""
+    path = folder / "calib_cam_to_cam.txt"
+    found = read_matrices(path, _CAMERA_KEYS)
+    projections = {camera: found[key] for camera in range(4) if (key := f"P_rect_{camera:02d}") in found}
+    if "R_rect_00" not in found or not projections:
+        missing = "R_rect_00" if "R_rect_00" not in found else "P_rect_00 to P_rect_03"
+        raise DataError(f"{path} lacks {missing}; expected KITTI's calib_cam_to_cam.txt")
+    sizes = {}
+    for camera in range(4):
+        if (key := f"S_rect_{camera:02d}") in found:
+            width, height = found[key]
+            if min(width, height) < 2:
+                raise DataError(f"{path}: {key} is {width:g} {height:g}; expected width and height in pixels")
+            sizes[camera] = (int(height), int(width))
+    return KittiCalibration(path, projections, sizes, found["R_rect_00"], _read_scanner(folder))
+
+
+def _read_scanner(folder: Path) -> Array | None:
+    path = folder / "calib_velo_to_cam.txt"
+    if not path.exists():
+        return None
+    found = read_matrices(path, _LIDAR_KEYS)
+    for key, shape in _LIDAR_KEYS.items():
+        if key not in found:
+            raise DataError(f"{path} lacks {key}; expected a line '{key}: ' with {math.prod(shape)} numbers")
+    T_cam_velo = np.eye(4)
+    T_cam_velo[:3, :3], T_cam_velo[:3, 3] = found["R"], found["T"]
+    return T_cam_velo
+
+
+def read_scan(path: Path) -> NDArray[np.float32]:
+    """Return the points of a Velodyne scan, n x 3: x forward, y left, z up, in meters."""
+    data = read_bytes(path)
+    if data.size % 16:
+        raise DataError(f"{path} has {data.size} bytes, not a multiple of the 16 bytes of a point; copy the file again")
+    points = data.view(np.float32).reshape(-1, 4)[:, :3]
+    known = np.isfinite(points).all(axis=1)
+    if not known.any():
+        raise DataError(f"{path} contains only points that are not finite numbers; copy the file again")
+    if not known.all():
+        lost = len(points) - int(known.sum())
+        warnings.warn(f"{path}: {lost} of {len(points)} points are not finite numbers and are left out", stacklevel=2)
+    return points[known]
+
+
+def lidar_depth(
+    points: NDArray[np.floating],
+    projection: Array,
+    rectification: Array,
+    T_cam_velo: Array,
+    size: tuple[int, int],
+    kind: Literal["camera_z", "lidar_x"] = "camera_z",
+) -> NDArray[np.float32]:
+    """Project a scan into a camera as the Eigen evaluation does, h x w; where several points share a pixel the nearest.
+
+    ``camera_z`` is depth along the camera's axis, ``lidar_x`` the scanner's own x (the classic numbers). Points behind
+    the scanner (x < 0) or the camera (z <= 0) are dropped. The calibration counts pixels from one, so a point lands on
+    column round(u) - 1 and row round(v) - 1.
+    """
+    one_of("depth kind", kind, ("camera_z", "lidar_x"))
+    ahead = points[points[:, 0] >= 0].astype(np.float64)
+    rectify = np.eye(4)
+    rectify[:3, :3] = rectification
+    P_pixel_velo = projection @ rectify @ T_cam_velo
+    homogeneous = ahead @ P_pixel_velo[:, :3].T + P_pixel_velo[:, 3]
+    visible = homogeneous[:, 2] > 0
+    homogeneous, ahead = homogeneous[visible], ahead[visible]
+    z = homogeneous[:, 2]
+    columns, rows = np.round(homogeneous[:, :2].T / z) - 1
+    inside = (columns >= 0) & (columns < size[1]) & (rows >= 0) & (rows < size[0])
+    values = (z if kind == "camera_z" else ahead[:, 0])[inside]
+    return nearest_map(rows[inside].astype(np.int64), columns[inside].astype(np.int64), values, size)
+
+
+def oxts_speed(path: Path) -> float:
+    """Return the speed in m/s of a record of KITTI's inertial unit: the length of (vf, vl, vu)."""
+    try:
+        words = path.read_text(encoding="utf-8", errors="replace").split()
+        velocity = np.array([float(word) for word in words[8:11]])
+    except OSError as reason:
+        raise DataError(f"cannot read {path}: {reason.strerror or reason}") from reason
+    except ValueError:
+        velocity = np.empty(0)
+    if velocity.size != 3 or not np.isfinite(velocity).all():
+        raise DataError(f"{path}: expected the 30 numbers of an OXTS record; values 9 to 11 are the speeds vf, vl, vu")
+    return float(np.linalg.norm(velocity))
+
+
+def read_timestamps(path: Path) -> Array | None:
+    """Read the ``timestamps.txt`` of a KITTI raw camera: seconds, one per frame from frame 0; None if there is none."""
+    if not path.is_file():
+        return None
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").rstrip().split("\n")
+    except OSError as reason:
+        raise DataError(f"cannot read {path}: {reason.strerror or reason}") from reason
+    times = np.empty(len(lines) if any(lines) else 0)
+    for number in range(len(times)):
+        line = lines[number].strip()
+        try:
+            times[number] = np.datetime64(line or "empty", "ns").astype(np.int64) / 1e9
+        except ValueError:
+            raise DataError(
+                f"{path}, line {number + 1}: expected a time such as '2011-09-26 13:02:25.964389445', got '{line[:40]}'"
+            ) from None
+    return times
+
+
+def read_times(path: Path) -> Array:
+    """Read the ``times.txt`` of a KITTI odometry sequence: seconds, one per frame; empty if there is none."""
+    if not path.is_file():
+        return np.empty(0)
+    times = []
+    for number, word in enumerate(path.read_text(encoding="utf-8", errors="replace").split(), 1):
+        try:
+            times.append(float(word))
+        except ValueError:
+            times.append(math.nan)
+        if not math.isfinite(times[-1]):
+            raise DataError(
+                f"{path}, line {number}: expected seconds, got the non-numeric value '{word[:40]}'; copy the file again"
+            )
+    return np.array(times)

@@ -1,0 +1,282 @@
+"""Which frames of a split are used: held out, named in a manifest, static, or unreadable."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from lightning.pytorch.utilities import rank_zero_warn
+from numpy.typing import NDArray
+
+from saunet.data.checks import check_frame
+from saunet.data.drive import Drive
+from saunet.data.loading.windows import Selection
+from saunet.errors import ConfigError, DataError
+from saunet.io.atomic import write_json
+from saunet.io.plain import read_json
+
+FORMAT = 1
+"""Version of the layout of a manifest."""
+UNREADABLE = "unreadable"
+"""The reason in a manifest that also forbids a frame as a neighbor; all others only forbid it as a target."""
+MIN_SPEED = 0.5
+"""Meters a second under which a car counts as standing."""
+FLOW_WIDTH = 320
+"""Images are made this wide before flow is measured, so that thresholds mean the same for every camera."""
+MIN_FLOW = 0.5
+"""Pixels of median flow, at 320 pixels width, under which a frame counts as static."""
+
+
+class Frame(NamedTuple):
+    """One frame of one camera."""
+
+    drive: str
+    """``<date>/<drive>``."""
+    number: int
+    side: str
+    """``l`` or ``r``."""
+
+    def __str__(self) -> str:
+        return f"{self.drive} {self.number:010d} {self.side}"
+
+
+Parts = tuple[list[Frame], list[Frame]]
+"""Training and validation frames."""
+
+
+def hold_out_drives(frames: Sequence[Frame], drives: Iterable[str]) -> Parts:
+    """Put the frames of the named drives into validation; a name may be the end of ``<date>/<drive>``."""
+    held, known = set(), sorted({frame.drive for frame in frames})
+    for name in drives:
+        fitting = [drive for drive in known if drive == name or drive.endswith(f"/{name}")]
+        if not fitting:
+            raise ConfigError(f"no drive '{name}' to hold out; drives: {', '.join(known[:40])}")
+        held.update(fitting)
+    return [f for f in frames if f.drive not in held], [f for f in frames if f.drive in held]
+
+
+def hold_out_random(frames: Iterable[Frame], share: float, seed: int) -> Parts:
+    """Put a seeded random share of the frames, each camera for itself, into validation."""
+    ordered = sorted(frames)
+    drawn = np.random.default_rng(seed).permutation(len(ordered))[: math.ceil(share * len(ordered))]
+    chosen = {ordered[place] for place in drawn}
+    return [frame for frame in ordered if frame not in chosen], [frame for frame in ordered if frame in chosen]
+
+
+def hold_out_tails(frames: Sequence[Frame], share: float, gap: int) -> Parts:
+    """Put the last share of each drive into validation, and leave out ``gap`` frames before it.
+
+    With a gap as long as the farthest neighbors of both sides, no validation window shares a frame with a training
+    window.
+    """
+    numbers: dict[str, set[int]] = {}
+    for frame in frames:
+        numbers.setdefault(frame.drive, set()).add(frame.number)
+    first_held = {}
+    for drive, each in numbers.items():
+        held = math.ceil(share * len(each))
+        first_held[drive] = sorted(each)[-held] if held else max(each) + gap + 1
+    train = [frame for frame in frames if frame.number < first_held[frame.drive] - gap]
+    return train, [frame for frame in frames if frame.number >= first_held[frame.drive]]
+
+
+def hold_out(frames: Sequence[Frame], share: float, gap: int, seed: int) -> Parts:
+    """Hold out whole drives, drawn by seed, where there are ten or more; the tails of all drives where there are fewer.
+
+    Drives are added until they hold the share; a drive that would exceed twice the share is passed over. ``gap`` frames
+    are left out between a training part and a held-out tail.
+    """
+    counts = Counter(frame.drive for frame in frames)
+    if len(counts) < 10:
+        return hold_out_tails(frames, share, gap)
+    held: list[str] = []
+    wanted, total = share * len(frames), 0
+    names = sorted(counts)
+    for place in np.random.default_rng(seed).permutation(len(names)):
+        if total < wanted and total + counts[names[place]] <= 2 * wanted:
+            held.append(names[place])
+            total += counts[names[place]]
+    return hold_out_drives(frames, held)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Frames to leave out of training and validation: what ``saunet doctor`` writes and ``data.manifest=`` reads."""
+
+    leave_out: Mapping[str, Mapping[str, Sequence[int]]]
+    """Drive -> reason -> frame numbers."""
+    numbering: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    path: Path = Path("manifest.json")
+    test_only: Set[str] = frozenset()
+
+    def check(self, names: Set[str]) -> None:
+        """Check that the manifest is of these drives; warn where some of its drives are not among them."""
+        mine = self.leave_out.keys() - self.test_only
+        strange = sorted(mine - names)
+        if not strange:
+            return
+        listed = f"such as '{strange[0]}'" + (f"; here they are called '{min(names)}'" if names else "")
+        if len(strange) == len(mine):
+            raise DataError(
+                f"{self.path} names {len(mine)} recordings and none of them is trained on ({listed}...); make it with "
+                "saunet doctor and the data settings of this run, or set data.manifest=null"
+            )
+        rank_zero_warn(
+            f"{self.path} names {len(mine)} recordings, and {len(strange)} of them are not trained on ({listed}...); "
+            "if they should be, run saunet doctor again with the data settings of this run"
+        )
+
+    def apply(self, selection: Selection, offsets: Sequence[int]) -> Selection:
+        """Return a selection without the frames to leave out, counted by reason."""
+        name, numbering = selection.drive.name, selection.drive.numbering
+        if self.numbering.get(name, numbering) != numbering:
+            raise DataError(
+                f"{self.path} was made for '{name}' with {self.numbering[name] or 'other settings'} and it is now read "
+                f"with {numbering or 'other settings'}, which counts its frames differently; "
+                "run saunet doctor again with the settings of this run, or set data.manifest=null"
+            )
+        kept, left_out = list(selection.frames), dict(selection.left_out)
+        for reason, numbers in self.leave_out.get(name, {}).items():
+            unwanted = set(numbers)
+            if reason == UNREADABLE:
+                unwanted |= {number - offset for number in numbers for offset in offsets}
+            before = len(kept)
+            kept = [frame for frame in kept if frame not in unwanted]
+            left_out[f"{reason} (manifest)"] = before - len(kept)
+        return Selection(selection.drive, kept, left_out)
+
+
+def write_manifest(path: str | Path, manifest: Manifest) -> None:
+    """Write a manifest, whole or not at all."""
+    leave_out = {
+        drive: {reason: sorted(numbers) for reason, numbers in reasons.items()}
+        for drive, reasons in manifest.leave_out.items()
+    }
+    more = {"numbering": dict(manifest.numbering), "test_only": sorted(manifest.test_only), "leave_out": leave_out}
+    write_json(path, {"format": FORMAT, **manifest.facts, **more}, indent=1)
+
+
+def read_manifest(path: str | Path) -> Manifest:
+    """Read a manifest."""
+    path = Path(path).expanduser()
+    try:
+        plain = read_json(path)
+    except FileNotFoundError as reason:
+        raise DataError(f"no manifest at {path}; make one with saunet doctor, or set data.manifest=null") from reason
+    except (OSError, ValueError) as reason:
+        raise DataError(f"{reason}; make it again with saunet doctor") from reason
+    if not isinstance(plain, dict) or plain.get("format") != FORMAT:
+        found = plain.get("format") if isinstance(plain, dict) else type(plain).__name__
+        raise DataError(f"{path} is not a manifest of format {FORMAT} (found {found}); make it with saunet doctor")
+    leave_out, numbered = plain.get("leave_out"), plain.get("numbering", {})
+    if not isinstance(leave_out, dict) or not isinstance(numbered, dict) or not all(map(_is_entry, leave_out.values())):
+        raise DataError(
+            f"{path}: 'leave_out' must map each drive to reasons and these to lists of frame numbers, such as "
+            '{"clip l": {"static": [4, 5]}}'
+        )
+    test_only = frozenset(map(str, plain.get("test_only") or ()))
+    return Manifest(leave_out, {str(key): str(value) for key, value in numbered.items()}, {}, path, test_only)
+
+
+def _is_entry(reasons: Any) -> bool:
+    return isinstance(reasons, dict) and all(
+        isinstance(numbers, list) and all(isinstance(number, int) for number in numbers) for numbers in reasons.values()
+    )
+
+
+def median_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
+    """Return the median length of the optical flow between two images, in pixels of an image 320 pixels wide."""
+    return float(np.median(np.linalg.norm(optical_flow(first, second), axis=-1)))
+
+
+def optical_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the optical flow between two images, h x w x 2, in pixels of an image 320 pixels wide."""
+    before, after = _small(first), _small(second)
+    flow = np.zeros((*before.shape, 2), np.float32)
+    measure = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    return np.asarray(measure.calc(before, after, flow), dtype=np.float32)
+
+
+def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height = max(32, round(image.shape[0] * FLOW_WIDTH / image.shape[1]))
+    small = cv2.resize(image, (FLOW_WIDTH, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def static_by_flow(drive: Drive, frames: Sequence[int], min_flow: float, *, skip_unreadable: bool = False) -> set[int]:
+    """Return the frames that look like the frame before them (after them for the first), each image decoded once."""
+    existing, wanted = set(drive.indices), set(frames)
+    static: set[int] = set()
+    last: tuple[int, NDArray[np.uint8]] | None = None
+    for frame in sorted(existing & {each + step for each in wanted for step in (-1, 0, 1)}):
+        try:
+            image = drive.image(frame)
+            check_frame(drive, frame, image)
+        except DataError:
+            if not skip_unreadable:
+                raise
+            existing.discard(frame)  # the frame after it is then judged as a first one
+            continue
+        if last is not None and last[0] == frame - 1 and median_flow(last[1], image) < min_flow:
+            static.add(frame)
+            if frame - 2 not in existing:
+                static.add(frame - 1)
+        last = (frame, image)
+    return static & wanted
+
+
+def moving(selection: Selection, *, by_speed: bool, skip_unreadable: bool = False) -> Selection:
+    """Return a selection without the frames in which the car stands, and their count as ``static``.
+
+    They teach nothing, since nothing moves between neighbors.
+    """
+    drive, existing = selection.drive, set(selection.drive.indices)
+    frames = [frame for frame in selection.frames if frame in existing]
+    speeds = {frame: _speed(drive, frame, skip_unreadable) if by_speed else None for frame in frames}
+    static = {frame for frame, speed in speeds.items() if speed is not None and speed < MIN_SPEED}
+    unknown = [frame for frame, speed in speeds.items() if speed is None]
+    static |= static_by_flow(drive, unknown, MIN_FLOW, skip_unreadable=skip_unreadable)
+    kept = [frame for frame in selection.frames if frame not in static]
+    return Selection(drive, kept, {**selection.left_out, "static": len(static)})
+
+
+def has_speed(selection: Selection, skip_unreadable: bool = False) -> bool:
+    """Return whether the speed is known in any of the frames."""
+    return any(_speed(selection.drive, frame, skip_unreadable) is not None for frame in selection.frames)
+
+
+def _speed(drive: Drive, frame: int, skip_unreadable: bool) -> float | None:
+    """Return the speed in m/s; None where it is unknown, with ``skip_unreadable`` also for a broken record."""
+    try:
+        return drive.speed(frame)
+    except DataError as error:
+        if not skip_unreadable:
+            raise
+        warnings.warn(f"speed unknown: {error}", stacklevel=2)
+        return None
+
+
+def readable(selection: Selection, offsets: Sequence[int], with_depth: bool) -> Selection:
+    """Return a selection without the frames that cannot be read, themselves or a neighbor, each decoded once."""
+    drive, window = selection.drive, (0, *offsets)
+    broken = set()
+    for frame in sorted({each + offset for each in selection.frames for offset in window}.intersection(drive.indices)):
+        try:
+            check_frame(drive, frame, drive.image(frame))
+            drive.intrinsics(frame)
+            if with_depth and frame in selection.frames:
+                drive.depth(frame)
+        except DataError as error:
+            broken.add(frame)
+            warnings.warn(f"frame left out: {error}", stacklevel=2)
+    kept = [frame for frame in selection.frames if not any(frame + offset in broken for offset in window)]
+    lost = len(selection.frames) - len(kept)
+    return Selection(drive, kept, {**selection.left_out, "unreadable": lost})
