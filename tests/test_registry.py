@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 import saunet
 from saunet.cli.compose import structured
 from saunet.errors import ConfigError
-from saunet.registry import REGISTRIES, Registry, Spec, encoders, instantiate
+from saunet.registry import REGISTRIES, Registry, Spec, encoders, find, instantiate, terms
 
 
 class Widget:
@@ -121,3 +121,11 @@ def test_a_spec_is_built_later_with_changes() -> None:
     assert spec.changed(frames=2).build().features == spec.build().features
     with pytest.raises(ConfigError, match="did you mean 'weights'"):
         Spec.of("encoder", "resnet18", wieghts=None)
+
+
+def test_a_component_that_moved_to_another_module_is_found() -> None:
+    moved = find("saunet.losses.terms.of_another_day.Photometric")
+    assert moved is not None
+    assert moved.target is terms.entry("photometric").target
+    assert find("saunet.losses.terms.of_another_day.Monet") is None
+    assert find("elsewhere.Photometric") is None

@@ -52,7 +52,7 @@ class Registry:
     Args:
         kind: What the components are, in the singular: ``"encoder"``.
         group: Hydra config group their nodes are stored in: ``"model/encoder"``; None keeps them out of the config.
-        home: Package whose modules register the built-in components; imported on first use.
+        home: Module, or package of modules, that registers the built-in components; imported on first use.
         late: Parameters that the caller supplies when the rest of the system is known (a decoder's ``features``).
 
     Examples:
@@ -136,15 +136,23 @@ class Registry:
         return list(self._entries.values())
 
     def by_path(self, path: str) -> Entry | None:
-        """Return the entry with an import path, None if it is not registered; imports nothing outside of the home."""
-        module = path.rpartition(".")[0]
-        if module == self.home or module.startswith(f"{self.home}."):
+        """Return the entry with an import path, None if it is not registered; imports nothing outside of the home.
+
+        Inside the home the class alone counts, so that a checkpoint outlives a move of the class to another module.
+        """
+        module, _, name = path.rpartition(".")
+        at_home = f"{module}.".startswith(f"{self.home}.")
+        if at_home:
             self._import_home() if module not in self._modules() else importlib.import_module(module)
-        return next((entry for entry in self._entries.values() if entry.path == path), None)
+        for entry in self._entries.values():
+            owner, _, known = entry.path.rpartition(".")
+            if entry.path == path or (at_home and known == name and f"{owner}.".startswith(f"{self.home}.")):
+                return entry
+        return None
 
     def _modules(self) -> list[str]:
         package = importlib.import_module(self.home)
-        return [module.name for module in pkgutil.walk_packages(package.__path__, f"{self.home}.")]
+        return [module.name for module in pkgutil.walk_packages(getattr(package, "__path__", ()), f"{self.home}.")]
 
     def _import_home(self) -> None:
         if self._imported:

@@ -16,8 +16,7 @@ from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.geometry.warp import synthesize
 from saunet.losses.functional import photometric_error
-from saunet.losses.terms.photometric import Photometric
-from saunet.losses.terms.velocity import Velocity
+from saunet.losses.terms import Photometric, Velocity
 from saunet.synthetic import SyntheticDrive
 from saunet.types import DepthPyramid
 

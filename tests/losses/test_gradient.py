@@ -12,8 +12,7 @@ from torch import Tensor
 from saunet.errors import ConfigError
 from saunet.geometry.depth import median_ratio
 from saunet.losses.functional import pool_known, smoothness_loss
-from saunet.losses.terms.gradient import Gradient
-from saunet.losses.terms.smoothness import Smoothness
+from saunet.losses.terms import Gradient, Smoothness
 from saunet.types import DepthPyramid
 
 Load = Callable[[str], Mapping[str, Any]]

@@ -16,11 +16,8 @@ import saunet
 from saunet.cli.compose import structured
 from saunet.errors import ConfigError
 from saunet.losses.base import Objective, Term, TermResult
-from saunet.losses.objectives.monodepth2 import Monodepth2Objective
-from saunet.losses.objectives.saunet import SaunetObjective
-from saunet.losses.terms.gradient import Gradient
-from saunet.losses.terms.photometric import Monodepth2Photometric, Photometric
-from saunet.losses.terms.smoothness import Smoothness
+from saunet.losses.objectives import Monodepth2Objective, SaunetObjective
+from saunet.losses.terms import Gradient, Monodepth2Photometric, Photometric, Smoothness
 from saunet.registry import instantiate, objectives
 from saunet.types import DepthPyramid, LossTerms, View
 

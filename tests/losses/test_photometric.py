@@ -12,8 +12,8 @@ from torch import Tensor
 from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.geometry.warp import synthesize
-from saunet.losses.terms import photometric as module
-from saunet.losses.terms.photometric import Monodepth2Photometric, Photometric
+from saunet.losses import terms as module
+from saunet.losses.terms import Monodepth2Photometric, Photometric
 from saunet.types import DepthPyramid, View
 
 Load = Callable[[str], Mapping[str, Any]]

@@ -10,10 +10,8 @@ import torch
 
 from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
-from saunet.losses.objectives.monodepth2 import Monodepth2Objective
-from saunet.losses.objectives.saunet import SaunetObjective
-from saunet.losses.terms.consistency import Consistency
-from saunet.losses.terms.velocity import Velocity
+from saunet.losses.objectives import Monodepth2Objective, SaunetObjective
+from saunet.losses.terms import Consistency, Velocity
 from saunet.types import DepthPyramid
 
 Make = Callable[..., Any]

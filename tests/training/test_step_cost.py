@@ -12,8 +12,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from saunet.data.loading.module import DepthDataModule
-from saunet.losses import functional
-from saunet.losses.terms import photometric
+from saunet.losses import functional, terms
 from saunet.registry import objectives
 from saunet.training.health import health
 from saunet.training.module import SelfSupervisedDepth
@@ -97,7 +96,7 @@ def test_identity_losses_once_and_one_ssim_pass_a_scale(
         return ssim(prediction, target)
 
     monkeypatch.setattr(functional, "ssim_loss", counted)
-    assert photometric.photometric_error is functional.photometric_error  # which looks ssim_loss up when it is called
+    assert terms.photometric_error is functional.photometric_error  # which looks ssim_loss up when it is called
     walls.setup("fit")
     batch: Any = walls.on_after_batch_transfer(next(iter(walls.train_dataloader())), 0)
     _, views, _ = model.step(batch)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from saunet.geometry.precision import full_precision
+from saunet.geometry import full_precision
 
 Number = float | int | Float[Tensor, "*b"]
 
@@ -33,14 +33,8 @@ def scale_intrinsics(K: Float[Tensor, "*b 3 3"], scale_x: Number, scale_y: Numbe
                 [ 0.0000, 50.0000, 14.5000]])
     """
     x, y = _per_item(scale_x, K), _per_item(scale_y, K)
-    return torch.stack(
-        (
-            x * K[..., 0, :] + (0.5 * x - 0.5) * K[..., 2, :],
-            y * K[..., 1, :] + (0.5 * y - 0.5) * K[..., 2, :],
-            K[..., 2, :],
-        ),
-        dim=-2,
-    )
+    across, down, last = K.unbind(-2)
+    return torch.stack((x * across + (0.5 * x - 0.5) * last, y * down + (0.5 * y - 0.5) * last, last), dim=-2)
 
 
 @full_precision
@@ -60,8 +54,8 @@ def crop_intrinsics(K: Float[Tensor, "*b 3 3"], left: Number, top: Number) -> Fl
         >>> saunet.crop_intrinsics(K, left=10, top=4)[:2, 2]
         tensor([39.5000, 25.5000])
     """
-    x, y = _per_item(left, K), _per_item(top, K)
-    return torch.stack((K[..., 0, :] - x * K[..., 2, :], K[..., 1, :] - y * K[..., 2, :], K[..., 2, :]), dim=-2)
+    across, down, last = K.unbind(-2)
+    return torch.stack((across - _per_item(left, K) * last, down - _per_item(top, K) * last, last), dim=-2)
 
 
 @full_precision
@@ -82,9 +76,9 @@ def flip_intrinsics(K: Float[Tensor, "*b 3 3"], width: Number) -> Float[Tensor, 
         >>> saunet.flip_intrinsics(K, width=100)[0, 2]
         tensor(59.)
     """
-    shift = (_per_item(width, K) - 1) * K[..., 2, :]
-    mirrored = torch.cat((K[..., 0, :1], -K[..., 0, 1:]), dim=-1)
-    return torch.stack((mirrored + shift, K[..., 1, :], K[..., 2, :]), dim=-2)
+    across, down, last = K.unbind(-2)
+    mirrored = torch.cat((across[..., :1], -across[..., 1:]), dim=-1)
+    return torch.stack((mirrored + (_per_item(width, K) - 1) * last, down, last), dim=-2)
 
 
 def _per_item(value: Number, K: Tensor) -> Tensor | float:

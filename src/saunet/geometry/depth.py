@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from saunet.geometry.precision import full_precision
+from saunet.geometry import full_precision
 
 
 @full_precision
@@ -50,10 +50,9 @@ def disparity_to_depth(disparity: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 def median_ratio(
     prediction: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"], mask: Bool[Tensor, "b 1 h w"]
 ) -> Float[Tensor, " b"]:
-    """Per-image scale that brings a prediction to its target: median(target) / median(prediction) over the mask.
+    """Per-image scale median(target) / median(prediction) over the mask, without leaving the device.
 
-    The median of an even count is the mean of the two middle values (as in NumPy, unlike ``torch.median``). Works
-    without leaving the device.
+    The median of an even count is the mean of the two middle values, as in NumPy and unlike ``torch.median``.
     """
     ratio = _median(target, mask) / _median(prediction, mask)
     return torch.where(mask.flatten(1).any(1), ratio, torch.ones_like(ratio))

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from saunet.errors import in_range, positive
-from saunet.geometry.precision import full_precision
+from saunet.geometry import full_precision
 from saunet.geometry.warp import backproject
 
 _MOST_POINTS = 2000
@@ -32,11 +32,11 @@ class GroundPlane(NamedTuple):
     height: Float[Tensor, " b"]
     """Distance from the camera to the plane, in the unit of the depth; NaN where there is no plane."""
     support: Float[Tensor, " b"]
-    """Share of the pixels looked at that lie on the plane, 0 to 1."""
+    """Fraction of the pixels looked at that lie on the plane."""
 
 
 def road_region(height: int, width: int, device: torch.device | None = None) -> Bool[Tensor, "{height} {width}"]:
-    """Return where a camera that looks ahead expects road: a trapezium in the lower two fifths of the image."""
+    """Where a camera that looks ahead expects road: a trapezium in the lower two fifths of the image."""
     v = (torch.arange(height, device=device)[:, None] + 0.5) / height
     u = (torch.arange(width, device=device) + 0.5) / width
     depth_in_image = (v - 0.6) / 0.4
@@ -65,9 +65,6 @@ def fit_ground(
         tolerance: Relative depth error up to which a pixel belongs to the plane.
         max_tilt: Largest angle between the plane's normal and the camera's y axis, degrees.
         hypotheses: Number of planes tried.
-
-    Raises:
-        ConfigError: if a number is out of range.
     """
     in_range("tolerance", tolerance, 0, 1)
     in_range("max_tilt", max_tilt, 0, 90)
@@ -77,14 +74,13 @@ def fit_ground(
     places = region.flatten().nonzero()[:, 0]
     z = depth.double().flatten(1)[:, places]
     rays = backproject(torch.ones_like(depth, dtype=torch.float64), K.double()).flatten(2)[:, :, places]
-    known = (z > 0) & z.isfinite()
-    z = torch.where(known, z, 1.0)
-    planes = [
-        _fit(rays[i].T[known[i]], z[i][known[i]], tolerance, math.cos(math.radians(max_tilt)), hypotheses)
-        for i in range(len(z))
-    ]
-    normal, height, support = (torch.stack(column) for column in zip(*planes, strict=True))
-    return GroundPlane(normal.to(depth), height.to(depth), support.to(depth))
+    upright = math.cos(math.radians(max_tilt))
+    planes = []
+    for each, ray in zip(z, rays, strict=True):
+        known = (each > 0) & each.isfinite()
+        planes.append(_fit(ray.T[known], each[known], tolerance, upright, hypotheses))
+    normal, height, support = (torch.stack(column).to(depth) for column in zip(*planes, strict=True))
+    return GroundPlane(normal, height, support)
 
 
 def _fit(
@@ -112,10 +108,9 @@ def _fit(
         weight = torch.where(expected > 0, (1 - (error / tolerance).square()).clamp(min=0).square(), 0.0)
         A, b = rays / expected[:, None], 1 / (z * expected)
         weighted = A.T * weight
-        refined, info = torch.linalg.solve_ex(weighted @ A, weighted @ b)
-        if info != 0 or not _is_ground(refined, upright):
+        g, info = torch.linalg.solve_ex(weighted @ A, weighted @ b)
+        if info != 0 or not _is_ground(g, upright):
             return nothing
-        g = refined
     length = torch.linalg.vector_norm(g)
     on_plane = ((rays @ g * z - 1).abs() < tolerance).to(z).mean()
     return g / length, 1 / length, on_plane
@@ -124,6 +119,5 @@ def _fit(
 def _is_ground(g: Float[Tensor, "*n 3"], upright: float) -> Bool[Tensor, "*n"]:
     """Whether planes g . p = 1 lie below the camera and are about level."""
     length = torch.linalg.vector_norm(g, dim=-1)
-    level: Tensor = g[..., 1] > upright * length
-    below: Tensor = level & g.isfinite().all(-1) & (length > 0)
+    below: Tensor = (g[..., 1] > upright * length) & g.isfinite().all(-1) & (length > 0)
     return below

@@ -1,8 +1,4 @@
-"""Rigid motions: 6-vector <-> SE(3).
-
-Plain multiplications instead of matrix products: on GPUs a float32 matrix product may run in TF32 (ten bits), which
-moves a warped pixel by a visible fraction of its width.
-"""
+"""Rigid motions, without matrix products: on a GPU these may run in TF32 (ten bits), which visibly moves a pixel."""
 
 from __future__ import annotations
 
@@ -10,17 +6,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from saunet.geometry.precision import full_precision
+from saunet.geometry import full_precision
 
 _SMALL_ANGLE_SQUARED = 1e-2
 
 
 @full_precision
 def axisangle_to_matrix(axisangle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotation matrices of axis-angle vectors: the exact exponential map of so(3).
-
-    Values and gradients are exact at and around the angle 0, where the textbook formula divides zero by zero.
-    """
+    """Rotations of axis-angle vectors, exact also around the angle 0, where the textbook formula is 0 / 0."""
     squared = axisangle.square().sum(-1)
     small = squared < _SMALL_ANGLE_SQUARED
     # The branch that is not taken must stay finite too: its gradient is multiplied by zero, and 0 * inf is NaN.

@@ -1,8 +1,7 @@
 """View synthesis: resample source images into the target camera, given its depth and the motion between them.
 
 The pixel convention of the whole project lives here: integer coordinates are pixel centers, and a sampling grid is
-normalized by (W - 1, H - 1) with ``align_corners=True``. Everything is plain multiplication instead of matrix products,
-because a float32 matrix product may run in TF32 on a GPU, where the coordinate of a pixel is good to half a pixel only.
+normalized by (W - 1, H - 1) with ``align_corners=True``. As in `saunet.geometry.pose` nothing is a matrix product.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from saunet.geometry.precision import full_precision
+from saunet.geometry import full_precision
 from saunet.types import View
 
 MIN_Z = 1e-3

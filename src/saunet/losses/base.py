@@ -33,12 +33,11 @@ class Term(nn.Module):
     needs_source_depth: bool = False
     """Whether the batch must hold ``source_depth``, the depth network's answer for the sources."""
 
+    def __init__(self) -> None:
+        super().__init__()
+
     def forward(
-        self,
-        batch: TrainBatch,
-        pyramid: DepthPyramid,
-        poses: Float[Tensor, "b s 4 4"],
-        views: Sequence[View],
+        self, batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"], views: Sequence[View]
     ) -> TermResult:
         """Return the term's value for one batch.
 
@@ -47,9 +46,6 @@ class Term(nn.Module):
             pyramid: The predicted depth of the target, one map per scale.
             poses: The predicted motion T_src_tgt.
             views: The sources resampled into the target camera, one view per scale, all at full resolution.
-
-        Raises:
-            ConfigError: if the batch lacks what the term needs.
         """
         raise NotImplementedError(f"{type(self).__name__} has no forward")
 
@@ -63,9 +59,6 @@ class Objective(nn.Module):
         extra: Name -> mapping of ``weight``, optionally ``term`` (a registered name, by default the name itself, or a
             `Term`), and the parameters of that term: ``{"smoothness": {"weight": 0.001}}``. On the command line:
             ``+objective.extra.smoothness.weight=0.001``.
-
-    Raises:
-        ConfigError: for a negative weight, no positive weight, a name given twice, or an unknown extra term.
     """
 
     def __init__(self, terms: Mapping[str, Term], weights: Mapping[str, float], extra: Mapping[str, Any]) -> None:
@@ -91,11 +84,7 @@ class Objective(nn.Module):
         return any(getattr(term, "needs_source_depth", False) for term in self.terms.values())
 
     def forward(
-        self,
-        batch: TrainBatch,
-        pyramid: DepthPyramid,
-        poses: Float[Tensor, "b s 4 4"],
-        views: Sequence[View],
+        self, batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"], views: Sequence[View]
     ) -> LossTerms:
         """Return the weighted sum, each term before its weight, and the terms' maps; arguments as for `Term`."""
         results: dict[str, TermResult] = {name: term(batch, pyramid, poses, views) for name, term in self.terms.items()}
@@ -108,7 +97,7 @@ class Objective(nn.Module):
 
 
 def require(batch: TrainBatch, key: str, term: str, fix: str) -> Float[Tensor, "..."]:
-    """Return ``batch[key]``."""
+    """Return ``batch[key]``, or say which term misses it and what to do."""
     if key not in batch:
         raise ConfigError(f"{term} needs '{key}' in the batch, which the data does not give; {fix}")
     value: Tensor = batch[key]  # type: ignore[literal-required]

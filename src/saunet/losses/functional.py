@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from saunet.errors import one_of
-from saunet.geometry.precision import full_precision
+from saunet.geometry import full_precision
 
 _C1, _C2 = 0.01**2, 0.03**2
 
@@ -136,9 +136,8 @@ def masked_mean(
 ) -> Float[Tensor, ""]:
     """Mean over the images of each image's ``sum(values * mask) / max(sum(mask), 1)``; 0 with a graph for empty masks.
 
-    An image counts as one whatever its mask keeps, so a batch may be split over processes or passes in any way: the
-    loss is the mean of the parts' losses. One mean over all kept pixels would depend on the split. Values may be
-    anything, even NaN, where the mask is 0.
+    An image counts as one whatever its mask keeps, so that the loss does not depend on how a batch is split over
+    processes or passes. Values may be anything, even NaN, where the mask is 0.
     """
     mask = mask.expand_as(values).flatten(1)
     values = values.flatten(1)
@@ -171,16 +170,13 @@ def smoothness_loss(disparity: Float[Tensor, "b 1 h w"], image: Float[Tensor, "b
 
 @full_precision
 def forward_differences(x: Float[Tensor, "b c h w"]) -> tuple[Float[Tensor, "b c h w-1"], Float[Tensor, "b c h-1 w"]]:
-    """Differences to the right and to the lower neighbor, the g of SAU-Net eq. (13); the border has no partner."""
+    """Differences to the right and to the lower neighbor, the g of SAU-Net eq. (13)."""
     return x[..., :, 1:] - x[..., :, :-1], x[..., 1:, :] - x[..., :-1, :]
 
 
 @full_precision
 def sobel(x: Float[Tensor, "b c h w"], padding: str = "replicate") -> tuple[Float[Tensor, "b c h w"], ...]:
-    """Un-normalized 3x3 Sobel gradients (x: left minus right, y: top minus bottom), as LapDepth uses them.
-
-    LapDepth's ``zero`` padding makes border pixels compare values instead of gradients.
-    """
+    """LapDepth's un-normalized 3x3 Sobel gradients (x: left minus right, y: top minus bottom)."""
     one_of("padding", padding, ("replicate", "zero"))
     padded = F.pad(x, (1, 1, 1, 1), mode="replicate" if padding == "replicate" else "constant")
     across = padded[..., :, :-2] - padded[..., :, 2:]

@@ -13,7 +13,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 
 from saunet.errors import in_range, positive
-from saunet.geometry.precision import full_precision
+from saunet.geometry import full_precision
 from saunet.types import DepthPyramid, LossTerms
 
 FAR = 0.8

@@ -1,1 +1,0 @@
-"""Registered objectives: weighted compositions of terms."""
