@@ -8,8 +8,7 @@ import torch
 
 from saunet.errors import ConfigError
 from saunet.models.depth import DepthNet
-from saunet.models.encoders.lite_mono import DilatedBlock
-from saunet.models.layers.xca import CrossCovarianceAttention, FourierPosition
+from saunet.models.encoders.lite_mono import CrossCovarianceAttention, DilatedBlock, FourierPosition
 from saunet.registry import decoders, encoders
 from saunet.types import FeatureSpec
 
@@ -112,7 +111,7 @@ def test_wrong_drop_path():
 
 
 def test_decoder_needs_a_level():
-    with pytest.raises(ConfigError, match="deepest stride is 2; decoder 'lite_mono' needs at least 4"):
+    with pytest.raises(ConfigError, match=r"deepest stride is 2; .* needs at least 4"):
         decoders.build("lite_mono", features=(FeatureSpec(8, 2),))
 
 

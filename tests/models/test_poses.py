@@ -9,7 +9,7 @@ import torch
 from saunet.errors import ConfigError
 from saunet.geometry.pose import invert_pose
 from saunet.models.encoders.resnet import ResNet
-from saunet.models.poses.base import MOTION_SCALE, motions_to_sources
+from saunet.models.poses import MOTION_SCALE, motions_to_sources
 from saunet.registry import poses
 
 BLOCKS = (1, 1, 1, 1)

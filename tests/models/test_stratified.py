@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from saunet.errors import ConfigError
 from saunet.models.encoders.stratified import StratifiedTransformer
 from saunet.models.layers import window
-from saunet.models.layers.drop_path import DropPath
+from saunet.models.layers.conv import DropPath
 from saunet.registry import encoders
 from saunet.training.speed import Speed
 

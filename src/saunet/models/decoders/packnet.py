@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from saunet.errors import ConfigError
-from saunet.models.decoders.base import by_level, check_scales
+from saunet.models.decoders.base import Decoder
 from saunet.models.layers.conv import DisparityHead
 from saunet.models.layers.packing import GROUPS, ConvNormELU, Unpacking, initialize
 from saunet.registry import decoders
@@ -20,7 +20,7 @@ _MIN_DEPTH = 0.5
 
 
 @decoders.register("packnet")
-class PackNetDecoder(nn.Module):
+class PackNetDecoder(Decoder):
     """Unpack, join with the skip and the coarser disparity, convolve (PackNet Table 1, version with concatenation).
 
     As in the published code, a level hands sigmoid / 0.5 to the next finer one, the heads pad with zeros, and weights
@@ -32,9 +32,6 @@ class PackNetDecoder(nn.Module):
         features: The encoder's features, finest first.
         channels: Channels at 1/1, 1/2, 1/4, 1/8, 1/16, multiples of 32; a deepest stride of 16 needs only four.
         scales: Scales to predict disparity at, finest first.
-
-    Raises:
-        ConfigError: if the features' strides, the channels or the scales cannot work.
     """
 
     def __init__(
@@ -43,20 +40,16 @@ class PackNetDecoder(nn.Module):
         channels: Sequence[int] = (64, 64, 128, 256, 512),
         scales: Sequence[int] = (0, 1, 2, 3),
     ) -> None:
-        super().__init__()
-        skips = by_level(features)
-        deepest = max(skips)
-        if len(channels) < deepest or any(c < 1 or c % (2 * GROUPS) for c in channels):
+        super().__init__(features, scales)
+        if len(channels) < self.deepest or any(c < 1 or c % (2 * GROUPS) for c in channels):
             raise ConfigError(
-                f"channels is {list(channels)}; needed: {deepest} multiples of {2 * GROUPS}, a level each"
+                f"channels is {list(channels)}; needed: {self.deepest} multiples of {2 * GROUPS}, a level each"
             )
-        self.skip_levels = tuple(skips)
-        self.scales = check_scales(scales, deepest)
-        unpackings, joins, inputs = [], [], skips[deepest]
-        for level in range(deepest - 1, -1, -1):
+        unpackings, joins, inputs = [], [], self.skips[self.deepest]
+        for level in range(self.deepest - 1, -1, -1):
             coarser_disparity = 1 if level + 1 < len(self.scales) else 0
             unpackings.append(Unpacking(inputs, channels[level]))
-            joins.append(ConvNormELU(channels[level] + skips.get(level, 0) + coarser_disparity, channels[level]))
+            joins.append(ConvNormELU(channels[level] + self.skips.get(level, 0) + coarser_disparity, channels[level]))
             inputs = channels[level]
         self.unpackings = nn.ModuleList(unpackings)
         self.joins = nn.ModuleList(joins)
@@ -66,9 +59,8 @@ class PackNetDecoder(nn.Module):
             head.start_bias()  # type: ignore[operator]
 
     def forward(self, features: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Return sigmoid disparity, b 1 h/2**s w/2**s, for each scale s."""
-        skips = dict(zip(self.skip_levels, features, strict=True))
-        level = self.skip_levels[-1]
+        skips = dict(zip(self.skips, features, strict=True))
+        level = self.deepest
         x = skips[level]
         maps: list[Tensor] = []
         for unpack, join in zip(self.unpackings, self.joins, strict=True):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -15,27 +14,16 @@ from saunet.registry import encoders
 from saunet.types import FeatureSpec
 
 _STEM = 32
-
-
-class _Stage(NamedTuple):
-    """A row of EfficientNet-B0's table, before the width and depth factors."""
-
-    blocks: int
-    kernel: int
-    stride: int
-    expansion: int
-    channels: int
-
-
 _STAGES = (
-    _Stage(1, 3, 1, 1, 16),
-    _Stage(2, 3, 2, 6, 24),
-    _Stage(2, 5, 2, 6, 40),
-    _Stage(3, 3, 2, 6, 80),
-    _Stage(3, 5, 1, 6, 112),
-    _Stage(4, 5, 2, 6, 192),
-    _Stage(1, 3, 1, 6, 320),
+    (1, 3, 1, 1, 16),
+    (2, 3, 2, 6, 24),
+    (2, 5, 2, 6, 40),
+    (3, 3, 2, 6, 80),
+    (3, 5, 1, 6, 112),
+    (4, 5, 2, 6, 192),
+    (1, 3, 1, 6, 320),
 )
+"""EfficientNet-B0's table: blocks, kernel, stride, expansion, channels; before the width and depth factors."""
 _VARIANTS = {(1.0, 1.0): "efficientnet_lite0", (1.0, 1.1): "efficientnet_lite1", (1.1, 1.2): "efficientnet_lite2"}
 
 
@@ -53,13 +41,16 @@ class SameConv2d(nn.Conv2d):
         )
 
     def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co _ _"]:
-        """Return the convolved map, at ceil(size / stride)."""
-        kernel, stride = self.kernel_size[0], self.stride[0]
-        if stride > 1:
-            top, bottom = _same_padding(x.shape[-2], kernel, stride)
-            left, right = _same_padding(x.shape[-1], kernel, stride)
+        if self.stride[0] > 1:
+            top, bottom = self._same_padding(x.shape[-2])
+            left, right = self._same_padding(x.shape[-1])
             x = F.pad(x, (left, right, top, bottom))
         return super().forward(x)
+
+    def _same_padding(self, size: int) -> tuple[int, int]:
+        kernel, stride = self.kernel_size[0], self.stride[0]
+        total = max((math.ceil(size / stride) - 1) * stride + kernel - size, 0)
+        return total // 2, total - total // 2
 
 
 class InvertedResidual(nn.Module):
@@ -79,7 +70,6 @@ class InvertedResidual(nn.Module):
         self.bn_project = _batch_norm(outputs)
 
     def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co _ _"]:
-        """Return the block's output at 1/stride of the size, plus the input where the shapes agree."""
         y: Tensor = x
         if self.expands:
             y = F.relu6(self.bn_expand(self.conv_expand(y)), inplace=True)
@@ -98,21 +88,13 @@ class EfficientNetLite(nn.Module):
     after its last block; the classifier and the 1×1 convolution before it are left out. The features are the outputs
     of the last block at each stride. Batch normalization has the published ε = 0.001 and momentum 0.99 (0.01 in
     PyTorch's sense), so its running statistics need several hundred steps when training starts from random weights.
+    ``variant`` is the usual name, empty for factors of one's own. The encoder itself takes images of any size.
 
     Args:
         width: Factor on the channels, rounded to multiples of 8; those of the stem stay.
         depth: Factor on the blocks of a stage, rounded up; those of the first and last stage stay.
         frames: RGB images stacked in the channels of the input: 1 for depth, 2 or 3 for pose.
         weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
-
-    Attributes:
-        features: Channels and stride of each feature map, finest first.
-        size_divisor: Input height and width must be multiples of it.
-        variant: The usual name, such as ``efficientnet_lite0``; empty for factors of one's own.
-
-    Raises:
-        ConfigError: if a factor is not above 0, or there is no frame.
-        CheckpointError: if ``weights`` cannot be found, fetched, read or fitted.
     """
 
     def __init__(self, width: float = 1.0, depth: float = 1.0, frames: int = 1, weights: str | None = None) -> None:
@@ -128,24 +110,25 @@ class EfficientNetLite(nn.Module):
         self.bn_stem = _batch_norm(_STEM)
         inputs, stride, blocks = _STEM, 2, []
         last: dict[int, tuple[int, FeatureSpec]] = {}  # by stride: the last block there and its output
-        for number, stage in enumerate(_STAGES):
-            outputs = _round_channels(stage.channels * width)
-            repeats = stage.blocks if number in (0, len(_STAGES) - 1) else math.ceil(stage.blocks * depth)
-            for block in range(repeats):
-                step = stage.stride if block == 0 else 1
-                blocks.append(InvertedResidual(inputs, outputs, stage.kernel, step, stage.expansion))
-                inputs, stride = outputs, stride * step
+        for number, (repeats, kernel, step, expansion, channels) in enumerate(_STAGES):
+            outputs = _round_channels(channels * width)
+            for _ in range(repeats if number in (0, len(_STAGES) - 1) else math.ceil(repeats * depth)):
+                blocks.append(InvertedResidual(inputs, outputs, kernel, step, expansion))
+                inputs, stride, step = outputs, stride * step, 1
             last[stride] = len(blocks) - 1, FeatureSpec(outputs, stride)
         self.blocks = nn.ModuleList(blocks)
         self.feature_blocks = tuple(index for index, _ in last.values())
         self.features = tuple(spec for _, spec in last.values())
         self.size_divisor = 32
-        _initialize(self)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                # kaiming_normal_ would count all channels of a depthwise convolution; its fan out is its kernel's area
+                fan_out = module.kernel_size[0] * module.kernel_size[1] * module.out_channels // module.groups
+                nn.init.normal_(module.weight, 0.0, math.sqrt(2 / fan_out))
         if weights is not None:
             load_pretrained(self, weights)
 
     def forward(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, ...]:
-        """Return the five feature maps of RGB in [0, 1], b c ceil(h/s) ceil(w/s), finest first; any h and w will do."""
         x = F.relu6(self.bn_stem(self.conv_stem((image * 255 - 127) / 128)), inplace=True)
         features = []
         for index, block in enumerate(self.blocks):
@@ -153,12 +136,6 @@ class EfficientNetLite(nn.Module):
             if index in self.feature_blocks:
                 features.append(x)
         return tuple(features)
-
-
-def _same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
-    """Return how many zeros TensorFlow's ``SAME`` puts before and behind a side of ``size``."""
-    total = max((math.ceil(size / stride) - 1) * stride + kernel - size, 0)
-    return total // 2, total - total // 2
 
 
 def _round_channels(channels: float) -> int:
@@ -169,14 +146,3 @@ def _round_channels(channels: float) -> int:
 
 def _batch_norm(channels: int) -> nn.BatchNorm2d:
     return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
-
-
-def _initialize(network: nn.Module) -> None:
-    """Draw convolutions from a normal distribution of variance 2 / fan out, as EfficientNet does.
-
-    A depthwise convolution's fan out is its kernel's area; ``kaiming_normal_`` would count all of its channels.
-    """
-    for module in network.modules():
-        if isinstance(module, nn.Conv2d):
-            fan_out = module.kernel_size[0] * module.kernel_size[1] * module.out_channels // module.groups
-            nn.init.normal_(module.weight, 0.0, math.sqrt(2 / fan_out))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -10,8 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.errors import ConfigError, in_range
-from saunet.models.layers.drop_path import DropPath
-from saunet.models.layers.xca import CrossCovarianceAttention, FourierPosition
+from saunet.models.layers.conv import DropPath
 from saunet.registry import encoders
 from saunet.types import FeatureSpec
 
@@ -39,14 +39,6 @@ class LiteMonoEncoder(nn.Module):
         heads: Heads of the channel attention.
         expansion: How much wider the pointwise layers are.
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
-
-    Attributes:
-        features: Channels and stride of each feature map, finest first.
-        size_divisor: Input height and width must be multiples of it.
-
-    Raises:
-        ConfigError: if there are not three stages of at least two blocks, a dilation rate is below 1 or ``rates`` is
-            empty, or the heads do not divide the channels.
     """
 
     mean: Tensor
@@ -95,7 +87,6 @@ class LiteMonoEncoder(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
-        """Return the three feature maps of RGB in [0, 1], b c h/s w/s, finest first."""
         pooled = (image - self.mean) / self.std
         parts = [self.stem(pooled)]
         features = []
@@ -121,21 +112,15 @@ class DilatedBlock(nn.Module):
         self.drop_path = DropPath(drop_path)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Return the refined map."""
-        y = self.norm(self._depthwise(x)).permute(0, 2, 3, 1)
-        y = self.scale * self.reduce(F.gelu(self.expand(y)))
-        out: Tensor = x + self.drop_path(y.permute(0, 3, 1, 2))
-        return out
-
-    def _depthwise(self, x: Tensor) -> Tensor:
-        out: Tensor
         if x.device.type == "cpu" and torch.is_autocast_enabled("cpu"):
             # On some processors torch 2.13.0 and 2.14.1 compute garbage as the weight gradient of a dilated depthwise
             # convolution in bfloat16 and channels-last; it is a small part of the work, so it runs in float32.
             with torch.autocast("cpu", enabled=False):
-                out = self.depthwise(x.float())
+                y = self.depthwise(x.float())
         else:
-            out = self.depthwise(x)
+            y = self.depthwise(x)
+        y = self.scale * self.reduce(F.gelu(self.expand(self.norm(y).permute(0, 2, 3, 1))))
+        out: Tensor = x + self.drop_path(y.permute(0, 3, 1, 2))
         return out
 
 
@@ -155,7 +140,6 @@ class GlobalBlock(nn.Module):
         self.drop_path = DropPath(drop_path)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Return the refined map."""
         y = x if self.position is None else x + self.position(x)
         tokens = y.permute(0, 2, 3, 1).flatten(1, 2)
         tokens = tokens + self.scale_attention * self.attention(self.norm_attention(tokens))
@@ -163,6 +147,55 @@ class GlobalBlock(nn.Module):
         refined = tokens.unflatten(1, x.shape[-2:]).permute(0, 3, 1, 2)
         out: Tensor = x + self.drop_path(refined)
         return out
+
+
+class CrossCovarianceAttention(nn.Module):
+    """softmax(K̂ᵀQ̂/τ) over channels (El-Nouby et al., XCiT, NeurIPS 2021, eq. (5)), with a learnt τ per head.
+
+    Queries and keys are normalized along the pixels, in float32.
+    """
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        if heads < 1 or channels % heads:
+            raise ConfigError(f"heads is {heads}; it must divide the {channels} channels that it splits")
+        self.heads = heads
+        self.temperature = nn.Parameter(torch.ones(heads, 1, 1))
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.proj = nn.Linear(channels, channels)
+
+    def forward(self, tokens: Float[Tensor, "b n c"]) -> Float[Tensor, "b n c"]:
+        qkv = self.qkv(tokens).unflatten(-1, (3, self.heads, -1))  # b n 3 heads c/heads
+        query, key, value = qkv.permute(2, 0, 3, 4, 1)  # b heads c/heads n
+        query, key = F.normalize(query.float(), dim=-1), F.normalize(key.float(), dim=-1)
+        weights = (query @ key.transpose(-1, -2) * self.temperature).softmax(-1)
+        mixed = weights.to(value.dtype) @ value
+        out: Tensor = self.proj(mixed.flatten(1, 2).transpose(1, 2))
+        return out
+
+
+class FourierPosition(nn.Module):
+    """Sines and cosines of the normalized row and column, projected to the channels (XCiT section 3.4, after DETR)."""
+
+    def __init__(self, channels: int, waves: int = 32) -> None:
+        super().__init__()
+        self.waves = waves
+        self.project = nn.Conv2d(2 * waves, channels, 1)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "1 c h w"]:
+        height, width = x.shape[-2:]
+        # wavelengths 1 to 10000, each for a sine and a cosine
+        exponent = torch.arange(self.waves // 2, device=x.device, dtype=torch.float32) * (2 / self.waves)
+        frequency = 10000.0**-exponent
+        sides = []
+        for length in (height, width):
+            phase = torch.arange(1, length + 1, device=x.device, dtype=torch.float32) * (2 * math.pi / length)
+            angle = phase[:, None] * frequency
+            sides.append(torch.stack([angle.sin(), angle.cos()], -1).flatten(1).T)  # sine, cosine, sine, ...
+        rows = sides[0][:, :, None].expand(-1, -1, width)
+        columns = sides[1][:, None, :].expand(-1, height, -1)
+        code: Tensor = self.project(torch.cat([rows, columns])[None].to(x.dtype))
+        return code
 
 
 def _dilations(count: int, rates: tuple[int, ...], last: tuple[int, ...]) -> list[int]:

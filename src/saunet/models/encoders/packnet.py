@@ -17,22 +17,16 @@ from saunet.types import FeatureSpec
 class PackNetEncoder(nn.Module):
     """Five packing stages, the encoder of PackNet01 (PackNet Table 1): features at 1/1, 1/2, ... 1/32.
 
-    A 5×5 convolution at full size; then per stage a block (a 7×7 convolution in the first, residual blocks after it)
-    and a `Packing`. The features are the packed maps, which PackNet's decoder joins as skips. With ``decoder=packnet``
-    and the defaults the network has 128.3 M parameters; PackNet publishes 128 M. (SAU-Net's Table 2 says 118.5.)
+    A 5×5 convolution of the image as it is, at full size; then per stage a block (a 7×7 convolution in the first,
+    residual blocks after it) and a `Packing`. The features are the packed maps, which PackNet's decoder joins as skips.
+    With ``decoder=packnet`` and the defaults the network has 128.3 M parameters; PackNet publishes 128 M. (SAU-Net's
+    Table 2 says 118.5.)
 
     Four fifths of the weights are in the 2-D convolutions after packing, which see 32 times their channels.
 
     Args:
         channels: Channels of the five stages, multiples of 16.
         blocks: Residual blocks in stages 2 to 5.
-
-    Attributes:
-        features: Channels and stride of each feature map, finest first.
-        size_divisor: Input height and width must be multiples of it.
-
-    Raises:
-        ConfigError: for a wrong number of stages or channels that do not divide.
     """
 
     def __init__(self, channels: Sequence[int] = (64, 64, 128, 256, 512), blocks: Sequence[int] = (2, 2, 3, 3)) -> None:
@@ -42,7 +36,10 @@ class PackNetEncoder(nn.Module):
             raise ConfigError(
                 f"channels is {channels} and blocks {blocks}; PackNet has five stages, the last four with blocks"
             )
-        check_channels(channels)
+        if any(c < 1 or c % GROUPS for c in channels):
+            raise ConfigError(
+                f"channels is {channels}; PackNet normalizes over {GROUPS} groups, give multiples of {GROUPS}"
+            )
         self.stem = ConvNormELU(3, channels[0], kernel=5)
         stages: list[nn.Module] = [ConvNormELU(channels[0], channels[0], kernel=7)]
         for inputs, outputs, depth in zip(channels[:-1], channels[1:], blocks, strict=True):
@@ -54,18 +51,9 @@ class PackNetEncoder(nn.Module):
         initialize(self)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
-        """Return the six feature maps of RGB in [0, 1], taken as it is, b c h/s w/s, finest first."""
         x = self.stem(image)
         features = [x]
         for stage, packing in zip(self.stages, self.packings, strict=True):
             x = packing(stage(x))
             features.append(x)
         return tuple(features)
-
-
-def check_channels(channels: Sequence[int]) -> None:
-    """Check that every number of channels divides into PackNet's normalization groups."""
-    if any(c < 1 or c % GROUPS for c in channels):
-        raise ConfigError(
-            f"channels is {tuple(channels)}; PackNet normalizes over {GROUPS} groups, give multiples of {GROUPS}"
-        )

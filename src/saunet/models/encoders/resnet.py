@@ -31,7 +31,6 @@ class BasicBlock(nn.Module):
         self.downsample = _shortcut(inputs, width, stride)
 
     def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co _ _"]:
-        """Return relu(F(x) + shortcut(x)), at 1/stride of the size."""
         shortcut = x if self.downsample is None else self.downsample(x)
         x = F.relu(self.bn1(self.conv1(x)), inplace=True)
         x = self.bn2(self.conv2(x))
@@ -55,7 +54,6 @@ class Bottleneck(nn.Module):
         self.downsample = _shortcut(inputs, outputs, stride)
 
     def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co _ _"]:
-        """Return relu(F(x) + shortcut(x)), at 1/stride of the size."""
         shortcut = x if self.downsample is None else self.downsample(x)
         x = F.relu(self.bn1(self.conv1(x)), inplace=True)
         x = F.relu(self.bn2(self.conv2(x)), inplace=True)
@@ -78,15 +76,6 @@ class ResNet(nn.Module):
         bottleneck: Bottleneck blocks (ResNet-50 and up) instead of basic ones.
         frames: RGB images stacked in the channels of the input: 1 for depth, 2 or 3 for pose.
         weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
-
-    Attributes:
-        features: Channels and stride of each feature map, finest first.
-        size_divisor: Input height and width must be multiples of it.
-        variant: The usual name: ``resnet`` and the number of weighted layers with the classifier, such as ``resnet18``.
-
-    Raises:
-        ConfigError: if there are not four stages of at least one block, or no frame.
-        CheckpointError: if ``weights`` cannot be found, fetched, read or fitted.
     """
 
     mean: Tensor
@@ -127,12 +116,13 @@ class ResNet(nn.Module):
         outputs = (64, *(width * kind.expansion for width in _WIDTHS))
         self.features = tuple(FeatureSpec(channels, 2 ** (i + 1)) for i, channels in enumerate(outputs))
         self.size_divisor = 32
-        _initialize(self)
+        for module in self.modules():  # He et al.'s normal distribution (fan out), as torchvision does
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         if weights is not None:
             load_pretrained(self, weights)
 
     def forward(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, ...]:
-        """Return the five feature maps of RGB in [0, 1], b c h/s w/s, finest first."""
         x = F.relu(self.bn1(self.conv1((image - self.mean) / self.std)), inplace=True)
         features = [x]
         x = self.maxpool(x)
@@ -146,10 +136,3 @@ def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Sequential | None:
     if stride == 1 and inputs == outputs:
         return None
     return nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
-
-
-def _initialize(network: nn.Module) -> None:
-    """Draw convolutions from He et al.'s normal distribution (fan out), as torchvision does."""
-    for module in network.modules():
-        if isinstance(module, nn.Conv2d):
-            nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.models.pretrained import load_pretrained
-from saunet.models.window_encoder import WindowEncoder
+from saunet.models.encoders.swin import WindowEncoder
 from saunet.registry import encoders
 
 
@@ -30,14 +29,6 @@ class StratifiedTransformer(WindowEncoder):
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
         mask_padding: Windows over the border attend to real tokens only; False pads with zeros that take part.
         weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
-
-    Attributes:
-        features: Channels and stride of each feature map, finest first.
-        size_divisor: Input height and width must be multiples of it.
-
-    Raises:
-        ConfigError: for sequences of different lengths, values below 1, or heads that do not divide the channels.
-        CheckpointError: if ``weights`` cannot be found, fetched, read or fitted.
     """
 
     def __init__(
@@ -55,10 +46,7 @@ class StratifiedTransformer(WindowEncoder):
         self.size_divisor = 2 * self.features[-1].stride  # decoders may halve the deepest map once more
         self.stem = nn.ModuleDict({"conv": nn.Conv2d(3, dim, 3, stride=2, padding=1), "norm": nn.LayerNorm(dim)})
         self.not_pretrained += ("stem.",)
-        self._init_weights()
-        if weights is not None:
-            load_pretrained(self, weights)
+        self.start_weights(weights)
 
     def tokens(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h2 w2 c"]:
-        """Turn a normalized image into tokens at half its size."""
         return self.stem["norm"](self.stem["conv"](image).permute(0, 2, 3, 1))  # type: ignore[no-any-return]

@@ -1,16 +1,98 @@
-"""The Swin Transformer (Liu et al. 2021) as a feature extractor, from the same blocks as the stratified transformer."""
+"""The Swin Transformer (Liu et al. 2021) as a feature extractor, and what it shares with the stratified transformer."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet import errors
+from saunet.errors import ConfigError, divisible, in_range, positive
+from saunet.models.layers.window import SwinStage
 from saunet.models.pretrained import load_pretrained
-from saunet.models.window_encoder import WindowEncoder
 from saunet.registry import encoders
+from saunet.types import FeatureSpec
+
+_PUBLIC = {
+    (96, (2, 2, 6, 2), (3, 6, 12, 24)): "swin_tiny",
+    (96, (2, 2, 18, 2), (3, 6, 12, 24)): "swin_small",
+}
+"""Dim, depths and heads -> the public weights that fit."""
+
+
+class WindowEncoder(nn.Module):
+    """A stem to tokens, stages of (shifted-)window blocks, 2x2 merging between them, a LayerNorm on each output.
+
+    State-dict keys of the stages are those of the dense Swin backbone: ``layers.0.blocks.0.attn.qkv.weight``,
+    ``layers.0.downsample.reduction.weight``, ``norm0.weight``. ``stride`` is that of the first stage's tokens.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        stride: int,
+        dim: int,
+        depths: Sequence[int],
+        heads: Sequence[int],
+        window: Sequence[int],
+        mlp_ratio: float,
+        drop_path: float,
+        mask_padding: bool,
+    ) -> None:
+        super().__init__()
+        depths, heads, window = tuple(depths), tuple(heads), tuple(window)
+        if not len(depths) == len(heads) == len(window) > 0:
+            raise ConfigError(
+                f"depths, heads and window have {len(depths)}, {len(heads)} and {len(window)} entries; "
+                "give one number per stage in each"
+            )
+        for name, value in (("depths", min(depths)), ("heads", min(heads)), ("window", min(window)), ("dim", dim)):
+            positive(name, value)
+        positive("mlp_ratio", mlp_ratio)
+        in_range("drop_path", drop_path, 0, 0.99)
+        stages = len(depths)
+        self.features = tuple(FeatureSpec(dim * 2**i, stride * 2**i) for i in range(stages))
+        self.size_divisor = self.features[-1].stride
+        self.variant = _PUBLIC.get((dim, depths, heads))
+        self.not_pretrained: tuple[str, ...] = tuple(f"norm{i}." for i in range(stages - 1))
+        """Beginnings of the names of entries that no public file has."""
+        self.register_buffer("mean", torch.tensor((0.485, 0.456, 0.406)).view(3, 1, 1), persistent=False)  # ImageNet's
+        self.register_buffer("std", torch.tensor((0.229, 0.224, 0.225)).view(3, 1, 1), persistent=False)
+
+        rates = torch.linspace(0, drop_path, sum(depths), device="cpu").tolist()
+        self.layers = nn.ModuleList()
+        for i, (depth, spec) in enumerate(zip(depths, self.features, strict=True)):
+            own, rates = rates[:depth], rates[depth:]
+            last = i + 1 == stages
+            stage = SwinStage(spec.channels, depth, heads[i], window[i], mlp_ratio, own, mask_padding, merge=not last)
+            self.layers.append(stage)
+            self.add_module(f"norm{i}", nn.LayerNorm(spec.channels))
+
+    def tokens(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h2 w2 c"]:
+        """Turn a normalized image into the tokens of the first stage; each encoder has its own stem."""
+        raise NotImplementedError(f"{type(self).__name__} has no stem")
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
+        divisible(image.shape[2], image.shape[3], self.size_divisor)
+        x = self.tokens((image - self.mean) / self.std)
+        maps = []
+        for i, stage in enumerate(self.layers):
+            out, x = stage(x)
+            maps.append(self.get_submodule(f"norm{i}")(out).permute(0, 3, 1, 2))
+        return tuple(maps)
+
+    def start_weights(self, weights: str | None) -> None:
+        """Initialize as Swin (truncated normal for linear weights, zero biases), then take public weights."""
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.trunc_normal_(module.weight, std=0.02)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+        if weights is not None:
+            load_pretrained(self, weights)
 
 
 @encoders.register("swin_tiny")
@@ -31,14 +113,6 @@ class SwinTransformer(WindowEncoder):
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
         mask_padding: True keeps padded tokens out of the attention instead.
         weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
-
-    Attributes:
-        features: Channels and stride of each feature map, finest first.
-        size_divisor: Input height and width must be multiples of it.
-
-    Raises:
-        ConfigError: for sequences of different lengths, values below 1, or heads that do not divide the channels.
-        CheckpointError: if ``weights`` cannot be found, fetched, read or fitted.
     """
 
     def __init__(
@@ -53,13 +127,10 @@ class SwinTransformer(WindowEncoder):
         mask_padding: bool = False,
         weights: str | None = None,
     ) -> None:
-        errors.positive("patch", patch)
+        positive("patch", patch)
         super().__init__(patch, dim, depths, heads, window, mlp_ratio, drop_path, mask_padding)
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, dim, patch, stride=patch), "norm": nn.LayerNorm(dim)})
-        self._init_weights()
-        if weights is not None:
-            load_pretrained(self, weights)
+        self.start_weights(weights)
 
     def tokens(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h4 w4 c"]:
-        """Turn a normalized image into one token per patch."""
         return self.patch_embed["norm"](self.patch_embed["proj"](image).permute(0, 2, 3, 1))  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""Convolutions that depth decoders are made of: reflection-padded 3×3, bilinear upsampling, the disparity head."""
+"""Layers that several networks share: reflection-padded 3×3, upsampling, the disparity head, stochastic depth."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from saunet.errors import ConfigError
 
 START = 0.3
 """Sigmoid disparity that an untrained `DisparityHead` predicts on average."""
@@ -21,8 +23,7 @@ class Conv3x3(nn.Conv2d):
         super().__init__(inputs, outputs, 3)
 
     def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co h w"]:
-        """Return the convolution at the same size; a map one pixel wide has nothing to reflect and is repeated."""
-        mode = "reflect" if min(x.shape[-2:]) > 1 else "replicate"
+        mode = "reflect" if min(x.shape[-2:]) > 1 else "replicate"  # one pixel has nothing to reflect
         return F.conv2d(F.pad(x, (1, 1, 1, 1), mode=mode), self.weight, self.bias)
 
 
@@ -50,21 +51,34 @@ class DisparityHead(nn.Module):
         self.start_bias()
 
     def start_bias(self) -> None:
-        """Set the bias to its start."""
         nn.init.constant_(self.conv.bias, math.log(START / (1 - START)))  # type: ignore[arg-type]
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 _ _"]:
-        """Return disparity in (0, 1) at ``enlarge`` times the size of ``x``.
-
-        Outside autocast: a logit of bfloat16 near -4, which is a far pixel, would round depth to about two per cent.
-        """
+        # Outside autocast: a logit of bfloat16 near -4, a far pixel, would round depth to about two per cent.
         with torch.autocast(device_type=x.device.type, enabled=False):
             logits: Tensor = self.conv(x.to(self.conv.weight.dtype))
             return (upsample(logits, self.enlarge) if self.enlarge > 1 else logits).sigmoid()
 
 
+class DropPath(nn.Module):
+    """Stochastic depth (Huang et al. 2016): drop a residual branch for a whole sample in training, keeping the mean."""
+
+    def __init__(self, rate: float = 0.0) -> None:
+        super().__init__()
+        if not 0 <= rate < 1:
+            raise ConfigError(f"drop_path is {rate}; it must be at least 0 and less than 1")
+        self.rate = rate
+
+    def forward(self, x: Float[Tensor, "b ..."]) -> Float[Tensor, "b ..."]:
+        if not self.training or self.rate == 0:
+            return x
+        keep = 1 - self.rate
+        kept = torch.bernoulli(torch.full((x.shape[0], *[1] * (x.ndim - 1)), keep, device=x.device, dtype=x.dtype))
+        return x * kept / keep
+
+
 def upsample(x: Float[Tensor, "b c h w"], factor: int = 2) -> Float[Tensor, "b c _ _"]:
-    """Return ``x`` enlarged bilinearly; a pixel covers its area (``align_corners=False``), as in resizing images."""
+    """Enlarge bilinearly; a pixel covers its area (``align_corners=False``), as in resizing images."""
     return F.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
 
 

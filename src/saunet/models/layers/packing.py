@@ -21,7 +21,6 @@ class ConvNormELU(nn.Module):
         self.norm = nn.GroupNorm(GROUPS, outputs)
 
     def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co h w"]:
-        """Return the activated map at the same size."""
         return F.elu(self.norm(self.conv(x)), inplace=True)
 
 
@@ -36,7 +35,6 @@ class ResidualConv(nn.Module):
         self.norm = nn.GroupNorm(GROUPS, outputs)
 
     def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co h w"]:
-        """Return the map at the same size."""
         return F.elu(self.norm(self.conv2(self.conv1(x)) + self.shortcut(x)), inplace=True)
 
 
@@ -49,7 +47,6 @@ class Packing(nn.Module):
         self.reduce = ConvNormELU(4 * channels * FOLDS, channels, kernel)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c _ _"]:
-        """Return the packed map, c × h/2 × w/2."""
         folded = F.pixel_unshuffle(x, 2)
         packed: Tensor = self.reduce(self.expand(folded[:, None]).flatten(1, 2))
         return packed
@@ -64,9 +61,7 @@ class Unpacking(nn.Module):
         self.expand = nn.Conv3d(1, FOLDS, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co _ _"]:
-        """Return the unpacked map, co × 2h × 2w."""
-        expanded = self.expand(self.reduce(x)[:, None]).flatten(1, 2)
-        return F.pixel_shuffle(expanded, 2)
+        return F.pixel_shuffle(self.expand(self.reduce(x)[:, None]).flatten(1, 2), 2)
 
 
 def initialize(network: nn.Module) -> None:

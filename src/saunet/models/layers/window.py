@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes, _get_current_dispatch_mode
 
 from saunet import errors
-from saunet.models.layers.drop_path import DropPath
+from saunet.models.layers.conv import DropPath
 
 _KEPT: dict[tuple[object, ...], Tensor] = {}
 _KEPT_AT_MOST = 512
@@ -43,7 +43,6 @@ class WindowGroup(NamedTuple):
 
     @property
     def area(self) -> int:
-        """Tokens per window."""
         return self.height * self.width
 
 
@@ -75,54 +74,37 @@ def window_order(
     The order is (group, image, window row, window column, token row, token column), groups as in `window_groups`.
     Results are kept and shared between all modules; a compiled or exported graph holds them as constants.
     """
-    arguments = (batch, height, width, window, shift)
-    order: Tensor = _order(*arguments, str(device))
-    inverse: Tensor = _inverse(*arguments, str(device))
-    return order, inverse
+    arguments = (batch, height, width, window, shift, str(device))
+    return _plan("order", *arguments), _plan("inverse", *arguments)
 
 
 def relative_position_index(height: int, width: int, window: int, device: torch.device) -> Int[Tensor, " n2"]:
     """Return the row of the ``(2 window - 1)**2`` bias table for each (query, key) of a ``height x width`` window."""
-    index: Tensor = _relative_index(height, width, window, str(device))
+    index: Tensor = _plan("relative", height, width, window, str(device))
     return index
 
 
 @torch.compiler.allow_in_graph  # type: ignore[untyped-decorator]
-def _order(batch: int, height: int, width: int, window: int, shift: int, device: str) -> Tensor:
-    arguments = (int(batch), int(height), int(width), window, shift)
-    return _keep(("order", *arguments, device), lambda: _build_order(*arguments), device)
-
-
-@torch.compiler.allow_in_graph  # type: ignore[untyped-decorator]
-def _inverse(batch: int, height: int, width: int, window: int, shift: int, device: str) -> Tensor:
-    arguments = (int(batch), int(height), int(width), window, shift)
-    return _keep(("inverse", *arguments, device), lambda: np.argsort(_build_order(*arguments)), device)
-
-
-@torch.compiler.allow_in_graph  # type: ignore[untyped-decorator]
-def _relative_index(height: int, width: int, window: int, device: str) -> Tensor:
-    arguments = (int(height), int(width), window)
-    return _keep(("relative", *arguments, device), lambda: _build_relative_index(*arguments), device)
-
-
-def _keep(key: tuple[object, ...], build: Callable[[], np.ndarray], device: str) -> Tensor:
+def _plan(kind: str, *arguments: Any) -> Tensor:
+    """Return an index tensor, made once: ``arguments`` are sizes, which a tracer may wrap, and last the device."""
+    *sizes, device = arguments
+    key = (kind, *map(int, sizes), device)
     if key not in _KEPT:
         while len(_KEPT) >= _KEPT_AT_MOST:
             _KEPT.pop(next(iter(_KEPT)))
         # made outside of whatever mode is on: an index made for a prediction or a trace must serve everyone
         with torch.inference_mode(False), _disable_current_modes():
-            _KEPT[key] = torch.from_numpy(build()).to(device)
+            _KEPT[key] = torch.from_numpy(_BUILDERS[kind](*key[1:-1])).to(device)
     return torch.ops.aten.lift_fresh.default(_KEPT[key])  # type: ignore[no-any-return]  # a tracer takes it as a constant
 
 
 def _build_order(batch: int, height: int, width: int, window: int, shift: int) -> np.ndarray:
     tokens = np.arange(batch * height * width).reshape(batch, height, width)
     parts = []
-    for group in window_groups(height, width, window, shift):
-        tops = [start for start, length in axis_windows(height, window, shift) if length == group.height]
-        lefts = [start for start, length in axis_windows(width, window, shift) if length == group.width]
-        rows = np.array(tops)[:, None] + np.arange(group.height)
-        columns = np.array(lefts)[:, None] + np.arange(group.width)
+    for tall, wide, _ in window_groups(height, width, window, shift):
+        tops = [start for start, length in axis_windows(height, window, shift) if length == tall]
+        lefts = [start for start, length in axis_windows(width, window, shift) if length == wide]
+        rows, columns = np.add.outer(tops, np.arange(tall)), np.add.outer(lefts, np.arange(wide))
         parts.append(tokens[:, rows[:, None, :, None], columns[None, :, None, :]].ravel())
     return np.concatenate(parts)
 
@@ -131,6 +113,13 @@ def _build_relative_index(height: int, width: int, window: int) -> np.ndarray:
     y, x = (axis.ravel() for axis in np.mgrid[:height, :width])
     down, right = y[:, None] - y[None, :], x[:, None] - x[None, :]
     return np.asarray((down + window - 1) * (2 * window - 1) + right + window - 1).ravel()
+
+
+_BUILDERS: dict[str, Callable[..., np.ndarray]] = {
+    "order": _build_order,
+    "inverse": lambda *sizes: np.argsort(_build_order(*sizes)),
+    "relative": _build_relative_index,
+}
 
 
 class _Reorder(torch.autograd.Function):
@@ -176,7 +165,6 @@ class WindowAttention(nn.Module):
         nn.init.trunc_normal_(self.relative_position_bias_table, std=0.02)
 
     def forward(self, x: Float[Tensor, "b h w c"]) -> Float[Tensor, "b h w c"]:
-        """Attend within each window of a map of tokens."""
         height, width = x.shape[1:3]
         if self.pads(height, width):
             x = F.pad(x, (0, 0, 0, -width % self.window, 0, -height % self.window))
@@ -187,42 +175,37 @@ class WindowAttention(nn.Module):
         groups = window_groups(rows, columns, self.window, self.shift)
         tokens = reorder(x.reshape(-1, self.dim), order, inverse)
         qkv = torch.split(self.qkv(tokens), [batch * group.windows * group.area for group in groups])
-        parts = [
-            self.attend(part, group, self.bias(group, part.dtype)) for part, group in zip(qkv, groups, strict=True)
-        ]
+        parts = [self.attend(part, group) for part, group in zip(qkv, groups, strict=True)]
         attended = self.proj(parts[0] if len(parts) == 1 else torch.cat(parts))
         out = reorder(attended, inverse, order).view(batch, rows, columns, self.dim)
         return out if (rows, columns) == (height, width) else out[:, :height, :width]
 
     def _attend_each(self, x: Float[Tensor, "b h w c"]) -> Float[Tensor, "b h w c"]:
-        """Attend with one image's order of tokens for all: for an exporter that leaves the number of images open."""
+        """Attend with one image's order of tokens for all."""
         _, rows, columns, _ = x.shape
         order, inverse = window_order(1, rows, columns, self.window, self.shift, x.device)
         groups = window_groups(rows, columns, self.window, self.shift)
         qkv = self.qkv(x.flatten(1, 2).index_select(1, order))
-        parts = [
-            self.attend(part.reshape(-1, 3 * self.dim), group, self.bias(group, part.dtype)).view(
-                -1, group.windows * group.area, self.dim
-            )
-            for part, group in zip(qkv.split([g.windows * g.area for g in groups], 1), groups, strict=True)
-        ]
+        parts = []
+        for part, group in zip(qkv.split([g.windows * g.area for g in groups], 1), groups, strict=True):
+            attended = self.attend(part.reshape(-1, 3 * self.dim), group)
+            parts.append(attended.view(-1, group.windows * group.area, self.dim))
         return self.proj(torch.cat(parts, 1)).index_select(1, inverse).unflatten(1, (rows, columns))  # type: ignore[no-any-return]
 
     def pads(self, height: int, width: int) -> bool:
-        """Return whether a map of this size is padded with zeros."""
+        """Whether a map of this size is padded with zeros."""
         return not self.mask_padding and (height % self.window != 0 or width % self.window != 0)
 
     def bias(self, group: WindowGroup, dtype: torch.dtype) -> Float[Tensor, "1 heads n n"]:
-        """Return the relative position bias of a window size."""
         table = self.relative_position_bias_table
         index = relative_position_index(group.height, group.width, self.window, table.device)
-        pairs = table.to(dtype).t().index_select(1, index)
-        return pairs.view(1, self.heads, group.area, group.area)
+        return table.to(dtype).t().index_select(1, index).view(1, self.heads, group.area, group.area)
 
     def attend(
-        self, qkv: Float[Tensor, "n c3"], group: WindowGroup, bias: Float[Tensor, "1 heads a a"]
+        self, qkv: Float[Tensor, "n c3"], group: WindowGroup, bias: Float[Tensor, "1 heads a a"] | None = None
     ) -> Float[Tensor, "n c"]:
-        """Attend inside each window of a group, given queries, keys and values of its tokens and its bias."""
+        """Attend inside each window of a group, given queries, keys and values of its tokens."""
+        bias = self.bias(group, qkv.dtype) if bias is None else bias
         split = qkv.view(-1, group.area, 3, self.heads, self.dim // self.heads)
         query, key, value = split.permute(2, 0, 3, 1, 4).unbind(0)
         out = F.scaled_dot_product_attention(query, key, value, attn_mask=bias)
@@ -230,7 +213,7 @@ class WindowAttention(nn.Module):
 
 
 def _symbolic(size: object) -> bool:
-    """Return whether an exported network leaves a size open; the annotations of torch call it an int all the same."""
+    """Whether an exported network leaves a size open; the annotations of torch call it an int all the same."""
     return isinstance(size, torch.SymInt)
 
 
@@ -257,8 +240,7 @@ def _untouched(module: nn.Module) -> bool:
     return known and not (module._forward_hooks or module._forward_pre_hooks)
 
 
-def rows_per_piece(width: int) -> int:
-    """Return how many rows make a piece when the widest intermediate result has ``width`` columns."""
+def _rows_per_piece(width: int) -> int:
     return max(64, _CACHED_ELEMENTS // width)
 
 
@@ -270,7 +252,7 @@ def add_attention(
     window, shift = attention.window, attention.shift
     order, inverse = window_order(batch, height, width, window, shift, x.device)
     rows = F.embedding(order, x.reshape(-1, dim))
-    start, size = 0, rows_per_piece(3 * dim)
+    start, size = 0, _rows_per_piece(3 * dim)
     buffer = rows.new_empty(min(max(size, window**2), len(rows)), 3 * dim)
     for group in window_groups(height, width, window, shift):
         stop, step = start + batch * group.windows * group.area, max(1, size // group.area) * group.area
@@ -285,7 +267,7 @@ def add_attention(
 def add_mlp_(x: Float[Tensor, "*n c"], norm: nn.LayerNorm, fc1: nn.Linear, fc2: nn.Linear) -> Float[Tensor, "*n c"]:
     """Add ``fc2(gelu(fc1(norm(x))))`` to ``x``, in place."""
     rows = x.view(-1, x.shape[-1])
-    size = rows_per_piece(fc1.out_features)
+    size = _rows_per_piece(fc1.out_features)
     buffer = rows.new_empty(min(size, len(rows)), fc1.out_features)
     for piece in torch.split(rows, size):
         _add(piece, fc2, _hidden(norm(piece), fc1, buffer))
@@ -301,7 +283,6 @@ def _hidden(rows: Tensor, layer: nn.Linear, buffer: Tensor) -> Tensor:
 
 
 def _into(out: Tensor, layer: nn.Linear, rows: Tensor) -> Tensor:
-    """Write ``layer(rows)`` to ``out``."""
     return torch.addmm(layer.bias, rows, layer.weight.t(), out=out)
 
 
@@ -319,7 +300,6 @@ class Mlp(nn.Module):
         self.fc2 = nn.Linear(hidden, dim)
 
     def forward(self, x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
-        """Map each token on its own."""
         return self.fc2(F.gelu(self.fc1(x)))  # type: ignore[no-any-return]
 
 
@@ -344,7 +324,6 @@ class SwinBlock(nn.Module):
         self.mlp = Mlp(dim, int(dim * mlp_ratio))
 
     def forward(self, x: Float[Tensor, "b h w c"]) -> Float[Tensor, "b h w c"]:
-        """Apply attention and MLP, each behind a norm and around a residual."""
         if streams(x, self) and not self.attn.pads(x.shape[1], x.shape[2]):
             return add_mlp_(add_attention(x, self.norm1, self.attn), self.norm2, self.mlp.fc1, self.mlp.fc2)
         x = x + self.drop_path(self.attn(self.norm1(x)))
@@ -363,7 +342,6 @@ class PatchMerging(nn.Module):
         self.reduction = nn.Linear(4 * dim, 2 * dim, bias=False)
 
     def forward(self, x: Float[Tensor, "b h w c"]) -> Float[Tensor, "b h2 w2 c2"]:
-        """Merge; height and width must be even."""
         batch, height, width, channels = x.shape
         pairs = x.view(batch, height // 2, 2, width // 2, 2, channels)
         merged = pairs.permute(0, 1, 3, 4, 2, 5).reshape(batch, height // 2, width // 2, 4 * channels)

@@ -1,1 +1,0 @@
-"""Registered channel attention modules."""

@@ -1,1 +1,0 @@
-"""Registered pose networks: frames -> relative camera motion."""
