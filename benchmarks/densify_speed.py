@@ -24,7 +24,7 @@ import scipy.sparse.linalg
 import torch
 
 from saunet.tools.prepare.colorization import colorize
-from saunet.tools.prepare.densify import interpolate
+from saunet.tools.prepare.targets import interpolate
 
 
 def usual(image: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -61,7 +61,7 @@ def frames(root: str | None, count: int) -> Iterator[tuple[np.ndarray, np.ndarra
         known = (rng.random(ramp.shape) < 0.05) & (np.arange(375)[:, None] > 130)
         yield image, np.where(known, ramp, 0).astype(np.float32)
         return
-    from saunet.tools.prepare.recordings import kitti_recordings
+    from saunet.tools.prepare.tool import kitti_recordings
 
     taken = 0
     for drive, numbers in kitti_recordings(root):

@@ -14,8 +14,8 @@ import pytest
 
 import saunet
 from saunet.runs.checkpoint import read_checkpoint
-from saunet.tools.prepare.densify import densify
-from saunet.tools.prepare.recordings import kitti_recordings
+from saunet.tools.prepare.targets import densify
+from saunet.tools.prepare.tool import kitti_recordings
 
 Tool = Callable[..., Any]
 SMALL = ("data.height=64", "data.width=96", "data.batch_size=2", "data.workers=0", "trainer=smoke")

@@ -21,7 +21,7 @@ from saunet.tools.doctor.findings import diagnose, manifest_of
 from saunet.tools.doctor.sheet import draw_sheet
 from saunet.tools.doctor.survey import survey
 from saunet.tools.prepare.cache import build_cache
-from saunet.tools.prepare.recordings import kitti_recordings
+from saunet.tools.prepare.tool import kitti_recordings
 
 
 def kitti(root, **options):

@@ -19,7 +19,7 @@ from saunet.data.loading.stored import CacheSettings, ImageCache
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import read_image, resize
 from saunet.tools.prepare.cache import build_cache
-from saunet.tools.prepare.recordings import kitti_recordings
+from saunet.tools.prepare.tool import kitti_recordings
 
 SMALL = CacheSettings(height=10, width=32)
 

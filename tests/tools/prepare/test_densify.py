@@ -11,8 +11,8 @@ from prepare_tree import name
 from saunet.data.loading.stored import DepthMaps
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import read_depth
-from saunet.tools.prepare.densify import densify, densify_map, interpolate
-from saunet.tools.prepare.recordings import kitti_recordings
+from saunet.tools.prepare.targets import densify, densify_map, interpolate
+from saunet.tools.prepare.tool import kitti_recordings
 
 
 def barycentric(depth):

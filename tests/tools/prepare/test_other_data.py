@@ -14,7 +14,7 @@ from saunet.data.loading.stored import CacheSettings, ImageCache
 from saunet.errors import DataError
 from saunet.registry import datamodules
 from saunet.tools.prepare.cache import build_cache
-from saunet.tools.prepare.recordings import module_recordings
+from saunet.tools.prepare.tool import module_recordings
 
 CAMERA = (
     "image_size: [320, 200]\nK: [250, 252, 158.0, 101.0]\nfps: 10\ndistortion: [-0.1, 0, 0, 0]\ncrop: [0, 0.1, 0, 0]\n"

@@ -8,8 +8,8 @@ from prepare_tree import name
 from saunet.data.loading.stored import DepthMaps
 from saunet.errors import DataError
 from saunet.prediction.prediction import ImagePredictor
-from saunet.tools.prepare.recordings import kitti_recordings
-from saunet.tools.prepare.teacher import FileTeacher, ModelTeacher, teach
+from saunet.tools.prepare.targets import FileTeacher, ModelTeacher, teach
+from saunet.tools.prepare.tool import kitti_recordings
 
 
 class Brightness(ImagePredictor):

@@ -13,9 +13,8 @@ from saunet.data.loading.windows import resize_depth
 from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 from saunet.tools.prepare.cache import build_cache
-from saunet.tools.prepare.densify import densify
-from saunet.tools.prepare.recordings import kitti_recordings
-from saunet.tools.prepare.teacher import FileTeacher, teach
+from saunet.tools.prepare.targets import FileTeacher, densify, teach
+from saunet.tools.prepare.tool import kitti_recordings
 
 
 def module(root, **options):

@@ -8,6 +8,7 @@ copies anew whose originals have changed.
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +49,7 @@ class CacheReport:
 
 
 def encode(image: np.ndarray, settings: CacheSettings) -> bytes:
-    """Return an RGB frame, h x w x 3, at the cache's size as the bytes of a file."""
+    """Return an RGB frame at the cache's size as the bytes of a file."""
     small = cv2.cvtColor(resize(image, settings.height, settings.width), cv2.COLOR_RGB2BGR)
     flag = cv2.IMWRITE_JPEG_QUALITY if settings.format == "jpg" else cv2.IMWRITE_WEBP_QUALITY
     done, data = cv2.imencode(f".{settings.format}", small, [flag, settings.quality])
@@ -68,34 +69,28 @@ class _Copy:
     def __call__(self, item: tuple[int, int]) -> tuple[str, Entry]:
         drive, frame = self.drives[item[0]], item[1]
         path, known, key = self.cache.path(drive, frame), self.known[item[0]], f"{frame:010d}"
-        there, state = path.is_file(), _state(drive, frame)
-        if there:
-            data = path.read_bytes()
-            digest = hashlib.sha256(data).hexdigest()
-            same = known.get("originals", {}).get(key) == state
-            if same and known.get("frames", {}).get(key) == [len(data), digest]:
-                return "verified", (len(data), digest, tuple(known["native"]), state)
+        state, old = _state(drive, frame), path.read_bytes() if path.is_file() else None
+        if old is not None and known.get("originals", {}).get(key) == state:
+            mark = (len(old), hashlib.sha256(old).hexdigest())
+            if known.get("frames", {}).get(key) == [*mark]:
+                return "verified", (*mark, tuple(known["native"]), state)
         image = drive.image(frame)
         check_frame(drive, frame, image)
-        size = (image.shape[0], image.shape[1])
         fresh = encode(image, self.cache.settings)
-        entry = (len(fresh), hashlib.sha256(fresh).hexdigest(), size, state)
-        if there and data == fresh:
+        entry = (len(fresh), hashlib.sha256(fresh).hexdigest(), (image.shape[0], image.shape[1]), state)
+        if old == fresh:
             return "verified", entry
         write_bytes(path, fresh)
-        return "replaced" if there else "made", entry
+        return "made" if old is None else "replaced", entry
 
 
 def _state(drive: Drive, frame: int) -> list[int] | None:
     """Return bytes and time of change (ns) of a frame's original file; None where there is none to ask."""
-    path = drive.path(frame)
-    if path is None:
-        return None
     try:
-        found = path.stat()
+        found = path.stat() if (path := drive.path(frame)) else None
     except OSError:  # reading it says what is wrong
         return None
-    return [found.st_size, found.st_mtime_ns]
+    return [found.st_size, found.st_mtime_ns] if found else None
 
 
 def build_cache(
@@ -107,29 +102,27 @@ def build_cache(
 ) -> CacheReport:
     """Make, complete or check a cache of some frames of each recording; the recordings are only read."""
     cache = _open(Path(folder).expanduser(), settings)
-    homes = [cache.home(drive) for drive, _ in recordings]
-    for home in homes:
-        remove_partial(home)
-    known = tuple(cache.frames(drive) for drive, _ in recordings)
-    for (drive, _), frames in zip(recordings, known, strict=True):
+    drives = tuple(drive for drive, _ in recordings)
+    for drive in drives:
+        remove_partial(cache.home(drive))
+    known = tuple(cache.frames(drive) for drive in drives)
+    for drive, frames in zip(drives, known, strict=True):
         if frames:
             cache.check_origin(drive, frames)
     items = [(place, frame) for place, (_, frames) in enumerate(recordings) for frame in frames]
-    work: Work[tuple[int, int], tuple[str, Entry]] = Work(
-        _Copy(tuple(drive for drive, _ in recordings), cache, known), workers, on_error
-    )
-    counts = {"made": 0, "verified": 0, "replaced": 0}
-    lists: list[dict[int, Entry]] = [{} for _ in recordings]
+    work: Work[tuple[int, int], tuple[str, Entry]] = Work(_Copy(drives, cache, known), workers, on_error)
+    counts: Counter[str] = Counter()
+    lists: list[dict[int, Entry]] = [{} for _ in drives]
     waiting = [len(frames) for _, frames in recordings]
     for (place, frame), (what, entry) in work.run(items, "cache"):
         counts[what] += 1
         lists[place][frame] = entry
         waiting[place] -= 1
         if waiting[place] == 0:
-            _finish(homes[place], recordings[place][0], known[place], lists[place])
+            _finish(cache.home(drives[place]), drives[place], known[place], lists[place])
     for place, left in enumerate(waiting):
         if left and lists[place]:  # some of its frames are broken and skipped
-            _finish(homes[place], recordings[place][0], known[place], lists[place])
+            _finish(cache.home(drives[place]), drives[place], known[place], lists[place])
     made = counts["made"] + counts["replaced"]
     return CacheReport(made, counts["verified"], counts["replaced"], tuple(work.failures), Path(folder))
 
@@ -143,9 +136,9 @@ def _open(folder: Path, settings: CacheSettings) -> ImageCache:
             raise DataError(f"{folder} is not empty and not a cache; set folder to a new one")
         write_json(path, settings.plain())
     cache = ImageCache(folder)
-    changed = [key for key, value in settings.plain().items() if cache.settings.plain()[key] != value]
-    if changed:
-        is_now = ", ".join(f"{key}={cache.settings.plain()[key]}" for key in changed)
+    there = cache.settings.plain()
+    is_now = ", ".join(f"{key}={there[key]}" for key, value in settings.plain().items() if there[key] != value)
+    if is_now:
         raise DataError(f"the cache at {folder} was made with {is_now}; use the same, or set folder to a new one")
     return cache
 

@@ -23,8 +23,7 @@ def affinity(gray: Float[ndarray, "h w"]) -> Float[ndarray, "9 h w"]:
     """Return the weight of each pixel's neighbors in its own value, summing to 1; 0 for itself and out of the image.
 
     With v the variance of the 3 x 3 window, s = max(0.6 v, -min (g_n - g)**2 / ln 0.01, 2e-6) and the weight of
-    neighbor n is exp(-(g_n - g)**2 / s), normalized. The order is that of
-    `saunet.tools.prepare.sparse_solver.NEIGHBORS`.
+    neighbor n is exp(-(g_n - g)**2 / s), normalized; n in the order of `NEIGHBORS`.
     """
     height, width = gray.shape
     difference = np.zeros((9, height, width))
@@ -32,7 +31,7 @@ def affinity(gray: Float[ndarray, "h w"]) -> Float[ndarray, "9 h w"]:
         here = _shifted(height, row), _shifted(width, column)
         there = _shifted(height, -row), _shifted(width, -column)
         np.subtract(gray[there], gray[here], out=plane[here])
-    count = np.outer(_reach(height), _reach(width))
+    count = apply_stencil(np.ones_like(difference), np.ones_like(gray))  # pixels of the window in the image
     mean = difference.sum(0) / count
     difference *= difference
     variance = difference.sum(0) / count - mean * mean
@@ -50,21 +49,12 @@ def affinity(gray: Float[ndarray, "h w"]) -> Float[ndarray, "9 h w"]:
 
 
 def _shifted(length: int, step: int) -> slice:
-    """Return the places from which a step stays inside."""
+    """Return the pixels from which a step stays inside."""
     return slice(max(0, -step), length - max(0, step))
 
 
-def _reach(length: int) -> Float[ndarray, " {length}"]:
-    """Return how many of a place and its two neighbors exist."""
-    places = np.arange(length)
-    return 1.0 + (places > 0) + (places < length - 1)
-
-
 def colorize(image: UInt8[ndarray, "_ _ 3"], depth: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
-    """Return depth at every pixel of an RGB image: measured where known (not 0), spread along similar brightness else.
-
-    Solves (I - W + diag(known)) x = known depth, with W of `affinity`.
-    """
+    """Return depth at every pixel: measured where known, else spread, by (I - W + diag(known)) x = known depth."""
     if image.shape[:2] != depth.shape or min(depth.shape) < 2:
         raise DataError(f"depth of shape {depth.shape} does not belong to an image of shape {image.shape}")
     known = depth > 0

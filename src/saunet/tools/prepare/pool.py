@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,10 +43,7 @@ class Done:
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove the temporary files of writers that were killed (see `saunet.io.atomic.replacing`).
-
-    Only one run may write into a folder at a time.
-    """
+    """Remove the temporary files of writers that were killed; only one run may write into a folder at a time."""
     if folder.is_dir():
         for path in folder.glob(".*.partial*"):
             path.unlink(missing_ok=True)
@@ -81,11 +78,10 @@ class Work(Generic[Item, Result]):
                 yield item, _attempt(self.function, item)
             return
         # Fresh processes, not forks: forking a process in which libraries have started threads can hang.
-        context = multiprocessing.get_context("spawn")
-        count = min(self.workers, len(items))
-        pool = ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(self.function,))
+        count, context = min(self.workers, len(items)), multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(count, context, _begin, (self.function,))
         try:
-            waiting: dict[Future[Any], Item] = {pool.submit(_work, item): item for item in items}
+            waiting = {pool.submit(_work, item): item for item in items}
             for future in as_completed(list(waiting)):
                 yield waiting.pop(future), future.result()
         except BrokenProcessPool as reason:

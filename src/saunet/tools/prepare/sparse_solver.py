@@ -9,8 +9,8 @@ of diffusion are: then no pivoting is needed, which is what makes the order of e
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import itertools
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-NEIGHBORS = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1))
+NEIGHBORS = tuple(itertools.product((-1, 0, 1), (-1, 0, 1)))
 """Where the nine coefficients of an equation point to: (row, column) steps; the fifth is the pixel itself."""
 
 Place = tuple[int, int]
@@ -44,18 +44,15 @@ class StencilSolver:
     """The factors of a grid of equations (in the order of `NEIGHBORS`, 0 out of the image), ready for right sides."""
 
     def __init__(self, stencil: Float[ndarray, "9 h w"], dtype: torch.dtype = torch.float32) -> None:
-        self.height, self.width = stencil.shape[1:]
-        self.dtype = dtype
         self._leaves = _Leaves(stencil, dtype)
         fronts = self._leaves.fronts()
-        self._merges: list[_Merge] = []
-        rows, columns = fronts.shape[:2]
         cell, outline = self._leaves.cell, _outline(*self._leaves.cell)
-        while rows > 1 or columns > 1:
-            merge = _Merge(cell, outline, rows, columns)
+        self._merges: list[_Merge] = []
+        while fronts.shape[0] > 1 or fronts.shape[1] > 1:
+            merge = _Merge(cell, outline, fronts.shape[0], fronts.shape[1])
             fronts = merge.eliminate(fronts)
             self._merges.append(merge)
-            cell, outline, rows, columns = merge.merged, merge.outline, merge.rows, merge.columns
+            cell, outline = merge.merged, merge.outline
 
     def solve(self, right: Float[ndarray, "h w"]) -> Float[ndarray, "h w"]:
         """Return the solution for a right side, as exact as ``dtype`` is."""
@@ -71,34 +68,25 @@ class StencilSolver:
 
 def _outline(height: int, width: int) -> list[Place]:
     """Return the places of the lines around a cell; those of one line lie in a row, from left to right or down."""
-    across, down = range(width + 1), range(1, height)
-    return [
-        *((0, column) for column in across),
-        *((height, column) for column in across),
-        *((row, 0) for row in down),
-        *((row, width) for row in down),
-    ]
+    above_and_below = itertools.product((0, height), range(width + 1))
+    left_and_right = ((row, column) for column in (0, width) for row in range(1, height))
+    return [*above_and_below, *left_and_right]
 
 
 def _runs(places: Sequence[tuple[int, int]]) -> list[Run]:
     """Group pairs of positions that go up together into pairs of slices."""
     found: list[Run] = []
-    start = 0
-    for end in range(1, len(places) + 1):
-        if end < len(places) and all(b == a + 1 for a, b in zip(places[end - 1], places[end], strict=True)):
-            continue
-        first, last = places[start], places[end - 1]
-        found.append((slice(first[0], last[0] + 1), slice(first[1], last[1] + 1)))
-        start = end
+    for _, group in itertools.groupby(enumerate(places), lambda item: (item[1][0] - item[0], item[1][1] - item[0])):
+        run = [pair for _, pair in group]
+        found.append((slice(run[0][0], run[-1][0] + 1), slice(run[0][1], run[-1][1] + 1)))
     return found
 
 
 def _cells(length: int) -> tuple[int, int]:
     """Return (pixels a cell and its line, number of cells): a power of two cells, as little larger as can be."""
     sizes = [(-(-(length + 1) // 2**power), 2**power) for power in range(20)]
-    fitting = [(size * count, size, count) for size, count in sizes if 5 <= size <= 9] or [(length + 1, length + 1, 1)]
-    _, size, count = min(fitting)
-    return size, count
+    fitting = [(size, count) for size, count in sizes if 5 <= size <= 9] or [(length + 1, 1)]
+    return min(fitting, key=lambda cell: (cell[0] * cell[1], cell))
 
 
 class _Leaves:
@@ -108,22 +96,24 @@ class _Leaves:
         self.size = (stencil.shape[1], stencil.shape[2])
         (cell_h, self.rows), (cell_w, self.columns) = _cells(self.size[0]), _cells(self.size[1])
         self.cell = (cell_h, cell_w)
-        self.dtype = dtype
+        self.places = list(itertools.product(range(cell_h + 1), range(cell_w + 1)))
+        self.nothing = torch.zeros(self.rows, self.columns, dtype=dtype)
         planes = [self._plane(coefficients, float(k == 4)) for k, coefficients in enumerate(stencil)]
         # An equation between two places of a line belongs to one of the two cells beside it: that above or left.
         self._left: dict[tuple[Place, Place], Tensor] = {}
-        for place in ((row, column) for row in range(cell_h + 1) for column in range(cell_w + 1)):
+        for row, column in self.places:
             for plane, (down, right) in zip(planes, NEIGHBORS, strict=True):
-                other = (place[0] + down, place[1] + right)
+                other = (row + down, column + right)
                 inside = 0 <= other[0] <= cell_h and 0 <= other[1] <= cell_w
-                if inside and (place[0] or other[0]) and (place[1] or other[1]):
-                    self._left[place, other] = self._at(plane, place).clone()
+                if inside and (row or other[0]) and (column or other[1]):
+                    self._left[(row, column), other] = self._at(plane, (row, column)).clone()
         self._steps = [self._eliminate(place) for place in _dissected(1, cell_h, 1, cell_w)]
 
     def _plane(self, values: Float[ndarray, "h w"], outside: float) -> Tensor:
         """Return values as (row in cell, column in cell, cell row, cell column); pixels outside stand alone."""
         (cell_h, cell_w), (height, width) = self.cell, self.size
-        padded = torch.full(((self.rows + 1) * cell_h, (self.columns + 1) * cell_w), outside, dtype=self.dtype)
+        sides = ((self.rows + 1) * cell_h, (self.columns + 1) * cell_w)
+        padded = torch.full(sides, outside, dtype=self.nothing.dtype)
         padded[1 : height + 1, 1 : width + 1] = torch.from_numpy(values)
         return padded.view(self.rows + 1, cell_h, self.columns + 1, cell_w).permute(1, 3, 0, 2).contiguous()
 
@@ -138,28 +128,24 @@ class _Leaves:
         inverse = left.pop((pivot, pivot)).reciprocal_()
         upper = {other: left.pop((pivot, other)).mul_(inverse) for other in others}
         lower = {other: left.pop((other, pivot)) for other in others}
-        for a in others:
-            for b in others:
-                if (a, b) in left:
-                    left[a, b].addcmul_(lower[a], upper[b], value=-1)
-                else:
-                    left[a, b] = (lower[a] * upper[b]).neg_()
+        for a, b in itertools.product(others, others):
+            if (a, b) in left:
+                left[a, b].addcmul_(lower[a], upper[b], value=-1)
+            else:
+                left[a, b] = (lower[a] * upper[b]).neg_()
         return pivot, inverse, lower, upper
 
     def fronts(self) -> Tensor:
         """Return what is left between the places of each cell's outline: cell rows x cell columns x n x n."""
         outline = _outline(*self.cell)
-        nothing = torch.zeros(self.rows, self.columns, dtype=self.dtype)
-        stacked = [torch.stack([self._left.get((a, b), nothing) for b in outline], -1) for a in outline]
+        stacked = [torch.stack([self._left.get((a, b), self.nothing) for b in outline], -1) for a in outline]
         self._left.clear()
         return torch.stack(stacked, -2)
 
     def forward(self, right: Float[ndarray, "h w"]) -> Tensor:
         """Eliminate in a right side; returns what is left for each outline."""
         plane = self._plane(right, 0.0)
-        nothing = torch.zeros(self.rows, self.columns, dtype=self.dtype)
-        places = ((row, column) for row in range(self.cell[0] + 1) for column in range(self.cell[1] + 1))
-        values = {place: (self._at(plane, place) if all(place) else nothing).clone() for place in places}
+        values = {place: (self._at(plane, place) if all(place) else self.nothing).clone() for place in self.places}
         for pivot, inverse, lower, _ in self._steps:
             values[pivot].mul_(inverse)
             for other, coefficient in lower.items():
@@ -171,11 +157,10 @@ class _Leaves:
         """Return the solution, given that on the outlines."""
         known = {place: values[..., i].contiguous() for i, place in enumerate(_outline(*self.cell))}
         for pivot, _, _, upper in reversed(self._steps):
-            value = self._inside[pivot]
+            known[pivot] = self._inside[pivot]
             for other, coefficient in upper.items():
-                value.addcmul_(coefficient, known[other], value=-1)
-            known[pivot] = value
-        plane = torch.empty(*self.cell, self.rows + 1, self.columns + 1, dtype=self.dtype)
+                known[pivot].addcmul_(coefficient, known[other], value=-1)
+        plane = values.new_empty(*self.cell, self.rows + 1, self.columns + 1)
         for place, value in known.items():
             if all(place):
                 self._at(plane, place).copy_(value)
@@ -197,15 +182,6 @@ def _dissected(top: int, bottom: int, left: int, right: int) -> list[Place]:
     return _dissected(top, bottom, left, middle) + _dissected(top, bottom, middle + 1, right) + line
 
 
-@dataclass(frozen=True, slots=True)
-class _Factors:
-    """What elimination of the lines keeps of each merged cell."""
-
-    inverse: Tensor
-    upper: Tensor
-    lower: Tensor
-
-
 class _Merge:
     """One level: cells become one with their right or lower neighbor, and the line between is eliminated."""
 
@@ -213,19 +189,18 @@ class _Merge:
         height, width = cell
         self.down = rows > 1 and (height <= width or columns == 1)
         step = (height, 0) if self.down else (0, width)
+        self.before = (rows, columns, len(outline))
         self.rows, self.columns = (rows // 2, columns) if self.down else (rows, columns // 2)
         self.merged = (height + step[0], width + step[1])
-        self.children = len(outline)
         # Lines at the border of the image lie outside it and take no part once a cell spans the image.
-        around = [
+        self.outline = [
             (row, column)
             for row, column in _outline(*self.merged)
             if (self.rows > 1 or 0 < row < self.merged[0]) and (self.columns > 1 or 0 < column < self.merged[1])
         ]
-        self.outline = around
         line = [(height, c) for c in range(1, width)] if self.down else [(r, width) for r in range(1, height)]
         self.inner = len(line)
-        position = {place: i for i, place in enumerate([*line, *around])}
+        position = {place: i for i, place in enumerate([*line, *self.outline])}
         self._runs = [
             _runs([(i, position[p]) for i, (r, c) in enumerate(outline) if (p := (r + dy, c + dx)) in position])
             for dy, dx in ((0, 0), step)
@@ -239,32 +214,25 @@ class _Merge:
         """Merge and eliminate; returns what is left between the places of each merged cell's outline."""
         n, m = self._size, self.inner
         r = n - m
-        count = (self.rows, self.columns)
-        factors = _Factors(
-            fronts.new_empty(*count, m, m), fronts.new_empty(*count, m, r), fronts.new_empty(*count, r, m)
-        )
-        left = fronts.new_empty(*count, r, r)
+        self._inverse, self._upper, self._lower, left = results = [
+            fronts.new_empty(self.rows, self.columns, *sides) for sides in ((m, m), (m, r), (r, m), (r, r))
+        ]
         halves = self._halves(fronts)
-        for rows in self._chunks(n * n):
+        step = max(1, _CHUNK // (n * n * self.columns))
+        for start in range(0, self.rows, step):
+            rows = slice(start, min(start + step, self.rows))
             front = fronts.new_zeros(rows.stop - rows.start, self.columns, n, n)
             for half, runs in zip(halves, self._runs, strict=True):
-                for source_a, target_a in runs:
-                    for source_b, target_b in runs:
-                        front[:, :, target_a, target_b] += half[rows, :, source_a, source_b]
+                for (from_a, to_a), (from_b, to_b) in itertools.product(runs, runs):
+                    front[:, :, to_a, to_b] += half[rows, :, from_a, from_b]
             flat = front.view(-1, n, n)
             inverse = torch.linalg.inv(flat[:, :m, :m])
             lower = flat[:, m:, :m].contiguous()
             upper = inverse @ flat[:, :m, m:]
-            shape = (rows.stop - rows.start, self.columns)
-            left[rows] = torch.baddbmm(flat[:, m:, m:], lower, upper, alpha=-1).view(*shape, r, r)
-            factors.inverse[rows] = inverse.view(*shape, m, m)
-            factors.lower[rows], factors.upper[rows] = lower.view(*shape, r, m), upper.view(*shape, m, r)
-        self._factors = factors
+            rest = torch.baddbmm(flat[:, m:, m:], lower, upper, alpha=-1)
+            for whole, part in zip(results, (inverse, upper, lower, rest), strict=True):
+                whole[rows] = part.view(whole[rows].shape)
         return left
-
-    def _chunks(self, numbers: int) -> Iterator[slice]:
-        step = max(1, _CHUNK // (numbers * self.columns))
-        return (slice(start, min(start + step, self.rows)) for start in range(0, self.rows, step))
 
     def forward(self, values: Tensor) -> Tensor:
         """Eliminate in a right side; returns what is left for each outline."""
@@ -272,15 +240,14 @@ class _Merge:
         for half, runs in zip(self._halves(values), self._runs, strict=True):
             for source, target in runs:
                 joined[..., target] += half[..., source]
-        self._inside = (self._factors.inverse @ joined[..., : self.inner, None])[..., 0]
-        return joined[..., self.inner :] - (self._factors.lower @ self._inside[..., None])[..., 0]
+        self._inside = (self._inverse @ joined[..., : self.inner, None])[..., 0]
+        return joined[..., self.inner :] - (self._lower @ self._inside[..., None])[..., 0]
 
     def backward(self, values: Tensor) -> Tensor:
         """Return the solution on the outlines before the merge, given that on those after it."""
-        inside = self._inside - (self._factors.upper @ values[..., None])[..., 0]
+        inside = self._inside - (self._upper @ values[..., None])[..., 0]
         joined = torch.cat([inside, values], -1)
-        rows, columns = (2 * self.rows, self.columns) if self.down else (self.rows, 2 * self.columns)
-        before = values.new_zeros(rows, columns, self.children)
+        before = values.new_zeros(self.before)
         for half, runs in zip(self._halves(before), self._runs, strict=True):
             for source, target in runs:
                 half[..., source] = joined[..., target]

@@ -7,16 +7,18 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args
 
-from saunet.data.kitti.raw import CAMERAS
+from saunet.data.drive import Drive
+from saunet.data.kitti import splits
+from saunet.data.kitti.raw import CAMERAS, DepthKind, KittiRaw
+from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.sampling import available_cores
 from saunet.data.loading.stored import DENSE_KINDS, CacheSettings
-from saunet.errors import ConfigError, one_of, positive, usable_device
+from saunet.data.loading.windows import other_view
+from saunet.errors import ConfigError, DataError, one_of, positive, suggest, usable_device
 from saunet.registry import Spec
 from saunet.tools.prepare.cache import CacheReport, build_cache
-from saunet.tools.prepare.densify import DenseKind, densify
 from saunet.tools.prepare.pool import Done, OnError
-from saunet.tools.prepare.recordings import kitti_recordings, module_recordings
-from saunet.tools.prepare.teacher import Values, source_of, teach
+from saunet.tools.prepare.targets import DenseKind, FileTeacher, ModelTeacher, Recording, Values, densify, teach
 
 Job = Literal["densify", "teacher", "cache"]
 _KITTI = ("root", "cameras", "drives", "split")
@@ -144,9 +146,81 @@ def prepare(options: PrepareOptions) -> Done | CacheReport:
         if options.job == "densify":
             return densify(kitti, options.kinds, options.folder, workers, options.on_error)
         if options.job == "teacher":
-            device = str(usable_device(options.device))
-            source = source_of(options.checkpoint, options.input, options.values, device)
-            return teach(kitti, source, options.folder, options.on_error)
+            return teach(kitti, _teacher(options), options.folder, options.on_error)
         recordings = list(kitti)
     settings = CacheSettings(options.height, options.width, options.format, options.quality)
     return build_cache(recordings, Path(str(options.folder)), settings, workers, options.on_error)
+
+
+def _teacher(options: PrepareOptions) -> ModelTeacher | FileTeacher:
+    device = str(usable_device(options.device))
+    if options.input is not None:
+        return FileTeacher(options.input, options.values)
+    from saunet.prediction.predictor import Predictor
+
+    return ModelTeacher(Predictor.from_checkpoint(str(options.checkpoint), device))
+
+
+def kitti_recordings(
+    root: str | Path,
+    cameras: Sequence[str] = ("left", "right"),
+    drives: Sequence[str] = (),
+    split: str = "all",
+    depth: DepthKind = "camera_z",
+) -> list[Recording]:
+    """Find the recordings of a KITTI raw tree that have frames of a split (see `PrepareOptions`)."""
+    raw = KittiRaw(root)
+    for drive in drives:
+        if not any(name.endswith(drive) for name in raw.drives):
+            hint = suggest(drive, [name.rpartition("/")[2] for name in raw.drives])
+            raise ConfigError(f"drives holds '{drive}', which is not below {raw.root}{hint}")
+    wanted = _frames(split)
+    found: list[Recording] = []
+    for name in raw.drives:
+        if drives and not name.endswith(tuple(drives)):
+            continue
+        for camera in cameras:
+            recording = raw.drive(name, camera, depth)
+            side = CAMERAS[camera][1]
+            frames = [n for n in recording.indices if wanted is None or (name, n, side) in wanted]
+            if frames:
+                found.append((recording, frames))
+    if not found:
+        raise DataError(f"the drives below {raw.root} hold no frames of cameras {list(cameras)} and split '{split}'")
+    return found
+
+
+def _frames(split: str) -> set[tuple[str, int, str]] | None:
+    if split == "all":
+        return None
+    if split in splits.TRAINING:
+        train, val = splits.training_split(split, 0)
+        frames = [*train, *val]
+    elif split in splits.TEST:
+        frames = splits.test_split(split)
+    elif Path(split).is_file():
+        frames = splits.read_split(Path(split))
+    else:
+        words = ("all", *splits.TRAINING, *splits.TEST)
+        hint = suggest(split, words)
+        raise ConfigError(
+            f"split is '{split}'{hint or ','} allowed: {', '.join(words)}, or the path of an existing file"
+        )
+    return {(frame.drive, frame.number + step, frame.side) for frame in frames for step in (-1, 0, 1)}
+
+
+def module_recordings(data: DepthDataModule) -> list[tuple[Drive, Sequence[int]]]:
+    """Return what a data module trains and validates on, with all frames; with ``stereo`` the other cameras too."""
+    if not data.cacheable:
+        raise ConfigError(
+            f"{type(data).__name__} reads no copies made by saunet prepare; use data=kitti, kitti_odometry or video"
+        )
+    data.prepare_data()
+    drives: dict[str, Drive] = {}
+    for split in ("train", "val"):
+        for drive, *_ in data.select(split):
+            drives.setdefault(drive.name, drive)
+            if data.stereo:
+                other, _ = other_view(drive)
+                drives.setdefault(other.name, other)
+    return [(drive, drive.indices) for drive in drives.values() if len(drive.indices)]
