@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,9 +13,7 @@ import numpy as np
 from saunet.data.loading.selecting import MIN_FLOW, UNREADABLE, Manifest
 from saunet.data.video.drive import SAME_PICTURE
 from saunet.errors import UnreadableError
-from saunet.tools.doctor.survey import ABSENT, BANDS, FrameFacts, Survey
-
-Level = Literal["error", "warning", "note"]
+from saunet.tools.doctor.survey import ABSENT, BANDS, CameraFacts, FrameFacts, Survey
 
 DARK, BRIGHT = 0.08, 0.92
 """Mean brightness outside which a frame shows nothing."""
@@ -24,13 +21,14 @@ FLAT = 0.03
 """Contrast under which a frame shows nothing (fog on the lens, a wall, a cap)."""
 _STILL_BAND = 0.5
 """A band that moves less than this fraction of the whole picture is part of the car."""
+_USE_MANIFEST = "train with data.manifest=<this manifest>"
 
 
 @dataclass(frozen=True)
 class Finding:
     """One thing to know about a data set."""
 
-    level: Level
+    level: Literal["error", "warning", "note"]
     text: str
     fix: str = ""
 
@@ -40,13 +38,9 @@ class Finding:
 
 def diagnose(survey: Survey) -> list[Finding]:
     """Return what there is to say about a data set, errors first."""
-    rules: list[Callable[[Survey], Iterator[Finding]]] = [
-        *(_splits, _names, _unreadable, _sizes, _cameras, _neighbors, _leak, _parallax),
-        *(_doubled, _static, _bonnet, _light, _truth, _speed),
-    ]
-    found = [finding for rule in rules for finding in rule(survey)]
-    order = {"error": 0, "warning": 1, "note": 2}
-    return sorted(found, key=lambda finding: order[finding.level])
+    rules = (_splits, _names, _unreadable, _sizes, _cameras, _neighbors, _leak, _parallax, _doubled, _static, _bonnet)
+    found = [finding for rule in (*rules, _light, _truth, _speed) for finding in rule(survey)]
+    return sorted(found, key=lambda finding: ("error", "warning", "note").index(finding.level))
 
 
 def _splits(survey: Survey) -> Iterator[Finding]:
@@ -54,49 +48,36 @@ def _splits(survey: Survey) -> Iterator[Finding]:
         splits = [split for split, error in survey.problems.items() if str(error) == problem]
         named = " and ".join([", ".join(splits[:-1]), splits[-1]] if len(splits) > 1 else splits)
         broken = isinstance(survey.problems[splits[0]], UnreadableError)
-        yield Finding(
-            "error",
-            f"the {named} split{'s' if len(splits) > 1 else ''} cannot be used: {problem}",
-            "data.on_error=skip counts all files that are broken" if broken else "",
-        )
+        text = f"the {named} split{'s' if len(splits) > 1 else ''} cannot be used: {problem}"
+        yield Finding("error", text, "data.on_error=skip counts all files that are broken" if broken else "")
     count = survey.windows.get("train")
     if count is not None and count < 1000:
-        yield Finding(
-            "warning",
-            f"only {count} training samples; published models use some 40 000",
-            "add drives, or start from a trained model",
-        )
+        text = f"only {count} training samples; published models use some 40 000"
+        yield Finding("warning", text, "add drives, or start from a trained model")
     if count is not None and "val" not in survey.windows and "val" not in survey.problems:
         yield Finding("warning", "nothing is held out for validation", "set data.val_share or name clips or drives")
 
 
 def _names(survey: Survey) -> Iterator[Finding]:
     for name in survey.ambiguous:
-        yield Finding(
-            "error",
-            f"'{name}' is the name of different recordings in different splits, so a manifest cannot tell them apart",
-            "give each recording a name of its own",
-        )
+        text = f"'{name}' is the name of different recordings in different splits, so a manifest cannot tell them apart"
+        yield Finding("error", text, "give each recording a name of its own")
 
 
 def _unreadable(survey: Survey) -> Iterator[Finding]:
-    passed_over = max((reasons.get("unreadable", 0) for reasons in survey.left_out.values()), default=0)
-    if passed_over:
-        yield Finding("warning", f"{passed_over} frames cannot be read and are left out", "copy them again")
-    lost = max((reasons.get("not decodable", 0) for reasons in survey.left_out.values()), default=0)
+    unreadable, lost = (
+        max((reasons.get(reason, 0) for reasons in survey.left_out.values()), default=0)
+        for reason in ("unreadable", "not decodable")
+    )
+    if unreadable:
+        yield Finding("warning", f"{unreadable} frames cannot be read and are left out", "copy them again")
     if lost:
-        yield Finding(
-            "warning",
-            f"{lost} frames that videos claim to hold cannot be decoded and are left out",
-            "the end of a video is cut off or damaged: copy it again",
-        )
+        text = f"{lost} frames that videos claim to hold cannot be decoded and are left out"
+        yield Finding("warning", text, "the end of a video is cut off or damaged: copy it again")
     broken = [frame for frame in survey.frames if frame.problem]
     if broken:
-        yield Finding(
-            "error",
-            f"{len(broken)} of {len(survey.frames)} frames cannot be read; the first: {broken[0].problem}",
-            "copy them again, or train with data.manifest=<this manifest> or data.on_error=skip",
-        )
+        text = f"{len(broken)} of {len(survey.frames)} frames cannot be read; the first: {broken[0].problem}"
+        yield Finding("error", text, f"copy them again, or {_USE_MANIFEST} or data.on_error=skip")
 
 
 def _sizes(survey: Survey) -> Iterator[Finding]:
@@ -114,66 +95,53 @@ def _sizes(survey: Survey) -> Iterator[Finding]:
 
 
 def _cameras(survey: Survey) -> Iterator[Finding]:
-    for problem in survey.camera_problems:
-        yield Finding("error", problem)
-    views = []
+    yield from (Finding("error", problem) for problem in survey.camera_problems)
     for camera in survey.cameras:
-        (height, width), K = camera.size, camera.K
-        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-        told = f"'{camera.drive}': fx {fx:.1f}, fy {fy:.1f}, center {cx:.1f}, {cy:.1f} in {width}x{height}"
-        view = math.degrees(2 * math.atan(width / 2 / fx))
-        views.append(view)
-        if not 20 <= view <= 150:
-            yield Finding(
-                "error",
-                f"{told} means a field of view of {view:.0f} degrees, which no driving camera has",
-                "give K in pixels of the image size it was calibrated for",
-            )
-        elif abs(fx / fy - 1) > 0.1:
-            yield Finding("warning", f"{told}: the focal lengths differ", "were images stretched after calibration?")
-        if not (0.35 < (cx + 0.5) / width < 0.65 and 0.2 < (cy + 0.5) / height < 0.8):
-            yield Finding(
-                "warning",
-                f"{told}: the center is far from the middle of the image",
-                "is K that of uncropped or differently sized images?",
-            )
-    if views:
-        low, high = round(min(views)), round(max(views))
+        yield from _camera(camera)
+    if survey.cameras:
+        views = [round(camera.view) for camera in survey.cameras]
+        low, high = min(views), max(views)
         yield Finding("note", f"horizontal field of view {low}{f' to {high}' if high > low else ''} degrees")
-    unknown = sum(camera.height is None for camera in survey.cameras)
-    if survey.cameras and not unknown:
-        heights = sorted({round(camera.height or 0, 2) for camera in survey.cameras})
-        yield Finding("note", f"camera height {', '.join(map(str, heights))} m: depth can be made metric")
+    heights = {camera.height for camera in survey.cameras}
+    if heights and None not in heights:
+        listed = ", ".join(map(str, sorted({round(height or 0, 2) for height in heights})))
+        yield Finding("note", f"camera height {listed} m: depth can be made metric")
+
+
+def _camera(camera: CameraFacts) -> Iterator[Finding]:
+    (height, width), K = camera.size, camera.K
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    told = f"'{camera.drive}': fx {fx:.1f}, fy {fy:.1f}, center {cx:.1f}, {cy:.1f} in {width}x{height}"
+    if not 20 <= camera.view <= 150:
+        text = f"{told} means a field of view of {camera.view:.0f} degrees, which no driving camera has"
+        yield Finding("error", text, "give K in pixels of the image size it was calibrated for")
+    elif abs(fx / fy - 1) > 0.1:
+        yield Finding("warning", f"{told}: the focal lengths differ", "were images stretched after calibration?")
+    if not (0.35 < (cx + 0.5) / width < 0.65 and 0.2 < (cy + 0.5) / height < 0.8):
+        text = f"{told}: the center is far from the middle of the image"
+        yield Finding("warning", text, "is K that of uncropped or differently sized images?")
 
 
 def _neighbors(survey: Survey) -> Iterator[Finding]:
     for split, reasons in survey.left_out.items():
         absent, listed = survey.absent[split]
-        total = survey.windows[split] + sum(reasons.values())
+        total, missing = survey.windows[split] + sum(reasons.values()), reasons.get(ABSENT, 0)
         if absent:
-            yield Finding(
-                "warning",
-                f"{absent} of {listed} recordings of the {split} split are not there, with {reasons.get(ABSENT, 0)} of "
-                f"its {total} frames",
-                "add them, or choose a split of those that are there, such as data.split=all for KITTI",
-            )
-        total -= reasons.get(ABSENT, 0)
+            text = f"{absent} of {listed} recordings of the {split} split are not there"
+            fix = "add them, or choose a split of those that are there, such as data.split=all for KITTI"
+            yield Finding("warning", f"{text}, with {missing} of its {total} frames", fix)
+        total -= missing
         for reason, count in reasons.items():
             if reason in ("without neighbor", "missing") and count > max(10, 0.2 * total):
-                yield Finding(
-                    "warning",
-                    f"{count} of {total} {split} frames are left out, {reason}",
-                    "check that frame numbers are consecutive and that no frames were thinned out",
-                )
+                fix = "check that frame numbers are consecutive and that no frames were thinned out"
+                yield Finding("warning", f"{count} of {total} {split} frames are left out, {reason}", fix)
 
 
 def _leak(survey: Survey) -> Iterator[Finding]:
     if survey.shared_frames:
-        yield Finding(
-            "warning",
-            f"{survey.shared_frames} frames are read by training and by validation samples",
-            "hold out whole drives or clips (data.val_drives, data.val_clips) for an honest validation",
-        )
+        text = f"{survey.shared_frames} frames are read by training and by validation samples"
+        fix = "hold out whole drives or clips (data.val_drives, data.val_clips) for an honest validation"
+        yield Finding("warning", text, fix)
 
 
 def _parallax(survey: Survey) -> Iterator[Finding]:
@@ -185,46 +153,35 @@ def _parallax(survey: Survey) -> Iterator[Finding]:
     low, middle, high = np.quantile(flows, [0.05, 0.5, 0.95])
     rates = sorted({round(camera.fps, 2) for camera in survey.cameras if camera.fps})
     rate = f" (recorded at {', '.join(map(str, rates))} frames a second)" if rates else ""
-    step = survey.step
     yield Finding(
         "note",
-        f"motion between frames {step} apart: median {middle:.1f} px at 320 px width, 5 to 95 % of moving frames: "
-        f"{low:.1f} to {high:.1f}{rate}",
+        f"motion between frames {survey.step} apart: median {middle:.1f} px at 320 px width, 5 to 95 % of moving "
+        f"frames: {low:.1f} to {high:.1f}{rate}",
     )
     if middle < 1.5:
-        wider = max(2, round(step * 4 / middle))
-        yield Finding(
-            "warning",
-            f"the picture moves by {middle:.1f} px a step, too little to tell depths apart",
-            f"use data.offsets=[-{wider},{wider}] or a lower frame rate",
-        )
+        wider = max(2, round(survey.step * 4 / middle))
+        text = f"the picture moves by {middle:.1f} px a step, too little to tell depths apart"
+        yield Finding("warning", text, f"use data.offsets=[-{wider},{wider}] or a lower frame rate")
     elif middle > 25:
-        yield Finding(
-            "warning",
-            f"the picture moves by {middle:.0f} px a step, so that neighbors hardly overlap",
-            "use more frames a second or smaller data.offsets",
-        )
+        text = f"the picture moves by {middle:.0f} px a step, so that neighbors hardly overlap"
+        yield Finding("warning", text, "use more frames a second or smaller data.offsets")
 
 
 def _doubled(survey: Survey) -> Iterator[Finding]:
-    doubled = sum(frame.change is not None and frame.change < SAME_PICTURE for frame in survey.compared())
-    if doubled > 0.02 * len(survey.compared()):
-        yield Finding(
-            "warning",
-            f"{doubled} of {len(survey.compared())} frames are the same picture as their neighbor",
-            "the video's frame rate was raised: use the original, or data=video, which drops doubled frames",
-        )
+    compared = survey.compared()
+    doubled = sum(frame.change is not None and frame.change < SAME_PICTURE for frame in compared)
+    if doubled > 0.02 * len(compared):
+        text = f"{doubled} of {len(compared)} frames are the same picture as their neighbor"
+        fix = "the video's frame rate was raised: use the original, or data=video, which drops doubled frames"
+        yield Finding("warning", text, fix)
 
 
 def _static(survey: Survey) -> Iterator[Finding]:
     compared = survey.compared()
     still = sum((frame.flow or 0) < MIN_FLOW for frame in compared)
     if still > 0.05 * len(compared):
-        yield Finding(
-            "warning",
-            f"{still} of {len(compared)} frames show no motion; they teach nothing",
-            "train with data.manifest=<this manifest>, or data.static=flow (kitti) or drop (video)",
-        )
+        text = f"{still} of {len(compared)} frames show no motion; they teach nothing"
+        yield Finding("warning", text, f"{_USE_MANIFEST}, or data.static=flow (kitti) or drop (video)")
 
 
 def band_profile(survey: Survey) -> np.ndarray | None:
@@ -235,17 +192,12 @@ def band_profile(survey: Survey) -> np.ndarray | None:
 
 def _bonnet(survey: Survey) -> Iterator[Finding]:
     profile = band_profile(survey)
-    if profile is None:
+    if profile is None or (profile < _STILL_BAND).all():
         return
-    still = profile < _STILL_BAND
-    bottom = int(np.argmin(still[::-1])) if not still.all() else 0
-    if bottom:
-        share = bottom / BANDS
-        yield Finding(
-            "warning",
-            f"the lowest {share:.0%} of the picture do not move: the car's bonnet, a dashboard or an imprint",
-            f"cut it off with data.crop=[0,{share:.2f},0,0] (video), or crop in camera.yaml",
-        )
+    share = int(np.argmin(profile[::-1] < _STILL_BAND)) / BANDS
+    if share:
+        text = f"the lowest {share:.0%} of the picture do not move: the car's bonnet, a dashboard or an imprint"
+        yield Finding("warning", text, f"cut it off with data.crop=[0,{share:.2f},0,0] (video), or crop in camera.yaml")
 
 
 def _light(survey: Survey) -> Iterator[Finding]:
@@ -255,34 +207,31 @@ def _light(survey: Survey) -> Iterator[Finding]:
     light = np.array([frame.brightness for frame in frames])
     flat = sum(frame.contrast < FLAT for frame in frames)
     yield Finding("note", f"brightness {np.median(light):.2f} (median), {light.min():.2f} to {light.max():.2f}")
-    for count, what in ((int((light < DARK).sum()), "almost black"), (int((light > BRIGHT).sum()), "almost white")):
+    for count, what in (
+        (int((light < DARK).sum()), "are almost black"),
+        (int((light > BRIGHT).sum()), "are almost white"),
+        (flat, "have no contrast"),
+    ):
         if count:
-            yield Finding("warning", f"{count} frames are {what}", "train with data.manifest=<this manifest>")
-    if flat:
-        yield Finding("warning", f"{flat} frames have no contrast", "train with data.manifest=<this manifest>")
+            yield Finding("warning", f"{count} frames {what}", _USE_MANIFEST)
 
 
 def _truth(survey: Survey) -> Iterator[Finding]:
+    truths = survey.truths
     if not survey.truth_wanted:
         return
-    if not survey.truths:
-        yield Finding(
-            "note",
-            "no ground-truth depth: training needs none; evaluation compares views of neighboring frames",
-        )
+    if not truths:
+        text = "no ground-truth depth: training needs none; evaluation compares views of neighboring frames"
+        yield Finding("note", text)
         return
-    known = float(np.mean([truth.known for truth in survey.truths]))
-    low, high = min(t.low for t in survey.truths), max(t.high for t in survey.truths)
-    middle = float(np.median([truth.middle for truth in survey.truths]))
-    yield Finding(
-        "note",
-        f"ground truth in {len(survey.truths)} of {survey.truth_wanted} frames asked: {known:.1%} of the pixels, "
-        f"{low:.1f} to {high:.1f} m, median {middle:.1f} m",
-    )
+    known = float(np.mean([truth.known for truth in truths]))
+    low, high = min(truth.low for truth in truths), max(truth.high for truth in truths)
+    middle = float(np.median([truth.middle for truth in truths]))
+    text = f"ground truth in {len(truths)} of {survey.truth_wanted} frames asked: {known:.1%} of the pixels"
+    yield Finding("note", f"{text}, {low:.1f} to {high:.1f} m, median {middle:.1f} m")
     if high > 1000 or not 1 <= middle <= 100:
-        yield Finding(
-            "warning", f"depths have a median of {middle:.1f} m and reach {high:.0f} m", "are they in meters?"
-        )
+        text = f"depths have a median of {middle:.1f} m and reach {high:.0f} m"
+        yield Finding("warning", text, "are they in meters?")
 
 
 def _speed(survey: Survey) -> Iterator[Finding]:
@@ -293,16 +242,12 @@ def _speed(survey: Survey) -> Iterator[Finding]:
     sized = [frame for frame in frames if frame.file_bytes]
     rate = sum(f.file_bytes or 0 for f in sized) / max(1e-9, sum(f.seconds for f in sized)) / 1e6
     disk = f", {rate:.0f} MB/s" if sized else ""
-    yield Finding(
-        "note", f"reading and decoding takes {1000 * seconds:.1f} ms an image{disk}: {1 / seconds:.0f}/s a core"
-    )
+    text = f"reading and decoding takes {1000 * seconds:.1f} ms an image{disk}: {1 / seconds:.0f}/s a core"
+    yield Finding("note", text)
     if seconds > 0.05:
-        yield Finding(
-            "warning",
-            f"a core reads {1 / seconds:.0f} images a second; a training step of 12 samples needs 36",
-            f"{'make a cache of small images once (saunet prepare cache), ' if survey.cacheable else ''}"
-            "use more data.workers or a faster disk",
-        )
+        cache = "make a cache of small images once (saunet prepare cache), " if survey.cacheable else ""
+        text = f"a core reads {1 / seconds:.0f} images a second; a training step of 12 samples needs 36"
+        yield Finding("warning", text, f"{cache}use more data.workers or a faster disk")
 
 
 def manifest_of(survey: Survey, findings: Sequence[Finding], path: str | Path) -> Manifest:
@@ -325,16 +270,12 @@ def manifest_of(survey: Survey, findings: Sequence[Finding], path: str | Path) -
 
 
 def _reason(frame: FrameFacts) -> str | None:
-    if frame.problem:
-        return UNREADABLE
-    if frame.brightness < DARK:
-        return "dark"
-    if frame.brightness > BRIGHT:
-        return "bright"
-    if frame.contrast < FLAT:
-        return "flat"
-    if frame.change is not None and frame.change < SAME_PICTURE:
-        return "doubled"
-    if frame.flow is not None and frame.flow < MIN_FLOW:
-        return "static"
-    return None
+    reasons = {
+        UNREADABLE: frame.problem is not None,
+        "dark": frame.brightness < DARK,
+        "bright": frame.brightness > BRIGHT,
+        "flat": frame.contrast < FLAT,
+        "doubled": frame.change is not None and frame.change < SAME_PICTURE,
+        "static": frame.flow is not None and frame.flow < MIN_FLOW,
+    }
+    return next((reason for reason, holds in reasons.items() if holds), None)

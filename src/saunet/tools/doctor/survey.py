@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,13 +66,16 @@ class CameraFacts:
     height: float | None
     """Meters above the road."""
 
+    @property
+    def view(self) -> float:
+        """Horizontal field of view in degrees."""
+        return math.degrees(2 * math.atan(self.size[1] / 2 / self.K[0, 0]))
+
 
 @dataclass(frozen=True)
 class TruthFacts:
     """One ground-truth map that was read."""
 
-    drive: str
-    index: int
     known: float
     """Fraction of the pixels."""
     low: float
@@ -117,7 +122,6 @@ class Survey:
     """Whether the data module could read a cache of smaller images and does not."""
 
     def readable(self) -> list[FrameFacts]:
-        """Return the frames that could be read."""
         return [frame for frame in self.frames if frame.problem is None]
 
     def compared(self) -> list[FrameFacts]:
@@ -194,7 +198,6 @@ def _label(drive: Drive, split: str, drives: Mapping[str, Drive]) -> str:
 
 
 def _read_by(dataset: WindowDataset) -> set[tuple[str, int]]:
-    """Return all frames that windows read, targets and neighbors."""
     return {
         (dataset.drives[position].name, frame + offset)
         for position, frame in dataset.windows
@@ -213,17 +216,16 @@ def _read_frames(
 ) -> None:
     shown = set(evenly(len(plan), _PICTURES))
     existing = {name: set(drives[name].indices) for name in {name for name, _ in plan}}
-    last: tuple[str, int, NDArray[np.uint8]] | None = None
+    last: tuple[tuple[str, int], NDArray[np.uint8]] | None = None
     for place, (name, index) in enumerate(plan):
         drive = drives[name]
         neighbor = index - found.step if index - found.step in existing[name] else index + found.step
-        try:
-            if last is None or last[:2] != (name, neighbor):
-                before = shrink(drive.image(neighbor)) if neighbor in existing[name] else None
-            else:
-                before = last[2]
-        except DataError:
-            before = None  # it is reported when its own turn comes
+        before = None
+        if last is not None and last[0] == (name, neighbor):
+            before = last[1]
+        elif neighbor in existing[name]:
+            with suppress(DataError):  # it is reported when its own turn comes
+                before = shrink(drive.image(neighbor))
         start = time.perf_counter()
         try:
             image = drive.image(index)
@@ -231,49 +233,21 @@ def _read_frames(
             found.frames.append(FrameFacts(name, index, problem=str(error)))
             continue
         seconds = time.perf_counter() - start
-        small = shrink(image)
-        found.frames.append(_facts(drive, name, index, image.shape[:2], seconds, small, before))
+        small, size, path = shrink(image), None, drive.path(index)
+        with suppress(OSError):
+            size = path.stat().st_size if path else None
+        light, contrast = float(small.mean()) / 255, float(small.mean(axis=2).std()) / 255
+        facts = FrameFacts(name, index, (image.shape[0], image.shape[1]), seconds, size, light, contrast)
+        if before is not None and before.shape == small.shape:
+            lengths = np.linalg.norm(optical_flow(before, small), axis=-1)
+            bands = np.array([band.mean() for band in np.array_split(lengths, BANDS)], dtype=np.float64)
+            change = relative_change(before, small)
+            facts = replace(facts, flow=float(np.median(lengths)), change=change, bands=bands)
+        found.frames.append(facts)
         if place in shown:
             found.pictures.append((f"{name} {index}", small))
-        last = (name, index, small)
+        last = ((name, index), small)
         advance(place + 1, len(plan))
-
-
-def _facts(
-    drive: Drive,
-    name: str,
-    index: int,
-    size: tuple[int, ...],
-    seconds: float,
-    small: NDArray[np.uint8],
-    before: NDArray[np.uint8] | None,
-) -> FrameFacts:
-    flow = change = bands = None
-    if before is not None and before.shape == small.shape:
-        lengths = np.linalg.norm(optical_flow(before, small), axis=-1)
-        flow = float(np.median(lengths))
-        change = relative_change(before, small)
-        bands = np.array([band.mean() for band in np.array_split(lengths, BANDS)], dtype=np.float64)
-    return FrameFacts(
-        name,
-        index,
-        (size[0], size[1]),
-        seconds,
-        _file_bytes(drive, index),
-        float(small.mean()) / 255,
-        float(small.mean(axis=2).std()) / 255,
-        flow,
-        change,
-        bands,
-    )
-
-
-def _file_bytes(drive: Drive, index: int) -> int | None:
-    path = drive.path(index)
-    try:
-        return None if path is None else path.stat().st_size
-    except OSError:
-        return None
 
 
 def _look_at_camera(found: Survey, name: str, drive: Drive, index: int) -> None:
@@ -297,7 +271,6 @@ def _read_truths(found: Survey, dataset: WindowDataset) -> None:
         except DataError as error:
             found.frames.append(FrameFacts(name, index, problem=str(error)))
             continue
-        known = depth[depth > 0] if depth is not None else np.zeros(0)
-        if depth is not None and known.size:
-            low, middle, high = (float(value) for value in np.quantile(known, [0, 0.5, 1]))
-            found.truths.append(TruthFacts(name, index, known.size / depth.size, low, middle, high))
+        if depth is not None and (known := depth[depth > 0]).size:
+            low, middle, high = np.quantile(known, [0, 0.5, 1]).tolist()
+            found.truths.append(TruthFacts(known.size / depth.size, low, middle, high))
