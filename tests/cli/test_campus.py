@@ -15,7 +15,7 @@ import saunet
 from saunet.data.kitti.raw import KittiRaw
 from saunet.data.video.camera import CameraFile, Lens, write_camera
 from saunet.io.images import read_image
-from saunet.tools.calibrate.boards import Board
+from saunet.tools.calibrate.solve import Board
 
 Tool = Callable[..., Any]
 TINY = (

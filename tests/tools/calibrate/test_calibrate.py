@@ -10,8 +10,7 @@ from board_views import SIZE, K, views
 
 from saunet.data.video.camera import read_camera, write_camera
 from saunet.errors import ConfigError, DataError
-from saunet.tools.calibrate.boards import Board
-from saunet.tools.calibrate.solve import check_picture, solve
+from saunet.tools.calibrate.solve import Board, check_picture, solve
 
 
 def save(folder, pictures):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,16 +15,104 @@ from numpy.typing import NDArray
 from saunet.data.loading.sampling import evenly
 from saunet.data.video.camera import CameraFile, Lens
 from saunet.data.video.clips import frame_paths
-from saunet.errors import DataError
-from saunet.io.images import read_image
+from saunet.errors import ConfigError, DataError, in_range, one_of, positive, suggest
+from saunet.io.images import read_image, resize
 from saunet.io.video import VideoReader
-from saunet.tools.calibrate.boards import Board, BoardView
 
+KINDS = ("chessboard", "charuco")
+_SEARCH_WIDTH = 1280
+"""Pictures are made this narrow to look for the board; corners are then refined in the picture itself."""
+_FEWEST_CORNERS = 8
 FEWEST_VIEWS = 8
 UNCERTAIN = 0.02
 """Relative standard deviation of the focal length from which a calibration is refused."""
 _CELLS = (6, 8)
 """Rows and columns of the grid on which coverage is counted."""
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """The board as seen in one picture."""
+
+    points: NDArray[np.float32]
+    """n x 3, meters on the board, z = 0."""
+    pixels: NDArray[np.float32]
+    """n x 2; integer coordinates are pixel centers."""
+
+
+class Board:
+    """A flat calibration board; see `CalibrateOptions` for the parameters."""
+
+    def __init__(
+        self,
+        kind: str = "chessboard",
+        columns: int = 10,
+        rows: int = 7,
+        square: float = 0.025,
+        marker: float = 0.75,
+        dictionary: str = "DICT_4X4_100",
+    ) -> None:
+        self.kind = one_of("board", kind, KINDS)
+        if columns < 4 or rows < 4:
+            raise ConfigError(f"the board has {columns}x{rows} squares; it needs at least 4 in both directions")
+        self.columns, self.rows = columns, rows
+        self.square = float(positive("square", square))
+        self._charuco: Any = None
+        if kind == "charuco":
+            in_range("marker", marker, 0.3, 0.95)
+            numbers = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+            if dictionary not in numbers:
+                raise ConfigError(f"unknown dictionary '{dictionary}'{suggest(dictionary, numbers)}")
+            words, needed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)), columns * rows // 2
+            if needed > len(words.bytesList):
+                larger = next((size for size in (50, 100, 250, 1000) if needed <= size), None)
+                fix = "use fewer squares; the largest usual dictionaries, such as DICT_4X4_1000, have 1000"
+                if larger:
+                    fix = f"choose a larger one, such as DICT_4X4_{larger}"
+                has = f"dictionary {dictionary} has {len(words.bytesList)} markers and the board needs {needed}"
+                raise ConfigError(f"{has}; {fix}")
+            self._charuco = cv2.aruco.CharucoBoard((columns, rows), self.square, marker * self.square, words)
+            self._detector = cv2.aruco.CharucoDetector(self._charuco)
+
+    def __str__(self) -> str:
+        return f"{self.kind} of {self.columns}x{self.rows} squares ({self.columns - 1}x{self.rows - 1} inner corners)"
+
+    def picture(self, pixels_a_square: int = 120) -> UInt8[np.ndarray, "h w"]:
+        """Return the board to print, with a white margin of one square."""
+        size = (self.columns * pixels_a_square, self.rows * pixels_a_square)
+        if self._charuco is not None:
+            inner = np.asarray(self._charuco.generateImage(size))
+        else:
+            parity = np.add.outer(np.arange(self.rows), np.arange(self.columns)) % 2
+            inner = np.kron(parity * 255, np.ones((pixels_a_square, pixels_a_square))).astype(np.uint8)
+        return np.pad(inner, pixels_a_square, constant_values=255)
+
+    def find(self, image: UInt8[np.ndarray, "h w 3"]) -> BoardView | None:
+        """Return the board in an RGB picture; None where it is not, or not enough of it."""
+        gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        return self._find_charuco(gray) if self._charuco is not None else self._find_chessboard(gray)
+
+    def _find_chessboard(self, gray: NDArray[np.uint8]) -> BoardView | None:
+        scale = min(1.0, _SEARCH_WIDTH / gray.shape[1])
+        small = resize(gray, round(gray.shape[0] * scale), round(gray.shape[1] * scale))
+        inner = (self.columns - 1, self.rows - 1)
+        found, corners = cv2.findChessboardCornersSB(small, inner, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+        if not found:
+            return None
+        factors = np.array([gray.shape[1] / small.shape[1], gray.shape[0] / small.shape[0]])
+        pixels = ((corners.reshape(-1, 2) + 0.5) * factors - 0.5).astype(np.float32)
+        if scale < 1:
+            stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.001)
+            pixels = np.asarray(cv2.cornerSubPix(gray, pixels[:, None], (7, 7), (-1, -1), stop)).reshape(-1, 2)
+        points = np.mgrid[: inner[0], : inner[1], :1].T.reshape(-1, 3) * self.square
+        return BoardView(points.astype(np.float32), pixels)
+
+    def _find_charuco(self, gray: NDArray[np.uint8]) -> BoardView | None:
+        corners, numbers, _, _ = self._detector.detectBoard(gray)
+        if numbers is None or len(numbers) < _FEWEST_CORNERS:
+            return None
+        points = np.asarray(self._charuco.getChessboardCorners())[np.asarray(numbers).ravel()]
+        return BoardView(points.astype(np.float32), np.asarray(corners, dtype=np.float32).reshape(-1, 2))
 
 
 @dataclass(frozen=True)
@@ -49,7 +137,6 @@ class Calibration:
 def solve(
     source: str | Path,
     board: Board,
-    *,
     model: str = "pinhole",
     views: int = 40,
     max_error: float = 1.0,
@@ -59,8 +146,7 @@ def solve(
     most = max(FEWEST_VIEWS, views)
     found: list[BoardView] = []
     looked_at, size, example = 0, (0, 0), None
-    for image, total in _pictures(Path(source).expanduser(), 3 * most):
-        looked_at += 1
+    for looked_at, (image, total) in enumerate(_pictures(Path(source).expanduser(), 3 * most), start=1):
         if size != (0, 0) and image.shape[:2] != size:
             raise DataError(
                 f"{source} mixes pictures of {size[1]}x{size[0]} and {image.shape[1]}x{image.shape[0]}; "
@@ -84,11 +170,10 @@ def solve(
     if problem:
         raise DataError(f"the calibration from {source} is not to be trusted: {problem}")
     # Without fps, also where the source is a video: it is that recording's, and other recordings have their own.
-    camera = CameraFile(
-        Path(source), K, size, tuple(distortion), model, reprojection_error=error if error > 0 else None
-    )
-    coverage = _coverage(used, size)
-    return Calibration(camera, error, uncertainty, coverage, tuple(used), looked_at, len(chosen) - len(used), example)
+    known = error if error > 0 else None
+    camera = CameraFile(Path(source), K, size, tuple(distortion), model, reprojection_error=known)
+    dropped = len(chosen) - len(used)
+    return Calibration(camera, error, uncertainty, _coverage(used, size), tuple(used), looked_at, dropped, example)
 
 
 def check_picture(result: Calibration) -> UInt8[np.ndarray, "_ _ 3"]:
@@ -102,7 +187,7 @@ def check_picture(result: Calibration) -> UInt8[np.ndarray, "_ _ 3"]:
     return np.concatenate([left, right], axis=1)
 
 
-def _pictures(source: Path, most: int) -> Any:
+def _pictures(source: Path, most: int) -> Iterator[tuple[NDArray[np.uint8], int | None]]:
     """Yield (image, number of pictures), evenly spread where there are more than ``most``."""
     if source.is_dir():
         paths = frame_paths(source)
@@ -153,13 +238,9 @@ Solution = tuple[NDArray[np.float64], list[float], float, float, NDArray[np.floa
 
 
 def _pinhole(views: Sequence[BoardView], size: tuple[int, int]) -> Solution:
-    error, K, distortion, _, _, deviations, _, errors = cv2.calibrateCameraExtended(
-        [view.points for view in views],
-        [view.pixels for view in views],
-        (size[1], size[0]),
-        None,  # type: ignore[call-overload]
-        None,
-    )
+    points, pixels = [view.points for view in views], [view.pixels for view in views]
+    result = cv2.calibrateCameraExtended(points, pixels, (size[1], size[0]), None, None)  # type: ignore[call-overload]
+    error, K, distortion, _, _, deviations, _, errors = result
     uncertainty = float(np.max(np.ravel(deviations)[:2] / np.array([K[0, 0], K[1, 1]])))
     return np.asarray(K, np.float64), np.ravel(distortion)[:5].tolist(), float(error), uncertainty, np.ravel(errors)
 

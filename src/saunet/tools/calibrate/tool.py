@@ -12,8 +12,7 @@ from saunet.data.video.camera import MODELS, write_camera
 from saunet.errors import ConfigError, one_of, positive
 from saunet.io.images import write_image
 from saunet.io.progress import bar
-from saunet.tools.calibrate.boards import Board
-from saunet.tools.calibrate.solve import Calibration, check_picture, solve
+from saunet.tools.calibrate.solve import Board, Calibration, check_picture, solve
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,14 +120,8 @@ def calibrate(
     assert options.input is not None
     with bar() as shown:
         task = shown.add_task("looking for the board", total=None)
-        result = solve(
-            options.input,
-            board,
-            model=options.lens,
-            views=options.views,
-            max_error=options.max_error,
-            advance=advance or (lambda done, total: shown.update(task, completed=done, total=total)),
-        )
+        advance = advance or (lambda done, total: shown.update(task, completed=done, total=total))
+        result = solve(options.input, board, options.lens, options.views, options.max_error, advance)
     output = Path(options.output)
     camera = replace(result.camera, camera_height=options.camera_height, condition=options.condition)
     note = f"from {len(result.views)} views of a {board} in {Path(options.input).name}"
