@@ -14,7 +14,7 @@ from saunet.models.pretrained import load_pretrained
 from saunet.registry import encoders
 from saunet.types import FeatureSpec
 
-_PUBLIC = {
+_PUBLIC: dict[tuple[int, tuple[int, ...], tuple[int, ...]], str] = {
     (96, (2, 2, 6, 2), (3, 6, 12, 24)): "swin_tiny",
     (96, (2, 2, 18, 2), (3, 6, 12, 24)): "swin_small",
 }
