@@ -45,11 +45,7 @@ class DepthNet(nn.Module):
     """
 
     def __init__(
-        self,
-        encoder: nn.Module,
-        decoder: Callable[..., nn.Module],
-        min_depth: float = 0.1,
-        max_depth: float = 100.0,
+        self, encoder: nn.Module, decoder: Callable[..., nn.Module], min_depth: float = 0.1, max_depth: float = 100.0
     ) -> None:
         super().__init__()
         if not 0 < min_depth < max_depth:
