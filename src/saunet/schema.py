@@ -241,11 +241,13 @@ def _type(annotation: Any) -> tuple[str, tuple[Any, ...]]:
 
 
 def _sentences(target: Callable[..., Any]) -> dict[str, str]:
-    """Return what is said of each parameter, in one line each: in ``Args:``, or in the string below a field."""
-    text = inspect.getdoc(target) or ""
-    section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.DOTALL | re.MULTILINE)
-    pieces = re.split(r"^    \**(\w+): ", section[1], flags=re.MULTILINE)[1:] if section else []
-    said = dict(zip(pieces[::2], pieces[1::2], strict=True))
+    """Return what is said of each parameter, here or in a base: in ``Args:``, or in the string below a field."""
+    said: dict[str, str] = {}
+    for owner in reversed(target.__mro__) if inspect.isclass(target) else [target]:
+        text = inspect.cleandoc(owner.__doc__ or "")
+        section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.DOTALL | re.MULTILINE)
+        pieces = re.split(r"^    \**(\w+): ", section[1], flags=re.MULTILINE)[1:] if section else []
+        said |= zip(pieces[::2], pieces[1::2], strict=True)
     function: Any = target.__init__ if inspect.isclass(target) else target
     for name, parameter in inspect.signature(function).parameters.items():
         if (options := _options(parameter, typing.get_type_hints(function).get(name))) is not None:

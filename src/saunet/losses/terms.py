@@ -105,16 +105,7 @@ class Photometric(Term):
 
 @terms.register("photometric_monodepth2")
 class Monodepth2Photometric(Photometric):
-    """The photometric term with Monodepth2's choices: mean over all pixels, border color outside the picture.
-
-    Args:
-        sources: See `Photometric`.
-        ssim_weight: See `Photometric`.
-        automask: See `Photometric`.
-        reduction: See `Photometric`.
-        use_validity: See `Photometric`.
-        noise: See `Photometric`.
-    """
+    """The photometric term with Monodepth2's choices: mean over all pixels, border color outside the picture."""
 
     def __init__(
         self,
