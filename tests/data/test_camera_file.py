@@ -70,7 +70,7 @@ def test_intrinsics_follow_the_size_of_the_frames(tmp_path):
         (GOOD + "distortion: [0.1, 0.2]\n", "distortion needs a list of 0 or 4 or 5 or 8"),
         (
             GOOD + "distortion: [0.1, 0.2, 0, 0, 0]\nmodel: fisheye\n",
-            "distortion needs a list of 0 or 4 numbers, got 5",
+            "distortion needs a list of 0 or 1 or 2 or 3 or 4 numbers, got 5",
         ),
         (GOOD + "model: fish\n", "model is 'fish'; did you mean 'fisheye'"),
         (GOOD + "fsp: 10\n", "unknown key 'fsp'; did you mean 'fps'"),
@@ -119,7 +119,7 @@ def camera(distortion, model="pinhole"):
 @pytest.mark.parametrize("model", ["pinhole", "fisheye"])
 @settings(max_examples=15, deadline=None)
 @given(
-    st.floats(-0.25, 0.1),
+    st.floats(-0.2, 0.1),  # beyond, the pinhole model folds back inside the picture
     st.floats(-0.4, 0.4),
     st.floats(-0.25, 0.25),
     st.sampled_from([(0, 0, 0, 0), (0.1, 0.2, 0.05, 0.15)]),

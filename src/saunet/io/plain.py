@@ -44,15 +44,19 @@ class _LimitError(ValueError):
     """What a limit was exceeded by."""
 
 
+def read_bytes(path: str | Path, most: int = JSON_BYTES, error: type[SaunetError] = UnreadableError) -> bytes:
+    """Return a file's content if it has at most so many bytes, as a sentence of class ``error`` else."""
+    with Path(path).open("rb") as stream:
+        data = stream.read(most + 1)
+    if len(data) > most:
+        raise error(f"{path} has more than {most:,} bytes, the most that are read of such a file; check what it is")
+    return data
+
+
 def read_text(path: str | Path, most: int = JSON_BYTES, error: type[SaunetError] = UnreadableError) -> str:
     """Return a file's text (UTF-8) if it has at most so many bytes, as a sentence of class ``error`` else."""
-    path = Path(path)
     try:
-        with path.open("rb") as stream:
-            data = stream.read(most + 1)
-        if len(data) > most:
-            raise error(f"{path} has more than {most:,} bytes, the most that are read of such a file; check what it is")
-        return data.decode("utf-8-sig")
+        return read_bytes(path, most, error).decode("utf-8-sig")
     except UnicodeDecodeError as reason:
         raise error(f"{path} is not text in UTF-8 ({_excerpt(reason)}); save it as UTF-8") from reason
 
@@ -78,13 +82,20 @@ def parse_json(text: str | bytes, source: str, error: type[SaunetError] = Unread
 
 def read_yaml(path: str | Path, error: type[SaunetError] = UnreadableError) -> Any:
     """Return what a YAML file holds, as a sentence of class ``error`` if it cannot be read."""
+    return parse_yaml(read_text(path, YAML_BYTES, error), str(path), error)
+
+
+def parse_yaml(text: str, source: str, error: type[SaunetError] = UnreadableError) -> Any:
+    """Return what YAML text holds, OpenCV's matrices as mappings; ``source`` names it in messages."""
     try:
-        return yaml.load(read_text(path, YAML_BYTES, error), _Loader)
+        if len(text) > YAML_BYTES:
+            raise _LimitError(f"more than {YAML_BYTES:,} characters")
+        return yaml.load(text, _Loader)
     # A broken tag or date, a key that is a list, and so on reach us as whatever PyYAML meets first.
     except (yaml.YAMLError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as reason:
         if isinstance(reason, SaunetError):
             raise
-        raise error(f"{path} cannot be read as YAML ({_excerpt(reason)})") from reason
+        raise error(f"{source} cannot be read as YAML ({_excerpt(reason)})") from reason
 
 
 def read_array(path: str | Path, *, mapped: bool = False, error: type[SaunetError] = UnreadableError) -> NDArray[Any]:
@@ -183,6 +194,9 @@ class _Loader(yaml.SafeLoader):
 
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+_Loader.add_multi_constructor(
+    "tag:yaml.org,2002:opencv-", lambda loader, _, node: loader.construct_mapping(node, deep=True)
+)
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

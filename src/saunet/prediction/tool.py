@@ -383,7 +383,7 @@ def _camera(options: PredictOptions, recording: Recording, predictor: ImagePredi
                 return None
             lens = undistorter.lens(*size)
             return Camera(lens.K, lens.height, lens.width)
-        if any(file.distortion):
+        if not file.is_straight:
             raise ConfigError(
                 f"camera={given} describes a lens with distortion, and points need straight images; "
                 f"set undistort={given} in its place"

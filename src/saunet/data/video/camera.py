@@ -4,7 +4,8 @@
 image_size: [1920, 1080]               # width, height of the images that K belongs to
 K: [1408.2, 1407.9, 958.7, 541.3]      # fx, fy, cx, cy in pixels; or three rows of three numbers
 distortion: [-0.31, 0.12, 0, 0, -0.02] # OpenCV's k1 k2 p1 p2 k3 ...; leave it out for undistorted images
-model: pinhole                         # or fisheye (four numbers of distortion)
+model: pinhole                         # or fisheye, omni ... (docs/cameras.md)
+fov: 100                               # degrees: width of the straight picture; by default as wide as it can be
 fps: 30                                # of the frames; a video file's own rate goes before it
 camera_height: 1.42                    # meters above the road, for metric depth
 condition: cloudy                      # free words, to choose and compare clips by
@@ -31,14 +32,13 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from saunet.data.checks import check_intrinsics
+from saunet.data.video.calibrations import find_camera, split_name
+from saunet.data.video.lens_models import COEFFICIENTS, WIDEST, Maps, straight_intrinsics, straightening_maps
 from saunet.errors import DataError, SaunetError, suggest
 from saunet.geometry.camera import crop_intrinsics, scale_intrinsics
 from saunet.io.atomic import write_bytes
-from saunet.io.plain import read_yaml
 
 FILE_NAME = "camera.yaml"
-MODELS = ("pinhole", "fisheye")
-_COUNTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (0, 4)}
 FIX = "is K in pixels of images of this size, or normalized (then set normalized: true)?"
 """What to look at where K cannot belong to the images."""
 _SAME_SHAPE = 0.02
@@ -67,6 +67,13 @@ class CameraFile:
     """Shares of the image to cut off at the top, bottom, left and right."""
     reprojection_error: float | None = None
     """Root mean square in pixels, where the file comes from a calibration."""
+    fov: float | None = None
+    """Horizontal degrees of the straight picture; None for as many as it can have."""
+
+    @property
+    def is_straight(self) -> bool:
+        """Whether the pictures are those of an ideal pinhole camera."""
+        return self.model == "pinhole" and not any(self.distortion)
 
     def intrinsics(self, height: int, width: int, what: str = "the frames") -> NDArray[np.float64]:
         """Return K, 3 x 3, in pixels of frames of a size, which must have the shape of the calibrated ones."""
@@ -87,10 +94,10 @@ class CameraFile:
 
 
 def read_camera(path: str | Path) -> CameraFile:
-    """Read a ``camera.yaml``."""
-    path = Path(path)
+    """Read a ``camera.yaml``, or ``FILE[:camera name]`` of another tool's calibration (docs/cameras.md)."""
+    path, name = split_name(path)
     try:
-        plain = read_yaml(path)
+        plain = find_camera(path, name)
     except FileNotFoundError as reason:
         raise DataError(
             f"no camera file at {path}; make one with saunet calibrate, or write one (see docs/your_camera.md)"
@@ -100,6 +107,11 @@ def read_camera(path: str | Path) -> CameraFile:
     if not isinstance(plain, dict):
         raise DataError(f"{path} holds {type(plain).__name__}; expected keys such as 'K: [fx, fy, cx, cy]'")
     keys = [*(each.name for each in fields(CameraFile) if each.name != "path"), "normalized"]
+    if plain and not set(plain) & set(keys):
+        raise DataError(
+            f"{path} is no calibration that can be read: camera.yaml, ROS, OpenCV, Kalibr, COLMAP, Nerfstudio, KITTI, "
+            "VINS, ORB-SLAM or MATLAB (see docs/cameras.md)"
+        )
     for key in plain:
         if key not in keys:
             hint = suggest(str(key), keys)
@@ -131,22 +143,27 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
             raise DataError(f"{path}: image_size is {plain['image_size']}; expected whole numbers [width, height]")
         size = (int(height), int(width))
     model = plain.get("model", "pinhole")
-    if model not in MODELS:
-        raise DataError(f"{path}: model is '{model}'{suggest(str(model), MODELS) or ','} allowed: {', '.join(MODELS)}")
+    if model not in COEFFICIENTS:
+        raise DataError(
+            f"{path}: model is '{model}'{suggest(str(model), COEFFICIENTS) or ','} allowed: {', '.join(COEFFICIENTS)}"
+        )
     crop = tuple(_numbers(path, "crop", plain.get("crop", [0, 0, 0, 0]), (4,)))
     check_crop(crop, f"{path}: crop")
     camera = CameraFile(
         path=path,
         K=_matrix(path, plain["K"]),
         image_size=size,
-        distortion=tuple(_numbers(path, "distortion", plain.get("distortion") or [], _COUNTS[model])),
+        distortion=tuple(_numbers(path, "distortion", plain.get("distortion") or [], COEFFICIENTS[model])),
         model=model,
         fps=above_zero("fps"),
         camera_height=above_zero("camera_height"),
         condition=None if plain.get("condition") is None else str(plain["condition"]),
         crop=(crop[0], crop[1], crop[2], crop[3]),
         reprojection_error=above_zero("reprojection_error"),
+        fov=above_zero("fov"),
     )
+    if camera.fov is not None and camera.fov > WIDEST:
+        raise DataError(f"{path}: fov is {camera.fov:g} degrees; a straight picture has at most {WIDEST:g}")
     if size is not None:
         check_intrinsics(camera.K, *size, f"{path}: K", FIX)
     elif not (0.1 < camera.K[0, 0] < 20 and 0 < camera.K[0, 2] < 1 and 0 < camera.K[1, 2] < 1):
@@ -201,8 +218,9 @@ def write_camera(path: str | Path, camera: CameraFile, note: str = "") -> None:
     plain["K"] = [float(f"{number:.8g}") for number in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])]
     if camera.distortion:
         plain["distortion"] = [float(f"{number:.8g}") for number in camera.distortion]
+    if not camera.is_straight:
         plain["model"] = camera.model
-    for key in ("fps", "camera_height", "condition"):
+    for key in ("fov", "fps", "camera_height", "condition"):
         if getattr(camera, key) is not None:
             plain[key] = getattr(camera, key)
     if any(camera.crop):
@@ -227,9 +245,11 @@ class Lens:
     ) -> None:
         self.recorded = (height, width)
         K = camera.intrinsics(height, width, what)
-        self._maps: tuple[NDArray[np.int16], NDArray[np.uint16]] | None = None
-        if any(camera.distortion):
-            K, self._maps = _undistortion(camera, K, height, width)
+        self._maps: Maps | None = None
+        if not camera.is_straight:
+            lens = camera.model, camera.distortion, K
+            K = straight_intrinsics(*lens, height, width, camera.fov, str(camera.path))
+            self._maps = straightening_maps(*lens, K, height, width)
             check_intrinsics(K, height, width, f"{camera.path}: K after undistortion", FIX)
         shares = camera.crop if crop is None else tuple(crop)
         check_crop(shares, "crop")
@@ -264,17 +284,3 @@ class Undistorter:
 
     def __call__(self, image: UInt8[np.ndarray, "_ _ 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
         return self.lens(image.shape[0], image.shape[1])(image)
-
-
-def _undistortion(
-    camera: CameraFile, K: NDArray[np.float64], height: int, width: int
-) -> tuple[NDArray[np.float64], tuple[NDArray[np.int16], NDArray[np.uint16]]]:
-    """Return K of the largest undistorted image without blank pixels, and where each of its pixels comes from."""
-    numbers, size = np.array(camera.distortion), (width, height)
-    if camera.model == "fisheye":
-        straight = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, numbers, size, np.eye(3), balance=0.0)
-        maps = cv2.fisheye.initUndistortRectifyMap(K, numbers, np.eye(3), straight, size, cv2.CV_16SC2)
-    else:
-        straight, _ = cv2.getOptimalNewCameraMatrix(K, numbers, size, 0.0, size)
-        maps = cv2.initUndistortRectifyMap(K, numbers, None, straight, size, cv2.CV_16SC2)
-    return np.asarray(straight, dtype=np.float64), (np.asarray(maps[0]), np.asarray(maps[1]))

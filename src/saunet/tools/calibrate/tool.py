@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from saunet.data.video.camera import MODELS, write_camera
+from saunet.data.video.camera import write_camera
 from saunet.errors import ConfigError, one_of, positive
 from saunet.io.images import write_image
 from saunet.io.progress import bar
@@ -68,7 +68,7 @@ class CalibrateOptions:
             )
         if Path(self.output).exists() and not self.overwrite:
             raise ConfigError(f"{self.output} exists; choose another output, or set overwrite=true")
-        one_of("lens", self.lens, MODELS)
+        one_of("lens", self.lens, ("pinhole", "fisheye"))
         positive("views", self.views)
         positive("max_error", self.max_error)
         if self.camera_height is not None:
