@@ -14,7 +14,6 @@ import pytest
 from saunet.cli import app, words
 from saunet.errors import ConfigError
 from saunet.reporting import collect
-from saunet.runs.sweep import read_plan
 
 
 def tool(*given: str) -> tuple[int, str, str]:
@@ -53,7 +52,7 @@ def test_a_run_with_a_folder_of_its_own_is_one_run_that_knows_itself(tool: Any, 
     )
     assert outcome.code == 0, outcome.err
     assert not (tmp_path / "outputs").exists()
-    (read,) = collect([tmp_path / "runs" / "mine"], jobs=read_plan).runs
+    (read,) = collect([tmp_path / "runs" / "mine"]).runs
     assert (read.path, read.component("model/encoder"), read.overrides["model/pose"]) == (
         tmp_path / "runs" / "mine", "resnet18", "posecnn",
     )  # fmt: skip

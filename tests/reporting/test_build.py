@@ -17,9 +17,9 @@ from rich.console import Console
 from saunet.errors import ConfigError, DataError
 from saunet.reporting import ReportOptions, collect, report
 from saunet.reporting.compare import compared
+from saunet.reporting.figures import speed
 from saunet.reporting.page import Document, Section, as_html, as_markdown, write
 from saunet.reporting.scenes import Seen, look
-from saunet.reporting.speed import speed
 from saunet.reporting.tool import build
 from saunet.tables import Column, Row, Table, show
 

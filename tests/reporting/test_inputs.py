@@ -12,13 +12,16 @@ import yaml
 from made_runs import add_checkpoint, make_evaluation, make_run
 
 from saunet.errors import ConfigError, DataError
+from saunet.reporting import ReportOptions
 from saunet.reporting.inputs import collect
 from saunet.reporting.tables import explained_table
+from saunet.runs.sweep import write_plan
 
 
 def test_a_sweep_holds_its_jobs_in_order_and_the_one_that_left_nothing(sweep: Path) -> None:
     planned = [[f"objective.beta={beta}"] for beta in (10, 1, 0.1, 0.01)]
-    (found,) = collect([sweep], jobs=lambda folder: planned).sweeps
+    write_plan(sweep, planned)
+    (found,) = collect([sweep]).sweeps
     assert [run.status for run in found.runs] == ["finished", "failed", "finished", "failed"]
     assert [run.job for run in found.runs] == [0, 1, 2, 3]
     assert found.runs[1].error == "the loss became NaN"
@@ -29,7 +32,8 @@ def test_a_sweep_holds_its_jobs_in_order_and_the_one_that_left_nothing(sweep: Pa
 
 def test_jobs_of_a_running_sweep_wait(sweep: Path) -> None:
     make_run(sweep / "3", job=3, status="running", host="another-machine")
-    (found,) = collect([sweep], jobs=lambda folder: [[f"seed={job}"] for job in range(5)]).sweeps
+    write_plan(sweep, [[f"seed={job}"] for job in range(5)])
+    (found,) = collect([sweep]).sweeps
     assert [run.status for run in found.runs[3:]] == ["running", "unfinished"]
     assert found.runs[4].error == "it is not started yet"
 
@@ -127,9 +131,9 @@ def test_a_path_without_a_run_is_refused(tmp_path: Path, name: str, words: str) 
         collect([tmp_path / name])
 
 
-def test_another_checkpoint_than_best_or_last_is_refused(tmp_path: Path) -> None:
+def test_another_checkpoint_than_best_or_last_is_refused() -> None:
     with pytest.raises(ConfigError, match="checkpoint is 'first'"):
-        collect([make_run(tmp_path / "a")], "first")
+        ReportOptions(checkpoint="first")
 
 
 def test_no_path_at_all_is_refused() -> None:

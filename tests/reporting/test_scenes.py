@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from saunet.errors import ConfigError, DataError
+from saunet.reporting import ReportOptions
 from saunet.reporting.figures import curve
 from saunet.reporting.scenes import View, edge_boxes, read_views, scene
 
@@ -75,6 +76,6 @@ def test_scenes_that_cannot_be_shown_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"scenes\.a is empty"):
         read_views({"a": []}, 3)
     with pytest.raises(ConfigError, match="scenes_limit is 0"):
-        read_views({"a": str(tmp_path)}, 0)
+        ReportOptions(scenes_limit=0)
     with pytest.raises(DataError, match="no file or folder"):
         read_views({"a": str(tmp_path / "gone")}, 3)

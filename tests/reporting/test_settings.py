@@ -9,7 +9,7 @@ from made_runs import make_run
 
 from saunet.reporting.inputs import collect
 from saunet.runs.folder import read_run
-from saunet.runs.sweep import differing, labels, ratio, sweeps_ratio
+from saunet.runs.sweep import differing, labels, ratio, sweeps_ratio, write_plan
 
 
 def test_a_component_of_another_name_is_one_difference(tmp_path: Path) -> None:
@@ -47,7 +47,8 @@ def test_the_ratio_of_the_weights_names_an_alpha_beta_sweep(sweep: Path) -> None
 
 def test_a_job_that_left_nothing_is_named_by_its_plan(sweep: Path) -> None:
     planned = [[f"objective.beta={beta}"] for beta in (10, 1, 0.1, 0.01)]
-    (found,) = collect([sweep], jobs=lambda folder: planned).sweeps
+    write_plan(sweep, planned)
+    (found,) = collect([sweep]).sweeps
     assert labels([found.runs])[0][-1] == "beta = 0.01"
 
 

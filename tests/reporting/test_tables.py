@@ -75,18 +75,7 @@ def test_a_failed_job_is_a_row_with_its_sentence_and_the_others_are_whole(sweep:
     (found,) = collect([sweep]).sweeps
     table = runs_table("s", "Sweep", dict(zip("abc", found.runs, strict=True)), swept=True)
     headings = [column.heading for column in table.columns]
-    assert headings == [
-        "Run",
-        "Status",
-        "objective.beta",
-        "α/β",
-        "Epochs",
-        "Loss",
-        "Abs Rel",
-        "RMSE",
-        "δ1",
-        "Minutes",
-    ]
+    assert headings == ["Run", "Status", "objective.beta", "α/β", "Epochs", "Loss", "Abs Rel", "RMSE", "δ1", "Minutes"]
     good, bad, last = table.rows
     assert good.cells == ("a", "finished", "10", 1.0, 1, pytest.approx(1.8), 0.3, ERRORS[2], ERRORS[4], 3.0)
     assert (bad.kind, bad.note, bad.cells[1], bad.cells[5:9]) == (

@@ -12,10 +12,10 @@ import cv2
 import pytest
 from rich.console import Console
 
-from saunet.tables import Column, Row, Table, csv_text, show, table
+from saunet.tables import Column, Row, Table, columns, csv_text, show, table
 from saunet.tables.drawing import Point, draw_speed, save, svg
 
-COLUMNS = (Column("method"), Column("Abs Rel", ".3f", -1), Column("δ1", ".3f", 1), Column("images"))
+COLUMNS = columns("method", "Abs Rel ↓|.3f", "δ1 ↑|.3f", "images")
 ROWS = (
     Row(("ours", 0.1234, 0.9, 697), group="one"),
     Row(("theirs", 0.1231, 0.8, 697), group="one", marks={2: "bad"}),

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation.files import read_rows
-from saunet.evaluation.result import ERROR_COLUMNS, ImageRow
+from saunet.evaluation.result import ERROR_COLUMNS, ImageRow, read_rows
 from saunet.evaluation.statistics import compare as paired
 from saunet.reporting.groups import Groups
-from saunet.reporting.inputs import Inputs, read_evaluation
+from saunet.reporting.inputs import Evaluation, Inputs, read_evaluation
 from saunet.runs.folder import SUBJECTS, Run
 from saunet.runs.sweep import differing, labels, values
 from saunet.tables import Column, Row, Table
@@ -19,8 +19,8 @@ from saunet.tables import Column, Row, Table
 def settings_table(runs: Mapping[str, Run]) -> Table:
     """Return the settings in which runs differ, a column a run."""
     members = list(runs.values())
-    told = {name: values(run, differing(members)) for name, run in runs.items()}
-    rows = [Row((key, *(told[name][index] for name in runs))) for index, key in enumerate(differing(members))]
+    keys = differing(members)
+    rows = [Row(cells) for cells in zip(keys, *(values(run, keys) for run in members), strict=True)]
     rows.append(Row(("status", *(f"{run.status}{f': {run.error}' if run.error else ''}" for run in members))))
     commits = [(run.record.get("git") or {}).get("commit") for run in members]
     if len(set(commits)) > 1:
@@ -42,21 +42,15 @@ class Scored:
     """One run's errors on each image under one protocol, from one evaluation."""
 
     rows: tuple[ImageRow, ...]
-    data: str
-    """What the images are, such as ``kitti, test split``."""
-    how: str
-    """Settings that change the numbers; empty for none."""
-    foreign: bool
-    """Of another system: how it was predicted is not known."""
+    of: Evaluation
 
     @property
     def images(self) -> frozenset[str]:
-        """The names of the images."""
         return frozenset(row.name for row in self.rows)
 
     def pairs(self, other: Scored) -> bool:
-        """Tell whether both are of the same images, predicted with the same settings."""
-        return self.images == other.images and (self.how == other.how or self.foreign or other.foreign)
+        """Return whether both are of the same images, predicted with the same settings, where these are known."""
+        return self.images == other.images and (self.of.how == other.of.how or self.of.foreign or other.of.foreign)
 
 
 def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
@@ -76,11 +70,11 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
             )
         for protocol in both:
             ours, theirs = found[names[0]][protocol], found[other][protocol]
-            pairs = [(one, two) for one in ours for two in theirs if one.pairs(two)]
+            pairs = [(one, two) for one, two in itertools.product(ours, theirs) if one.pairs(two)]
             try:
                 for one, two in pairs:
                     comparison = paired(one.rows, two.rows, names=(names[0], other))
-                    tables.append(comparison.table(_told(one, two)))
+                    tables.append(comparison.table(_told(one.of, two.of)))
                 if not pairs:
                     left_out.append(f"{names[0]} and {other} under {protocol}: {_apart(ours, theirs)}")
             except DataError as reason:
@@ -100,12 +94,12 @@ def _scored(run: Run) -> dict[str, list[Scored]]:
             if row.predictor in SUBJECTS:
                 table.setdefault(row.protocol, []).append(row)
         for protocol, rows in table.items():
-            scored = Scored(tuple(rows), evaluation.data, evaluation.how, evaluation.predictions is not None)
-            found.setdefault(protocol, {})[scored.images, scored.how] = scored
+            scored = Scored(tuple(rows), evaluation)
+            found.setdefault(protocol, {})[scored.images, evaluation.how] = scored
     return {protocol: list(members.values()) for protocol, members in found.items()}
 
 
-def _told(one: Scored, two: Scored) -> str:
+def _told(one: Evaluation, two: Evaluation) -> str:
     """Say what two paired evaluations are of: the settings once where they are equal."""
     if one.how == two.how:
         return ", ".join(filter(None, (one.data, one.how)))
@@ -115,14 +109,14 @@ def _told(one: Scored, two: Scored) -> str:
 
 def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
     """Say why no evaluation of one run pairs with any of the other."""
-    for one in ours:
-        for two in theirs:
-            if one.images == two.images:
-                return (
-                    f"the first was evaluated with {one.how or 'no flip or scale'} and the second with "
-                    f"{two.how or 'no flip or scale'}; run saunet evaluate on both with the same settings"
-                )
-    counts = [", ".join(f"{len(one.images)} of {one.data}" for one in each) for each in (ours, theirs)]
+    for one, two in itertools.product(ours, theirs):
+        if one.images == two.images:
+            first, second = (each.of.how or "no flip or scale" for each in (one, two))
+            return (
+                f"the first was evaluated with {first} and the second with {second}; "
+                "run saunet evaluate on both with the same settings"
+            )
+    counts = [", ".join(f"{len(one.images)} of {one.of.data}" for one in each) for each in (ours, theirs)]
     return (
         f"the images do not pair up ({counts[0]} against {counts[1]}, by their names not the same); "
         "run saunet evaluate on both with the same data"

@@ -1,17 +1,20 @@
-"""The drawings: curves against epochs (Figs. 4 and 5), and errors against alpha/beta."""
+"""Curves against epochs (Figs. 4 and 5), errors against alpha/beta, and accuracy against time (Fig. 10)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from saunet.reporting.groups import comparable
-from saunet.runs.folder import Run
+from saunet.errors import DataError
+from saunet.published import published
+from saunet.reporting.groups import Groups, chosen, comparable
+from saunet.reporting.page import Missing
+from saunet.reporting.scenes import Seen
+from saunet.runs.folder import Run, read_mapping
 from saunet.runs.sweep import RATIO, ratio
-from saunet.tables.drawing import COLORS, colors, new_figure, svg
-
-Curve = tuple[list[float], list[float]]
-"""Epochs and values."""
+from saunet.tables import Row, Table, columns
+from saunet.tables.drawing import COLORS, Point, colors, new_figure, svg
 
 
 def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, ordered: bool = False) -> bytes | None:
@@ -47,9 +50,8 @@ def draw_ratio(runs: Mapping[str, Run]) -> bytes | None:
     if len(points) < 2:
         return None
     figure, axes = new_figure(2, 11.7, 3.3)
-    for axis, column, title in zip(
-        axes, (1, 2), ("Abs Rel (smaller is better)", "δ < 1.25 (larger is better)"), strict=True
-    ):
+    titles = ("Abs Rel (smaller is better)", "δ < 1.25 (larger is better)")
+    for axis, column, title in zip(axes, (1, 2), titles, strict=True):
         axis.axvspan(95, 105, color="#fff1c9", zorder=0, label="the paper's best, 95 to 105")
         axis.plot([p[0] for p in points], [p[column] for p in points], "o-", color=COLORS[0], markersize=4.5)
         axis.set_xscale("log")
@@ -66,14 +68,11 @@ def _legend(figure: Any, axes: Sequence[Any]) -> None:
     for axis in axes:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    longest = max(map(len, handles))
-    columns = max(1, min(len(handles), 120 // (longest + 8)))
-    figure.legend(
-        handles.values(), handles.keys(), loc="outside lower center", ncols=columns, frameon=False, fontsize=9
-    )
+    ncols = max(1, min(len(handles), 120 // (max(map(len, handles)) + 8)))
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=ncols, frameon=False, fontsize=9)
 
 
-def curve(history: Sequence[Mapping[str, float]], key: str, points: int = 150) -> Curve:
+def curve(history: Sequence[Mapping[str, float]], key: str, points: int = 150) -> tuple[list[float], list[float]]:
     """Return one column of a log against epochs; long ones as means of neighbors.
 
     What is logged during an epoch lies between its whole numbers, what is logged after it on the next one: epoch 1 is
@@ -99,3 +98,59 @@ def _steps_per_epoch(history: Sequence[Mapping[str, float]]) -> float:
     ends = [row for row in placed if any(key.startswith("val/") for key in row)] or placed
     last = max(ends, key=lambda row: row["step"])
     return (last["step"] + 1) / (last["epoch"] + 1)
+
+
+def read_benchmark(folder: Path) -> list[dict[str, object]]:
+    """Return the measurements of a ``benchmark.json``."""
+    rows = read_mapping(folder / "benchmark.json").get("results")
+    keys = ("model", "size", "device", "precision", "mode", "batch_size", "depth_parameters", "median")
+    if not isinstance(rows, list) or not all(isinstance(row, dict) and all(key in row for key in keys) for row in rows):
+        raise DataError(f"{folder / 'benchmark.json'} is not a result of saunet benchmark; measure again")
+    return rows
+
+
+def speed(
+    benchmarks: Sequence[Path], runs: Mapping[str, Run], seen: Mapping[str, Seen]
+) -> tuple[list[Point], Table | None, list[Missing]]:
+    """Bring measured times and accuracies together.
+
+    A measurement belongs to the runs whose depth network has exactly its number of parameters (only that one is timed)
+    and its size: the accuracy was reached there and nowhere else. The figure has one point for each such run, device,
+    precision and mode, of one image at a time; of times measured twice, the one in the benchmark that is named last.
+    """
+    scores = chosen(runs)
+    group, shared = Groups(scores.values()), comparable(runs)
+    networks = {name: (one.parameters[0], f"{one.size[0]}x{one.size[1]}") for name, one in seen.items()}
+    points: dict[tuple[str, str], Point] = {}
+    rows: dict[str, list[Row]] = {group(score): [] for score in scores.values()}
+    alone: list[Row] = []
+    missing: list[Missing] = []
+    measured = [row for folder in benchmarks for row in read_benchmark(folder)]
+    for row in measured:
+        batch, size = int(str(row["batch_size"])), str(row["size"])
+        kind = f"{row['device']}, {row['precision']}, {row['mode']}"
+        how = f"{kind}, batch {batch}"
+        seconds = float(str(row["median"])) / batch
+        owners = [name for name in scores if networks.get(name) == (row["depth_parameters"], size.lower())]
+        if not owners:
+            why = f"no scored run has a depth network of exactly this many parameters that runs at {size}"
+            missing.append(Missing(f"Fig. 10, accuracy of {row['model']} ({size}, {how})", why))
+            alone.append(Row((str(row["model"]), how, size, None, seconds * 1e3), "measured", "Measured: times alone"))
+        for name in owners:
+            accuracy = scores[name].errors[4]
+            cells = (name, how, size, accuracy, seconds * 1e3)
+            rows[group(scores[name])].append(Row(cells, "measured", group(scores[name])))
+            if batch == 1 and name in shared:
+                points[name, kind] = Point(name, accuracy, seconds, kind)
+            else:
+                why = "its time is of several images at once" if batch > 1 else "its accuracy is of other images"
+                missing.append(Missing(f"Fig. 10, point of {name} ({how})", why))
+    if not measured:
+        missing.append(Missing("Fig. 10", "no benchmark given; name the folder that saunet benchmark wrote"))
+        return [], None, missing
+    headings = columns("Method", "Device", "Size", "δ < 1.25 ↑|.3f", "ms per image|.1f")
+    notes = ("Times of different devices do not compare; the paper's were taken on an AGX Orin.",)
+    printed = [(one.method, one.device, "", one.a1, one.seconds * 1e3) for one in published().figure10]
+    ours = [row for members in rows.values() for row in members]
+    table = (*(Row(cells, "published", "Published") for cells in printed), *ours, *alone)
+    return list(points.values()), Table("figure10", "Accuracy and time", headings, table, notes), missing

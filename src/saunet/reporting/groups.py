@@ -15,19 +15,13 @@ class Groups:
     """Headings, alike for numbers that compare and unlike for all others.
 
     The fingerprint of the images is part of a heading only where it alone tells two groups apart.
-
-    Args:
-        measured: All that is to get a heading.
     """
 
     def __init__(self, measured: Iterable[Score | Explained]) -> None:
-        found: dict[str, set[str]] = {}
-        for one in measured:
-            found.setdefault(_words(one), set()).add(one.fingerprint)
-        self._ambiguous = {words for words, fingerprints in found.items() if len(fingerprints) > 1}
+        counts = Counter(words for words, _ in {(_words(one), one.fingerprint) for one in measured})
+        self._ambiguous = {words for words, count in counts.items() if count > 1}
 
     def __call__(self, one: Score | Explained) -> str:
-        """Return the heading under which a number stands."""
         words = _words(one)
         if words not in self._ambiguous:
             return words
@@ -45,10 +39,8 @@ def chosen(runs: Mapping[str, Run]) -> dict[str, Score]:
         counts = Counter(key for scores in left.values() for key in dict.fromkeys(map(_key, scores)))
         best = max(counts, key=lambda key: (counts[key], not key[0]))
         for name, scores in left.items():
-            mine = [score for score in scores if _key(score) == best]
-            if mine:
-                found[name] = mine[0]
-                left[name] = []
+            if mine := [score for score in scores if _key(score) == best]:
+                found[name], left[name] = mine[0], []
     return found
 
 

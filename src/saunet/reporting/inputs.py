@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from saunet.errors import CheckpointError, DataError, one_of
+from saunet.errors import CheckpointError, DataError
 from saunet.io.torch_files import read_plain
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.runs.folder import (
@@ -24,10 +24,7 @@ from saunet.runs.folder import (
     read_run,
     split_overrides,
 )
-
-Jobs = Callable[[Path], "list[list[str]] | None"]
-"""Returns the overrides of every job that a sweep folder was to hold; None where that cannot be told."""
-
+from saunet.runs.sweep import read_plan
 
 _KEPT = {"lr": "initial_lr", "weight_decay": "weight_decay"}
 """Settings of a recipe that live on in an optimizer's state, and what they are called there."""
@@ -37,7 +34,6 @@ _KEPT = {"lr": "initial_lr", "weight_decay": "weight_decay"}
 class Sweep:
     """The jobs of one multirun folder, in order, those included that left nothing behind."""
 
-    path: Path
     name: str
     runs: tuple[Run, ...]
 
@@ -57,11 +53,8 @@ class Inputs:
         return (*self.runs, *(run for sweep in self.sweeps for run in sweep.runs))
 
 
-def collect(
-    paths: Sequence[str | Path], checkpoint: str = "best", jobs: Jobs | None = None, *, strangers: bool = True
-) -> Inputs:
+def collect(paths: Sequence[str | Path], checkpoint: str = "best", *, strangers: bool = True) -> Inputs:
     """Read everything that the paths name."""
-    one_of("checkpoint", checkpoint, ("best", "last"))
     if not paths:
         raise DataError("no run given; name folders of runs or sweeps, or checkpoints: saunet report outputs/train/...")
     runs: dict[Path, Run] = {}
@@ -69,34 +62,25 @@ def collect(
     evaluations: dict[Path, Evaluation] = {}
     benchmarks: dict[Path, None] = {}
     for path in map(Path, paths):
-        found = _find(path)
+        found = [(kind, place.resolve()) for kind, place in _find(path)]
         if not found:
             raise DataError(f"no run, sweep, checkpoint, evaluation or benchmark in {path}; check the path")
-        for kind, place in found:
-            place = place.resolve()
-            if kind == "sweep":
-                sweeps[place] = _read_sweep(place, checkpoint, jobs)
-            elif kind == "evaluation":
-                evaluations[place] = read_evaluation(place)
-            elif kind == "benchmark":
-                benchmarks[place] = None
-            elif kind == "checkpoint":
-                runs[place] = _read_checkpoint(place)
-            else:
-                runs[place] = read_run(place, checkpoint)
+        runs |= {place: read_run(place, checkpoint) for kind, place in found if kind == "run"}
+        runs |= {place: _read_checkpoint(place) for kind, place in found if kind == "checkpoint"}
+        sweeps |= {place: _read_sweep(place, checkpoint) for kind, place in found if kind == "sweep"}
+        evaluations |= {place: read_evaluation(place) for kind, place in found if kind == "evaluation"}
+        benchmarks |= {place: None for kind, place in found if kind == "benchmark"}
     known = [*runs.values(), *(run for sweep in sweeps.values() for run in sweep.runs)]
     for run in known:  # evaluations written into the run's own folder
         for file in sorted(run.path.rglob("metrics.json")) if run.path.is_dir() else ():
             evaluations.setdefault(file.parent, read_evaluation(file.parent))
     take = strangers or len(known) < 2
     for evaluation in evaluations.values():
-        foreign = evaluation.predictions is not None  # of no run at all, so it was named for its own sake
-        if (take or foreign) and not any(belongs(evaluation, run) for run in known):
-            origin = evaluation.checkpoint
-            if origin and origin.is_file() and not foreign:
+        # Foreign predictions are of no run at all, so they were named for their own sake.
+        if (take or evaluation.foreign) and not any(belongs(evaluation, run) for run in known):
+            orphan, origin = Run(evaluation.folder, name=evaluation.name), evaluation.checkpoint
+            if origin is not None and origin.is_file() and not evaluation.foreign:
                 orphan = _read_checkpoint(origin)
-            else:
-                orphan = Run(evaluation.folder, name=evaluation.name)
             runs[orphan.path] = orphan
             known.append(orphan)
 
@@ -154,7 +138,7 @@ def _find(path: Path, depth: int = 3) -> list[tuple[str, Path]]:
     return [found for child in below for found in _find(child, depth - 1)] if depth else []
 
 
-def _read_sweep(folder: Path, checkpoint: str, jobs: Jobs | None) -> Sweep:
+def _read_sweep(folder: Path, checkpoint: str) -> Sweep:
     found: dict[int, Run] = {}
     for place in sorted(path.parent for path in folder.rglob(".hydra") if path.is_dir()):
         config, hydra = read_hydra(place)
@@ -164,20 +148,16 @@ def _read_sweep(folder: Path, checkpoint: str, jobs: Jobs | None) -> Sweep:
         number = number if isinstance(number, int) and number not in found else len(found)
         led = home(place)
         found[number] = read_run(led if began(led) else place, checkpoint, number)
-    planned = jobs(folder) if jobs else None
-    going_on = any(run.status == "running" for run in found.values())
-    last = max(found, default=-1)
-    for number in range(max([*found, len(planned or ()) - 1, -1]) + 1):
-        if number not in found:
-            overrides = split_overrides(planned[number]) if planned and number < len(planned) else {}
-            waiting = going_on and number > last
-            error = "it is not started yet" if waiting else "it left no folder: it failed before it began"
-            status: Status = "unfinished" if waiting else "failed"
-            found[number] = Run(folder / str(number), status, error, str(number), overrides=overrides, job=number)
+    planned = read_plan(folder) or []
+    last, running = max(found, default=-1), any(run.status == "running" for run in found.values())
+    for number in set(range(max(last + 1, len(planned)))) - found.keys():
+        overrides = split_overrides(planned[number]) if number < len(planned) else {}
+        status: Status = "unfinished" if running and number > last else "failed"
+        why = {"unfinished": "it is not started yet", "failed": "it left no folder: it failed before it began"}[status]
+        found[number] = Run(folder / str(number), status, why, str(number), overrides=overrides, job=number)
     runs = tuple(found[number] for number in sorted(found))
-    config = read_mapping(folder / "multirun.yaml")
-    names = [str(config["name"])] if config.get("name") else [run.name for run in runs if run.config]
-    return Sweep(folder, (names or [folder.name])[0], runs)
+    name = read_mapping(folder / "multirun.yaml").get("name")
+    return Sweep(str(name or next((run.name for run in runs if run.config), folder.name)), runs)
 
 
 def _read_checkpoint(file: Path) -> Run:
@@ -196,13 +176,17 @@ class Evaluation:
     folder: Path
     checkpoint: Path | None
     predictions: str | None
-    """Where the predictions of another system came from; None for a checkpoint."""
+    """Where the predictions of another system came from, made nobody knows how; None for a checkpoint."""
     data: str
     """What was scored, such as ``kitti, test split``."""
     how: str
     """Settings that change the numbers, as the command line says them; empty for none."""
     scores: tuple[Score, ...]
     explained: tuple[Explained, ...]
+
+    @property
+    def foreign(self) -> bool:
+        return self.predictions is not None
 
     @property
     def name(self) -> str:
@@ -215,8 +199,8 @@ def read_evaluation(folder: Path) -> Evaluation:
     """Read the scores of an evaluation and find out which checkpoint they belong to."""
     content, (config, hydra) = read_mapping(folder / "metrics.json"), read_hydra(folder)
     runtime = hydra.get("runtime") or {}
-    settings = content.get("settings")  # all there is where `output_dir` led the results out of the run's folder
-    settings = settings if isinstance(settings, dict) else {}
+    # The settings are all there is where `output_dir` led the results out of the run's folder.
+    settings = _mapping(content.get("settings"))
     predictions = config.get("predictions") or settings.get("predictions")
     given = config.get("checkpoint") or settings.get("checkpoint")
     starts = [Path(runtime["cwd"])] if runtime.get("cwd") else [Path.cwd(), *folder.parents]
@@ -224,30 +208,20 @@ def read_evaluation(folder: Path) -> Evaluation:
     checkpoint = next((each for each in candidates if each.is_file()), next(iter(candidates), None))
     data = (runtime.get("choices") or {}).get("data") or settings.get("data") or "unknown data"
     place = f"{data}, {config.get('split') or settings.get('split') or 'test'} split"
-    how = _how(settings)
-    images = content.get("images") or {}
+    how, images = _how(settings), content.get("images") or {}
+    rows = [row for row in content.get("results", []) if all(isinstance(row.get(k), int | float) for k in ERROR_NAMES)]
+
+    def common(row: Mapping[str, Any]) -> dict[str, Any]:
+        protocol = row["protocol"]
+        return {"protocol": protocol, "data": place, "how": how, "fingerprint": images.get(protocol, "")}
+
     scores = tuple(
-        Score(
-            row["predictor"],
-            row["protocol"],
-            place,
-            row.get("images") or 0,
-            tuple(row[key] for key in ERROR_NAMES),
-            fingerprint=images.get(row["protocol"], ""),
-            how=how,
-        )
-        for row in content.get("results", [])
-        if all(isinstance(row.get(key), int | float) for key in ERROR_NAMES)
+        Score(row["predictor"], images=row.get("images") or 0, errors=tuple(row[k] for k in ERROR_NAMES), **common(row))
+        for row in rows
     )
     keys = ("condition", "images", "warped", "unwarped", "explained")
     explained = tuple(
-        Explained(
-            protocol=row["protocol"],
-            data=place,
-            fingerprint=images.get(row["protocol"], ""),
-            how=how,
-            **{key: row[key] for key in keys},
-        )
+        Explained(**{key: row[key] for key in keys}, **common(row))
         for row in content.get("views", [])
         if row.get("predictor") == "model" and all(row.get(key) is not None for key in keys)
     )
@@ -255,11 +229,15 @@ def read_evaluation(folder: Path) -> Evaluation:
     return Evaluation(folder, checkpoint, named, place, how, scores, explained)
 
 
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
 def belongs(evaluation: Evaluation, run: Run) -> bool:
-    """Tell whether an evaluation is one of a run: of its checkpoint, or in its folder and not of another system."""
+    """Return whether an evaluation is one of a run: of its checkpoint, or in its folder and not of another system."""
     if run.path == evaluation.folder:
         return True
-    if evaluation.predictions is not None:
+    if evaluation.foreign:
         return False
     if run.path.is_dir() and run.path in evaluation.folder.parents:
         return True
@@ -268,12 +246,8 @@ def belongs(evaluation: Evaluation, run: Run) -> bool:
 
 
 def _how(settings: Mapping[str, Any]) -> str:
-    """Say what else than the images and the protocol decides the numbers, as `Subject.settings` recorded it."""
-    scale = settings.get("scale")
-    scale = scale if isinstance(scale, dict) else {}
+    """Say what else than the images and the protocol decides the numbers, as the evaluation recorded it."""
+    scale = _mapping(settings.get("scale"))
     method = "stored" if scale.get("method") == "auto" else scale.get("method")
-    told = (
-        "flip=true" if settings.get("post_processing") else "",
-        f"scale.method={method}" if scale.get("factor") else "",
-    )
-    return ", ".join(filter(None, told))
+    flip = ["flip=true"] if settings.get("post_processing") else []
+    return ", ".join([*flip, *([f"scale.method={method}"] if scale.get("factor") else [])])

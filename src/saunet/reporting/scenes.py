@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from saunet.errors import ConfigError, SaunetError, positive
+from saunet.errors import ConfigError, SaunetError
 from saunet.io.colormaps import colorize
 from saunet.io.images import as_rgb_bytes, read_image, resize
 from saunet.prediction.predictor import Predictor
@@ -48,18 +48,15 @@ class View:
 
 def read_views(scenes: Mapping[str, str | Sequence[str]], limit: int) -> list[View]:
     """Read the images that a report shows."""
-    positive("scenes_limit", limit)
     views = []
     for condition, given in scenes.items():
         inputs = [given] if isinstance(given, str) else list(given or ())
         if not inputs:
             raise ConfigError(f"scenes.{condition} is empty; name an image, a folder or a pattern")
         paths = [path for item in inputs for path in image_paths(item)]
-        places = (
-            np.linspace(0, len(paths) - 1, min(limit, len(paths)) + 2).round()[1:-1] if limit < len(paths) else None
-        )
-        chosen = paths if places is None else [paths[int(place)] for place in places]
-        views += [View(path, read_image(path), "/".join(path.parts[-4:]), condition) for path in chosen]
+        if limit < len(paths):
+            paths = [paths[int(place)] for place in np.linspace(0, len(paths) - 1, limit + 2).round()[1:-1]]
+        views += [View(path, read_image(path), "/".join(path.parts[-4:]), condition) for path in paths]
     return views
 
 
@@ -102,9 +99,8 @@ def edge_boxes(
     size = max(8, width // 6)
     box = (min(height, round(size / 1.5)), min(width, size))
     strength = _gradient(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)) + 0.1
-    edges = sum(
-        (_gradient(np.log(np.maximum(one, 1e-6))) for one in disparities), np.zeros((height, width), np.float32)
-    )
+    flat = np.zeros((height, width), np.float32)
+    edges = sum((_gradient(np.log(np.maximum(one, 1e-6))) for one in disparities), flat)
     sums = cv2.boxFilter(edges * strength, -1, box[::-1], normalize=True, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
     sums = sums[: height - box[0] + 1, : width - box[1] + 1]
     boxes: list[Box] = []
@@ -143,16 +139,10 @@ def _gradient(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     return np.asarray(np.minimum(change / top, 1.0) if top > 0 else change, dtype=np.float32)
 
 
-def _shrunk(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
-    height, width = picture.shape[:2]
-    if width <= _WIDTH:
-        return picture
-    return np.asarray(resize(picture, max(1, round(height * _WIDTH / width)), _WIDTH))
-
-
 def _boxed(picture: UInt8[np.ndarray, "h w 3"], boxes: Sequence[Box]) -> UInt8[np.ndarray, "_ _ 3"]:
-    shown = _shrunk(picture).copy()
-    zoom = shown.shape[1] / picture.shape[1]
+    height, width = picture.shape[:2]
+    zoom = min(1.0, _WIDTH / width)
+    shown = np.array(resize(picture, max(1, round(height * zoom)), _WIDTH) if zoom < 1 else picture)
     line = max(1, round(shown.shape[1] / 300))
     for number, box in enumerate(boxes):
         corners = ((box.left, box.top), (box.left + box.width - 1, box.top + box.height - 1))

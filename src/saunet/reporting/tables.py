@@ -2,41 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from saunet.evaluation.result import ERROR_COLUMNS
+from saunet.metrics.functional import A1, ABS_REL, RMSE
 from saunet.published import published
 from saunet.reporting.groups import Groups, chosen
 from saunet.reporting.page import Missing
 from saunet.runs.folder import Run, Score
 from saunet.runs.sweep import RATIO, differing, ratio, values
-from saunet.tables import Cell, Column, Row, Table
+from saunet.tables import Cell, Column, Row, Table, columns
 
+_SHOWN = (ABS_REL, RMSE, A1)
+"""The errors that a table of runs shows."""
 PRINTED = "Published: KITTI Eigen test split (697 images), 0–80 m, median-scaled"
 
 
 def table1(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
     """Return the paper's Table 1 with every score of the runs, and which runs have none."""
     rows = [Row((row.method, row.pattern, *row.errors), "published", PRINTED) for row in published().table1]
-    ours, without = _scored(runs)
+    ours = _scored(runs)
     group = Groups(score for _, score in ours)
-    rows += [
-        Row(
-            (score.predictor if score.trivial else name, _pattern(runs[name], score), *score.errors),
-            "measured",
-            group(score),
-        )
-        for name, score in ours
-    ]
+    for name, score in ours:
+        who = score.predictor if score.trivial else name
+        rows.append(Row((who, _pattern(runs[name], score), *score.errors), "measured", group(score)))
     notes = (
         "Numbers of different groups do not compare: other images, other ground truth, other training. "
         "Bold is the best of its group.",
         "Pattern: D = depth as supervision, M = monocular video, S = stereo pairs.",
         "Eigen's last two numbers are equal in the paper; Klodt's RMSE log is a dash there.",
     )
-    columns = (Column("Method"), Column("Pattern"), *ERROR_COLUMNS)
-    missing = [Missing(f"Table 1, row of {name}", _no_score(runs[name])) for name in without]
-    return Table("table1", "Table 1. Errors and accuracy", columns, tuple(rows), notes), missing
+    headings = (*columns("Method", "Pattern"), *ERROR_COLUMNS)
+    missing = [Missing(f"Table 1, row of {name}", _no_score(run)) for name, run in runs.items() if not run.scores]
+    return Table("table1", "Table 1. Errors and accuracy", headings, tuple(rows), notes), missing
 
 
 def explained_table(runs: Mapping[str, Run]) -> Table | None:
@@ -49,16 +47,13 @@ def explained_table(runs: Mapping[str, Run]) -> Table | None:
     ]
     order = list(dict.fromkeys(row.group for row in rows))
     rows.sort(key=lambda row: order.index(row.group))
-    columns = (
-        Column("Method"),
-        Column("Condition"),
-        Column("Images"),
-        Column("Photometric error", ".4f"),
-        Column("without warping", ".4f"),
-        Column("Pixels explained", ".3f"),
+    headings = columns(
+        *("Method", "Condition", "Images", "Photometric error|.4f", "without warping|.4f", "Pixels explained|.3f")
     )
     notes = ("Photometric error: eqs. (8) to (10) after warping the neighboring frames by predicted depth and motion.",)
-    return Table("conditions", "Data without ground truth, by condition", columns, tuple(rows), notes) if rows else None
+    return (
+        Table("conditions", "Data without ground truth, by condition", headings, tuple(rows), notes) if rows else None
+    )
 
 
 def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table, list[Missing]]:
@@ -68,15 +63,10 @@ def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table, list[Missing]]:
         Row((name, depth / 1e6, pose / 1e6 if pose else None, (depth + pose) / 1e6), "measured", "Counted here")
         for name, (depth, pose) in sizes.items()
     ]
-    columns = (
-        Column("Method"),
-        Column("Depth network", ".1f"),
-        Column("Pose network", ".1f"),
-        Column("Together", ".1f"),
-    )
+    headings = columns("Method", "Depth network|.1f", "Pose network|.1f", "Together|.1f")
     notes = ("Millions of parameters; the paper's unit is “Mb”.",)
     missing = [] if sizes else [Missing("Table 2, our rows", "no run has a checkpoint")]
-    return Table("table2", "Table 2. Parameters", columns, tuple(rows), notes), missing
+    return Table("table2", "Table 2. Parameters", headings, tuple(rows), notes), missing
 
 
 def table3(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
@@ -85,24 +75,20 @@ def table3(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
         Row((row.method, _tick(row.stratified), _tick(row.attention), *row.errors), "published", PRINTED)
         for row in published().table3
     ]
-    ours, _ = _scored({name: run for name, run in runs.items() if run.component("model/encoder")})
-    models = [(name, score) for name, score in ours if not score.trivial]
+    ours = _scored({name: run for name, run in runs.items() if run.component("model/encoder")})
+    models = [(runs[name], score) for name, score in ours if not score.trivial]
     group = Groups(score for _, score in models)
-    kinds = {_networks(runs[name]) for name, _ in models}
-    columns = (Column("Method"), Column("STF-T"), Column("Attention"), *ERROR_COLUMNS)
+    headings = (*columns("Method", "STF-T", "Attention"), *ERROR_COLUMNS)
     notes = ["The paper's first two rows are digit for digit Mono R18 and Mono R50 of its Table 1."]
     missing = []
-    if len(kinds) > 1:
-        rows += [
-            Row((" + ".join(_networks(runs[name])), *_ticks(runs[name]), *score.errors), "measured", group(score))
-            for name, score in models
-        ]
-        rest = [key for key in differing([runs[name] for name, _ in models]) if not key.startswith("model.")]
+    if len({networks(run) for run, _ in models}) > 1:
+        rows += [Row((networks(run), *_ticks(run), *score.errors), "measured", group(score)) for run, score in models]
+        rest = [key for key in differing([run for run, _ in models]) if not key.startswith("model.")]
         if rest:
             notes.append(f"Our rows also differ in {', '.join(rest)}; the table of runs says how.")
     else:
         missing.append(Missing("Table 3, our rows", "no two scored runs differ in encoder or decoder"))
-    return Table("table3", "Table 3. Ablation of the networks", columns, tuple(rows), tuple(notes)), missing
+    return Table("table3", "Table 3. Ablation of the networks", headings, tuple(rows), tuple(notes)), missing
 
 
 def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -> Table:
@@ -111,49 +97,38 @@ def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -
     keys = differing(members, by_overrides=swept)
     ratios = [ratio(run) for run in members]
     show_ratio = len({value for value in ratios if value is not None}) > 1
-    columns = (
-        Column("Run"),
-        Column("Status"),
-        *(Column(key) for key in keys),
-        *((Column(RATIO),) if show_ratio else ()),
-        Column("Epochs"),
-        Column("Loss", ".4f"),
-        ERROR_COLUMNS[0],
-        ERROR_COLUMNS[2],
-        ERROR_COLUMNS[4],
-        Column("Minutes", ".1f"),
+    headings = (
+        *columns("Run", "Status"),
+        *map(Column, keys),
+        *columns(*[RATIO] * show_ratio, "Epochs", "Loss|.4f"),
+        *(ERROR_COLUMNS[index] for index in _SHOWN),
+        *columns("Minutes|.1f"),
     )
     scores = chosen(runs)
     group = Groups(scores.values())
-    several = len({group(score) for score in scores.values()}) > 1
+    groups = list(dict.fromkeys(map(group, scores.values())))
     rows = []
     for (label, run), number in zip(runs.items(), ratios, strict=True):
         score = scores.get(label)
-        rows.append(
-            Row(
-                (
-                    label,
-                    run.status,
-                    *values(run, keys),
-                    *((number,) if show_ratio else ()),
-                    *_progress(run),
-                    *((score.errors[0], score.errors[2], score.errors[4]) if score else (None, None, None)),
-                    run.seconds / 60 if run.seconds is not None else None,
-                ),
-                "failed" if run.error else "measured",
-                (group(score) if score else "Without a score") if several else "",
-                note=run.error or "",
-            )
+        cells = (
+            *(label, run.status, *values(run, keys), *[number] * show_ratio, *_progress(run)),
+            *(score.errors[index] if score else None for index in _SHOWN),
+            run.seconds / 60 if run.seconds is not None else None,
         )
-    if several:
-        order = [*dict.fromkeys(map(group, scores.values())), "Without a score"]
-        rows.sort(key=lambda row: order.index(row.group))
-    return Table(name, title, columns, tuple(rows), _score_notes([group(score) for score in scores.values()]))
+        place = (group(score) if score else "Without a score") if len(groups) > 1 else ""
+        rows.append(Row(cells, "failed" if run.error else "measured", place, run.error or ""))
+    notes = ["Loss: mean over the last tenth of the logged steps; losses of different weights do not compare."]
+    if len(groups) == 1:
+        notes.append(f"Errors — {groups[0]}.")
+    elif groups:
+        rows.sort(key=lambda row: [*groups, "Without a score"].index(row.group))
+        notes.append("Errors of different groups do not compare.")
+    return Table(name, title, headings, tuple(rows), tuple(notes))
 
 
 def networks(run: Run) -> str:
     """Return a run's networks in words, such as ``resnet18 + unet``."""
-    return " + ".join(_networks(run))
+    return f"{run.component('model/encoder')} + {run.component('model/decoder')}"
 
 
 def _progress(run: Run) -> tuple[Cell, Cell]:
@@ -164,36 +139,21 @@ def _progress(run: Run) -> tuple[Cell, Cell]:
     return (int(max(epochs)) + 1 if epochs else None), (sum(last) / len(last) if last else None)
 
 
-def _score_notes(groups: Sequence[str]) -> tuple[str, ...]:
-    sources = list(dict.fromkeys(groups))
-    notes = ["Loss: mean over the last tenth of the logged steps; losses of different weights do not compare."]
-    if len(sources) == 1:
-        notes.append(f"Errors — {sources[0]}.")
-    elif sources:
-        notes.append("Errors of different groups do not compare.")
-    return tuple(notes)
-
-
-def _scored(runs: Mapping[str, Run]) -> tuple[list[tuple[str, Score]], list[str]]:
-    """Return every score once, group by group, and the runs without any; validation counts where nothing else is."""
-    without = [name for name, run in runs.items() if not run.scores]
+def _scored(runs: Mapping[str, Run]) -> list[tuple[str, Score]]:
+    """Return every score once, group by group; validation counts where nothing else is."""
     pairs = []
     for name, run in runs.items():
         evaluated = [score for score in run.scores if not score.validation]
         pairs += [(name, score) for score in evaluated or run.scores]
     group = Groups(score for _, score in pairs)
-    found: dict[str, list[tuple[str, Score]]] = {}
-    told = set()
+    found: dict[str, dict[tuple[object, ...], tuple[str, Score]]] = {}
     for name, score in pairs:
         # Constant depth beside every evaluation of the same images; or a model that was evaluated twice alike.
         who = score.predictor if score.trivial else name
-        key = (score.trivial, who, group(score), tuple(round(value, 6) for value in score.errors))
-        if key not in told:
-            told.add(key)
-            found.setdefault(group(score), []).append((name, score))
-    for members in found.values():
-        members.sort(key=lambda pair: pair[1].trivial)  # trivial predictors last
-    return [pair for members in found.values() for pair in members], without
+        key = (score.trivial, who, *(round(value, 6) for value in score.errors))
+        found.setdefault(group(score), {}).setdefault(key, (name, score))
+    ordered = (sorted(members.values(), key=lambda pair: pair[1].trivial) for members in found.values())
+    return [pair for members in ordered for pair in members]
 
 
 def _no_score(run: Run) -> str:
@@ -207,20 +167,15 @@ def _pattern(run: Run, score: Score) -> str:
         return ""
     gradient = (run.config.get("objective") or {}).get("gradient") or {}
     data = run.config.get("data") or {}
-    stereo = bool(data.get("stereo"))
-    video = bool(data.get("offsets"))
-    return "+".join((*(("D",) if gradient.get("target") == "lidar" else ()), "M" * video + "S" * stereo or "M"))
-
-
-def _networks(run: Run) -> tuple[str, str]:
-    return run.component("model/encoder"), run.component("model/decoder")
+    seen = "M" * bool(data.get("offsets")) + "S" * bool(data.get("stereo")) or "M"
+    return "D+" * (gradient.get("target") == "lidar") + seen
 
 
 def _ticks(run: Run) -> tuple[str, str]:
-    encoder, decoder = _networks(run)
     node = (run.config.get("model") or {}).get("decoder") or {}
-    attention = decoder.lower().startswith("aunet") and node.get("attention") not in (None, "none")
-    return _tick(encoder.lower().startswith("stratified")), _tick(attention)
+    attention = run.component("model/decoder").lower().startswith("aunet")
+    attention = attention and node.get("attention") not in (None, "none")
+    return _tick(run.component("model/encoder").lower().startswith("stratified")), _tick(attention)
 
 
 def _tick(value: bool) -> str:

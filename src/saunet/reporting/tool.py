@@ -23,9 +23,8 @@ from saunet.reporting.groups import Groups, comparable
 from saunet.reporting.inputs import Inputs, collect
 from saunet.reporting.page import Document, Figure, Gallery, Missing, Picture, Scene, Section, write
 from saunet.reporting.scenes import Seen, View, look, read_views, scene
-from saunet.reporting.speed import speed
 from saunet.runs.folder import Run
-from saunet.runs.sweep import differing, labels, read_plan, sweeps_ratio
+from saunet.runs.sweep import differing, labels, sweeps_ratio
 from saunet.tables import Table, show
 from saunet.tables.drawing import Point, draw_speed, svg
 
@@ -119,10 +118,8 @@ def report(options: ReportOptions) -> ReportResult:
     Returns:
         The page, or the tables of a comparison; `ReportResult.show` prints it.
     """
-    folder = Path(options.output_dir) if options.output_dir is not None and not options.compare else None
-    if folder is not None:
-        check_folder(folder)
-    inputs = collect(options.runs, options.checkpoint, read_plan, strangers=not options.compare)
+    folder = None if options.output_dir is None or options.compare else check_folder(options.output_dir)
+    inputs = collect(options.runs, options.checkpoint, strangers=not options.compare)
     if options.compare:
         found, left_out = compared(inputs, options.labels)
         return ReportResult(None, tuple(found), tuple(left_out))
@@ -158,8 +155,7 @@ def build(
 ) -> Document:
     """Make a report of what was read."""
     options = options or ReportOptions()
-    device, drawable = str(usable_device(options.device)), find_spec("matplotlib") is not None
-    draw = options.figures and drawable
+    device, draw = str(usable_device(options.device)), options.figures and find_spec("matplotlib") is not None
     views = read_views(_by_condition(options.scenes), options.scenes_limit)
     groups = _groups(inputs, options.labels)
     everyone: Named = {name: run for group in groups for name, run in group.runs.items()}
@@ -174,17 +170,15 @@ def build(
             missing.append(Missing(f"Size and pictures of {name}", found))
     progress("drawing")
     sizes = {name: one.parameters for name, one in seen.items()}
-    shown = {name: run for name, run in everyone.items() if run.job is None or _evaluated(run)}
+    evaluated = {name for name, run in everyone.items() if not all(score.validation for score in run.scores)}
+    shown = {name: run for name, run in everyone.items() if run.job is None or name in evaluated}
     table1, no_rows = tables.table1(shown)
     table2, no_sizes = tables.table2(_by_networks(everyone, sizes))
     table3, no_ablation = tables.table3({name: run for group in groups for name, run in _varied(group).items()})
     explained = tables.explained_table(everyone)
+    intro = "The paper’s numbers as published, and ours as measured by this installation."
     sections = [
-        Section(
-            "Accuracy",
-            (table1, explained) if explained else (table1,),
-            "The paper’s numbers as published, and ours as measured by this installation.",
-        ),
+        Section("Accuracy", (table1, explained) if explained else (table1,), intro),
         Section("Networks", (table2, table3)),
         Section("Runs", _runs(groups, draw, missing)),
     ]
@@ -197,11 +191,10 @@ def build(
     galleries = [gallery for group in groups for gallery in _galleries(group, views, seen, options.zooms)]
     if galleries:
         sections.append(Section("Depth side by side", galleries, _READING))
-    missing += _no_pictures(views, galleries)
-    points, table10, no_speed = speed(inputs.benchmarks, shown, seen)
+    points, table10, no_speed = figures.speed(inputs.benchmarks, shown, seen)
     if table10:
-        sections.append(Section("Accuracy and time", [*_speed(points, draw), table10]))
-    missing += [*no_rows, *no_sizes, *no_ablation, *no_speed]
+        sections.append(Section("Accuracy and time", [*(_speed(points) if points and draw else ()), table10]))
+    missing += [*_no_pictures(views, galleries), *no_rows, *no_sizes, *no_ablation, *no_speed]
     missing.append(Missing("Published curves and pictures", "the paper prints them as images only"))
     if len(shown) < len(everyone):
         why = "they are in the tables of their sweeps; evaluate their checkpoints to have them here too"
@@ -224,23 +217,13 @@ def _groups(inputs: Inputs, wanted: Sequence[str]) -> list[_Group]:
         names[0] = list(wanted)
     if len({name for row in names for name in row}) < sum(map(len, names)):
         raise ConfigError(f"labels {list(wanted)} name two runs alike; give each its own name")
-    groups = []
-    if inputs.runs:
-        groups.append(_Group("runs", "runs", dict(zip(names[0], inputs.runs, strict=True)), swept=False))
+    named = [dict(zip(row, runs, strict=True)) for row, runs in zip(names, members, strict=True)]
+    groups = [_Group("runs", "runs", named.pop(0), swept=False)] if inputs.runs else []
     counts = Counter(sweep.name for sweep in inputs.sweeps)
-    for number, (sweep, row) in enumerate(zip(inputs.sweeps, names[len(groups) :], strict=True)):
+    for number, (sweep, jobs) in enumerate(zip(inputs.sweeps, named, strict=True)):
         slug = _slug(f"sweep_{sweep.name}") + (f"_{number}" if counts[sweep.name] > 1 else "")
-        jobs = dict(zip(row, sweep.runs, strict=True))
         groups.append(_Group(slug, f"sweep {sweep.name}", jobs, swept=True))
     return groups
-
-
-def _heading(group: _Group) -> str:
-    return f"{group.title[0].upper()}{group.title[1:]}" + (f": {len(group.runs)} jobs" if group.swept else "")
-
-
-def _evaluated(run: Run) -> bool:
-    return any(not score.validation for score in run.scores)
 
 
 def _varied(group: _Group) -> Named:
@@ -252,17 +235,20 @@ def _varied(group: _Group) -> Named:
 def _runs(groups: Sequence[_Group], draw: bool, missing: list[Missing]) -> list[Table | Figure]:
     blocks: list[Table | Figure] = []
     for group in groups:
-        blocks.append(tables.runs_table(group.name, _heading(group), group.runs, swept=group.swept))
-        if sweeps_ratio(list(group.runs.values())) and draw:
-            drawing = figures.draw_ratio(group.runs)
-            if drawing is None:
-                why = "fewer than two jobs have scores that compare"
-                missing.append(Missing(f"Errors against α/β of {group.title}", why))
-                continue
-            shared = list(comparable(group.runs).values())
-            caption = f"Errors against the ratio of eq. (14). {Groups(shared)(shared[0])}."
-            picture = Picture(f"{group.name}_ratio.svg", drawing, "errors against the ratio alpha/beta")
-            blocks.append(Figure("Choice of α and β", picture, caption))
+        heading = group.title[0].upper() + group.title[1:] + (f": {len(group.runs)} jobs" if group.swept else "")
+        blocks.append(tables.runs_table(group.name, heading, group.runs, swept=group.swept))
+        if not draw or not sweeps_ratio(list(group.runs.values())):
+            continue
+        drawing = figures.draw_ratio(group.runs)
+        if drawing is None:
+            missing.append(
+                Missing(f"Errors against α/β of {group.title}", "fewer than two jobs have scores that compare")
+            )
+            continue
+        shared = list(comparable(group.runs).values())
+        caption = f"Errors against the ratio of eq. (14). {Groups(shared)(shared[0])}."
+        picture = Picture(f"{group.name}_ratio.svg", drawing, "errors against the ratio alpha/beta")
+        blocks.append(Figure("Choice of α and β", picture, caption))
     return blocks
 
 
@@ -278,12 +264,7 @@ def _curves(group: _Group, missing: list[Missing]) -> list[Figure]:
     for number, what, panels, caption in wanted:
         drawing = figures.draw_curves(group.runs, panels, ordered=ordered)
         if drawing is None:
-            missing.append(
-                Missing(
-                    f"{number}, {what} of {group.title}",
-                    "no run has logged it",
-                )
-            )
+            missing.append(Missing(f"{number}, {what} of {group.title}", "no run has logged it"))
             continue
         picture = Picture(f"{group.name}_{what}.svg", drawing, f"{what} against epoch")
         place = f": {group.title}" if group.swept else ""
@@ -293,29 +274,30 @@ def _curves(group: _Group, missing: list[Missing]) -> list[Figure]:
 
 def _galleries(group: _Group, views: Sequence[View], seen: Mapping[str, Seen], zooms: int) -> list[Gallery]:
     """Return the group's pictures by condition: Fig. 7 where losses differ, else Fig. 8 (11: networks differ) and 9."""
-    names = [name for name in group.runs if name in seen]
-    if not names:
+    runs = {name: run for name, run in group.runs.items() if name in seen}
+    if not runs:
         return []
-    keys = {key.replace("/", ".") for key in differing([group.runs[name] for name in names], by_overrides=group.swept)}
-    networks = {tables.networks(group.runs[name]) for name in names}
-    losses = bool(keys) and all(
-        key.split(".")[0] in ("objective", "loss") or key == "data.target_depth" for key in keys
-    )
+    keys = {key.replace("/", ".") for key in differing(list(runs.values()), by_overrides=group.swept)}
+    several = len(set(map(tables.networks, runs.values()))) > 1
+    losses = keys and all(key.split(".")[0] in ("objective", "loss") or key == "data.target_depth" for key in keys)
+    what = "loss functions" if losses else "models" if several or not group.swept else "settings"
+    caption = f"{len(runs)} {'models' if what == 'models' else 'settings'}"
+    caption += f" of {group.title}." if group.swept else "."
     found = []
     for condition in dict.fromkeys(view.condition for view in views):
-        members = [(place, view) for place, view in enumerate(views) if view.condition == condition]
         campus = condition.lower().startswith("campus")
-        number = "Fig. 7" if losses else "Fig. 9" if campus else "Figs. 8 and 11" if len(networks) > 1 else "Fig. 8"
+        numbers: tuple[str, ...] = ("7",) if losses else ("9",) if campus else ("8", "11") if several else ("8",)
+        title = f"{what.capitalize()} side by side: {condition.replace('_', ' ')}"
+        if what == "settings":  # which is no figure of the paper
+            numbers = ()
+        else:
+            title = f"Fig{'s' * (len(numbers) > 1)}. {' and '.join(numbers)}. {title}"
         scenes: list[Scene] = []
-        for count, (place, view) in enumerate(members):
-            maps = {name: seen[name].disparities[place] for name in names}
-            scenes.append(scene(view, maps, f"{group.name}_{_slug(condition)}_{count}", zooms))
-        what = "loss functions" if losses else "models" if len(networks) > 1 or not group.swept else "settings"
-        heading = f"{what.capitalize()} side by side: {condition.replace('_', ' ')}"
-        title = heading if what == "settings" else f"{number}. {heading}"
-        count_words = f"{len(names)} {'models' if what == 'models' else 'settings'}"
-        count_words += f" of {group.title}." if group.swept else "."
-        found.append(Gallery(title, tuple(scenes), count_words))
+        for place, view in enumerate(views):
+            if view.condition == condition:
+                maps = {name: seen[name].disparities[place] for name in runs}
+                scenes.append(scene(view, maps, f"{group.name}_{_slug(condition)}_{len(scenes)}", zooms))
+        found.append(Gallery(title, tuple(scenes), caption, numbers))
     return found
 
 
@@ -325,8 +307,7 @@ def _no_pictures(views: Sequence[View], galleries: Sequence[Gallery]) -> list[Mi
         return [Missing("Figs. 7, 8, 9 and 11", why)]
     if not galleries:
         return [Missing("Figs. 7, 8, 9 and 11", "no run has a checkpoint that can be used")]
-    numbered = [re.match(r"Figs?\. ([\d and]+)\.", gallery.title) for gallery in galleries]
-    found = {number for match in numbered if match for number in re.findall(r"\d+", match[1])}
+    found = {number for gallery in galleries for number in gallery.numbers}
     reasons = {
         "7": "no group of runs differs in its loss alone",
         "8": "no scenes but those of the campus, or runs that differ in their loss alone",
@@ -336,28 +317,25 @@ def _no_pictures(views: Sequence[View], galleries: Sequence[Gallery]) -> list[Mi
     return [Missing(f"Fig. {number}", reason) for number, reason in reasons.items() if number not in found]
 
 
-def _speed(points: Sequence[Point], draw: bool) -> list[Figure]:
-    if not points or not draw:
-        return []
+def _speed(points: Sequence[Point]) -> list[Figure]:
     printed = [
         Point(f"{one.method}, published ({one.device})", one.a1, one.seconds, published=True)
         for one in published().figure10
     ]
     drawing = svg(draw_speed([*points, *printed], "accuracy, δ < 1.25"))
-    picture = Picture("figure10.svg", drawing, "seconds per image against accuracy")
     caption = (
         "Times of single images. One belongs to the runs whose network has the benchmark's parameters and size. "
         "Hollow: the only time that the paper gives in numbers, from another device and data set."
     )
+    picture = Picture("figure10.svg", drawing, "seconds per image against accuracy")
     return [Figure("Fig. 10. Accuracy against time", picture, caption)]
 
 
 def _by_networks(runs: Named, sizes: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
     """Return sizes by networks in words, so that a sweep's jobs are one row; by run where the words do not tell."""
-    words: dict[str, set[tuple[int, int]]] = {}
-    for name, size in sizes.items():
-        words.setdefault(_words(runs[name]), set()).add(size)
-    return {(_words(runs[name]) if len(words[_words(runs[name])]) == 1 else name): size for name, size in sizes.items()}
+    words = {name: _words(runs[name]) for name in sizes}
+    counts = Counter(word for word, _ in {(words[name], size) for name, size in sizes.items()})
+    return {(words[name] if counts[words[name]] == 1 else name): size for name, size in sizes.items()}
 
 
 def _words(run: Run) -> str:
@@ -366,10 +344,8 @@ def _words(run: Run) -> str:
 
 
 def _facts(runs: Named) -> tuple[str, ...]:
-    counts = Counter(run.status for run in runs.values())
-    told = ", ".join(
-        f"{count} {status if status != 'unknown' else 'without run.json'}" for status, count in counts.items()
-    )
+    counts = Counter("without run.json" if run.status == "unknown" else run.status for run in runs.values())
+    told = ", ".join(f"{count} {status}" for status, count in counts.items())
     made = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     return (f"{len(runs)} run{'' if len(runs) == 1 else 's'}: {told}", f"made {made}", f"saunet {__version__}")
 

@@ -1,4 +1,4 @@
-"""What all drawings share: colors, one style, and SVG with letters as outlines, sharp at any size without any font."""
+"""What all drawings share: colors, the style of ``saunet.mplstyle``, and the drawing of time against accuracy."""
 
 from __future__ import annotations
 
@@ -12,25 +12,7 @@ from saunet.io.atomic import replacing
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7b6fd0", "#444444")
 """Okabe and Ito's colors, which color-blind readers can tell apart, the yellow left out on white paper."""
-_STYLE: Any = {
-    "font.size": 9.5,
-    "axes.labelcolor": "#444444",
-    "axes.edgecolor": "#b9bec5",
-    "axes.linewidth": 0.8,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": "#e8eaed",
-    "grid.linewidth": 0.8,
-    "xtick.color": "#555555",
-    "ytick.color": "#555555",
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "lines.linewidth": 1.7,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "saunet",
-}
+_STYLE = Path(__file__).with_name("saunet.mplstyle")
 _MARKERS = "os^Dv<>Pp*hX"
 _GRAY = "#8a9099"
 
@@ -50,10 +32,10 @@ class Point:
 
 def new_figure(panels: int, width: float, height: float, **options: Any) -> tuple[Any, list[Any]]:
     """Return a figure and its panels side by side."""
-    from matplotlib import rc_context
+    from matplotlib import style
     from matplotlib.figure import Figure
 
-    with rc_context(_STYLE):
+    with style.context(_STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
         axes = figure.subplots(1, panels, squeeze=False, **options)[0]
     return figure, list(axes)
@@ -61,11 +43,11 @@ def new_figure(panels: int, width: float, height: float, **options: Any) -> tupl
 
 def svg(figure: Any) -> bytes:
     """Return a figure as SVG, the same bytes each time."""
-    from matplotlib import rc_context
+    from matplotlib import style
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     stream = io.BytesIO()
-    with rc_context(_STYLE):
+    with style.context(_STYLE):
         FigureCanvasSVG(figure).print_svg(stream, metadata={"Date": None})  # type: ignore[no-untyped-call]
     return stream.getvalue()
 
@@ -86,11 +68,9 @@ def colors(count: int, *, ordered: bool = False) -> list[Any]:
 
 
 def draw_speed(points: Sequence[Point], accuracy: str) -> Any:
-    """Draw seconds per image against accuracy, the paper's Fig. 10.
+    """Draw seconds per image against accuracy (with its label), the paper's Fig. 10.
 
-    Args:
-        points: What to draw: a color is a model, a marker is a way of timing, hollow is published.
-        accuracy: Label of the accuracy.
+    A color is a model, a marker is a way of timing, hollow is published.
     """
     known = [point for point in points if point.accuracy is not None]
     unknown = list(dict.fromkeys(point.name for point in points if point.accuracy is None))
@@ -108,13 +88,10 @@ def draw_speed(points: Sequence[Point], accuracy: str) -> Any:
         place = float(unknown.index(point.name)) if point.accuracy is None else point.accuracy
         marker = "D" if point.published else _MARKERS[settings.index(point.setting) % len(_MARKERS)]
         tint = _GRAY if point.published else tints[point.name]
-        panel.plot(
-            [place], [point.seconds], marker, color=tint, markersize=7.5, mfc="white" if point.published else tint
-        )
-        if (
-            point.accuracy is not None and point.name not in told
-        ):  # once, above; towards the middle, where there is room
-            told.add(point.name)
+        fill = "white" if point.published else tint
+        panel.plot([place], [point.seconds], marker, color=tint, markersize=7.5, mfc=fill)
+        if point.accuracy is not None and point.name not in told:
+            told.add(point.name)  # once, above; towards the middle, where there is room
             side, offset = ("right", -9) if place > middle else ("left", 9)
             where = {"textcoords": "offset points", "xytext": (offset, 5), "ha": side}
             panel.annotate(point.name, (place, point.seconds), fontsize=9, color="#333333", **where)

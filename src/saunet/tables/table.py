@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from html import escape
 from typing import TYPE_CHECKING, Literal
+
+from saunet.tables.templates import markdown_text, rendered
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,25 +21,32 @@ Cell = str | float | int | None
 Kind = Literal["plain", "published", "measured", "failed", "dim"]
 Mark = Literal["good", "bad"]
 
-_ARROWS = {-1: "↓", 0: "", 1: "↑"}
+_STYLES = {"": "", "best": "bold", "good": "bold green", "bad": "bold red"}
 _PLAIN_WIDTH = 160
 """Characters in a line where the output is not a terminal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column: its heading, how its numbers are written, and which of them are better."""
+    """A column: its heading, with an arrow towards better numbers if any are, and how its numbers are written."""
 
-    heading: str
+    label: str
+    """Such as ``Abs Rel ↓``."""
     format: str = ""
-    """Format of its numbers, such as ``.3f``; empty for text and whole numbers."""
-    better: Literal[-1, 0, 1] = 0
-    """Whether smaller (-1) or larger (1) numbers are better."""
+    """Such as ``.3f``; empty for text and whole numbers."""
 
     @property
-    def label(self) -> str:
-        """The heading with an arrow towards better numbers."""
-        return f"{self.heading} {_ARROWS[self.better]}".rstrip()
+    def arrow(self) -> str:
+        return self.label[-1] if self.label.endswith((" ↓", " ↑")) else ""
+
+    @property
+    def heading(self) -> str:
+        return self.label[:-2] if self.arrow else self.label
+
+    @property
+    def better(self) -> int:
+        """Whether smaller (-1) or larger (1) numbers are better, or neither (0)."""
+        return {"↓": -1, "": 0, "↑": 1}[self.arrow]
 
     def text(self, value: Cell) -> str:
         """Return a value as people read it; a dash where there is none."""
@@ -48,6 +57,11 @@ class Column:
         if self.format:
             return format(value, self.format)
         return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+
+
+def columns(*labels: str) -> tuple[Column, ...]:
+    """Return columns, each from its label and, behind a ``|``, its format, such as ``Abs Rel ↓|.3f``."""
+    return tuple(Column(*label.split("|")) for label in labels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +83,8 @@ class Table:
     r"""A table of plain values.
 
     Examples:
-        >>> columns = (Column("model"), Column("Abs Rel", ".3f", better=-1))
-        >>> table = Table("scores", "Scores", columns, (Row(("ours", 0.1)), Row(("theirs", 0.25))))
+        >>> rows = (Row(("ours", 0.1)), Row(("theirs", 0.25)))
+        >>> table = Table("scores", "Scores", columns("model", "Abs Rel ↓|.3f"), rows)
         >>> print(table.markdown())
         **Scores**
         <BLANKLINE>
@@ -93,31 +107,30 @@ class Table:
     """Whether the best value of each column that has a better side is bold."""
 
     def text(self, row: Row, column: int) -> str:
-        """Return a cell as people read it."""
         return self.columns[column].text(row.cells[column])
 
     def best(self, row: Row, column: int) -> bool:
         """Return whether a cell is the best, as printed, of at least two in its group."""
         better, value = self.columns[column].better, row.cells[column]
-        if not self.bold_best or not better or not _is_number(value):
+        if not self.bold_best or not better or not isinstance(value, int | float):
             return False
         rivals = [other.cells[column] for other in self.rows if other.group == row.group]
         numbers = [number for number in rivals if isinstance(number, int | float) and not math.isnan(number)]
         top = max(numbers) if better > 0 else min(numbers)
         return len(numbers) > 1 and self.columns[column].text(top) == self.text(row, column)
 
+    def cells(self, row: Row) -> list[tuple[str, str]]:
+        """Return each cell as people read it, and whether it is ``best``, ``good`` or ``bad``, or nothing of these."""
+        marks = [row.marks.get(index) or "best" * self.best(row, index) for index in range(len(row.cells))]
+        return [(self.text(row, index), mark) for index, mark in enumerate(marks)]
+
     def numeric(self, column: int) -> bool:
         """Return whether a column holds numbers and is aligned to the right."""
-        return bool(self.columns[column].format) or any(_is_number(row.cells[column]) for row in self.rows)
+        return bool(self.columns[column].format) or any(isinstance(row.cells[column], int | float) for row in self.rows)
 
     def grouped(self) -> list[tuple[str, list[Row]]]:
         """Return neighboring rows of one group together."""
-        found: list[tuple[str, list[Row]]] = []
-        for row in self.rows:
-            if not found or found[-1][0] != row.group:
-                found.append((row.group, []))
-            found[-1][1].append(row)
-        return found
+        return [(group, list(rows)) for group, rows in itertools.groupby(self.rows, lambda row: row.group)]
 
     def width(self) -> int:
         """Return how many characters wide the table is on a terminal where nothing wraps, its title aside."""
@@ -133,14 +146,14 @@ class Table:
         from rich.table import Table as RichTable
         from rich.text import Text
 
-        bold, rest = _split_title(self.title)
-        title = Text.assemble((bold, "bold"), rest)
+        head, colon, rest = self.title.partition(": ")
+        title = Text.assemble((head, "bold"), colon + rest)
         shown = RichTable(title=title, box=HORIZONTALS, padding=0, show_edge=False, title_justify="left")
         shown.title_style, shown.caption_justify = "", "left"
         for index, column in enumerate(self.columns):
             if self.numeric(index):
                 heading = "\n".join(textwrap.wrap(column.heading, 6, break_long_words=False))
-                label = f"{heading} {_ARROWS[column.better]}".rstrip()
+                label = f"{heading} {column.arrow}".rstrip()
                 shown.add_column(Text(label), justify="right", no_wrap=True, min_width=6)
             else:
                 shown.add_column(Text(column.label), overflow="fold", min_width=min(9, len(column.label)))
@@ -148,7 +161,7 @@ class Table:
             if group:
                 shown.add_row(Text(group, "italic"))
             for row in rows:
-                cells = [Text(self.text(row, index), self._style(row, index)) for index in range(len(row.cells))]
+                cells = [Text(text, _STYLES[mark]) for text, mark in self.cells(row)]
                 shown.add_row(*cells, style="dim" if row.kind == "dim" else None)
         notes = [*self.notes, *(f"{self.text(row, 0)}: {row.note}" for row in self.rows if row.note)]
         if notes:
@@ -157,48 +170,26 @@ class Table:
 
     def markdown(self) -> str:
         """Return the table as Markdown; the sentence about a row follows its second cell."""
-        bold, rest = _split_title(self.title)
-        lines = [
-            f"**{markdown_text(bold)}**{markdown_text(rest)}",
-            "",
-            markdown_line([markdown_text(column.label) for column in self.columns]),
-        ]
-        lines.append("|" + "".join("---:|" if self.numeric(index) else "---|" for index in range(len(self.columns))))
+        head, colon, rest = map(markdown_text, self.title.partition(": "))
+        aligned = ("---:|" if self.numeric(index) else "---|" for index in range(len(self.columns)))
+        labels = _markdown_line(markdown_text(column.label) for column in self.columns)
+        lines = [f"**{head}**{colon}{rest}", "", labels, "|" + "".join(aligned)]
         for group, rows in self.grouped():
             if group:
-                lines.append(markdown_line([f"*{markdown_text(group)}*", *[""] * (len(self.columns) - 1)]))
+                lines.append(_markdown_line([f"*{markdown_text(group)}*", *[""] * (len(self.columns) - 1)]))
             for row in rows:
-                cells = [markdown_text(self.text(row, index)) for index in range(len(row.cells))]
-                bolds = [bool(cell and self._style(row, index)) for index, cell in enumerate(cells)]
-                cells = [f"**{cell}**" if bold else cell for cell, bold in zip(cells, bolds, strict=True)]
+                marked = ((markdown_text(text), mark) for text, mark in self.cells(row))
+                cells = [f"**{text}**" if text and mark else text for text, mark in marked]
                 if row.note:
                     cells[1] += f": {markdown_text(row.note)}"
-                lines.append(markdown_line(cells))
+                lines.append(_markdown_line(cells))
         notes = [f"{markdown_text(note)}  " for note in self.notes]
         return "\n".join([*lines, *([""] if notes else []), *notes])
 
     def html(self) -> str:
         """Return the table as HTML: a heading, the table in a box that scrolls, and the notes."""
         kinds = ["number" if self.numeric(index) else "text" for index in range(len(self.columns))]
-        width = len(self.columns)
-        head = "".join(
-            f"<th class={kind}>{escape(column.heading)}{f' <i>{_ARROWS[column.better]}</i>' * bool(column.better)}</th>"
-            for column, kind in zip(self.columns, kinds, strict=True)
-        )
-        body = []
-        for group, rows in self.grouped():
-            if group:
-                body.append(f'<tr class="group {rows[0].kind}"><th colspan={width}>{escape(group)}</th></tr>')
-            for row in rows:
-                cells = "".join(f"<td class={kind}>{self._html_cell(row, i)}</td>" for i, kind in enumerate(kinds))
-                body.append(f"<tr class={row.kind}>{cells}</tr>")
-                if row.note:
-                    body.append(f'<tr class="{row.kind} why"><td colspan={width}>{escape(row.note)}</td></tr>')
-        notes = "".join(f"<p class=note>{escape(note)}</p>" for note in self.notes)
-        return (
-            f"<h3>{escape(self.title)}</h3><div class=scroll><table><thead><tr>{head}</tr></thead>"
-            f"<tbody>{''.join(body)}</tbody></table></div>{notes}"
-        )
+        return rendered("tables/table.html", table=self, kinds=kinds)
 
     def csv(self) -> str:
         """Return the table as CSV: numbers in full, columns for the group and the note where there are any."""
@@ -206,18 +197,9 @@ class Table:
         header = [column.heading for column in self.columns] + ["Source"] * grouped + ["Note"] * noted
         return csv_text(header, ([*row.cells, *[row.group] * grouped, *[row.note] * noted] for row in self.rows))
 
-    def _style(self, row: Row, column: int) -> str:
-        if column in row.marks:
-            return {"good": "bold green", "bad": "bold red"}[row.marks[column]]
-        return "bold" if self.best(row, column) else ""
 
-    def _html_cell(self, row: Row, column: int) -> str:
-        text = escape(self.text(row, column))
-        if column in row.marks:
-            return f"<b class={row.marks[column]}>{text}</b>"
-        if self.columns[column].heading == "Status":
-            return f'<span class="chip {escape(str(row.cells[column]))}">{text}</span>'
-        return f"<b>{text}</b>" if self.best(row, column) else text
+def _markdown_line(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -243,21 +225,3 @@ def show(tables: Iterable[Table], console: Console | None = None) -> None:
     console = console or stdout()
     for table in tables:
         console.print(table.rich(), "")
-
-
-def _is_number(value: Cell) -> bool:
-    return isinstance(value, int | float)
-
-
-def _split_title(title: str) -> tuple[str, str]:
-    head, colon, rest = title.partition(": ")
-    return head, colon + rest
-
-
-def markdown_text(text: str) -> str:
-    """Return text that cannot become markup in Markdown."""
-    return text.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;")
-
-
-def markdown_line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
