@@ -12,9 +12,8 @@ from saunet.cli.config import config_dir
 from saunet.errors import ConfigError, one_of
 from saunet.models.depth import DepthNet
 from saunet.registry import Spec
-from saunet.tools.benchmark import BenchmarkOptions, Networks
+from saunet.tools.benchmark import BenchmarkOptions, Networks, Plan
 from saunet.tools.benchmark import benchmark as measure
-from saunet.tools.benchmark.suite import Plan
 
 CHANGED = " (changed)"
 """Stands behind the name of a model that the command line has changed: it is not what the paper measured."""

@@ -103,6 +103,7 @@ def test_sizes_are_checked_before_anything_is_measured() -> None:
         ({"sizes": []}, "sizes is empty, .* such as 192x640"),
         ({"modes": ()}, "modes is empty"),
         ({"runs": 0}, "runs is 0"),
+        ({"warmup": -1}, "warmup is -1"),
     ],
 )
 def test_impossible_plans_are_refused(changes: dict[str, Any], message: str) -> None:

@@ -2,20 +2,7 @@
 
 from __future__ import annotations
 
-from saunet.tools.benchmark.measure import count_flops, count_parameters, measure_latency, peak_memory
-from saunet.tools.benchmark.suite import Measurement, Networks, Plan, run_suite
-from saunet.tools.benchmark.tool import BenchmarkOptions, BenchmarkResult, benchmark
+from saunet.tools.benchmark.measure import Measurement, Networks, Plan, count_parameters, run_suite
+from saunet.tools.benchmark.tool import BenchmarkOptions, benchmark
 
-__all__ = [
-    "BenchmarkOptions",
-    "BenchmarkResult",
-    "Measurement",
-    "Networks",
-    "Plan",
-    "benchmark",
-    "count_flops",
-    "count_parameters",
-    "measure_latency",
-    "peak_memory",
-    "run_suite",
-]
+__all__ = ["BenchmarkOptions", "Measurement", "Networks", "Plan", "benchmark", "count_parameters", "run_suite"]

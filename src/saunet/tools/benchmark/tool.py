@@ -13,16 +13,11 @@ from saunet.errors import ConfigError, positive, require_matplotlib, usable_devi
 from saunet.io.atomic import check_folder, write_json
 from saunet.io.progress import bar
 from saunet.published import published
-from saunet.tables import Column, Row, Table, show, stdout
+from saunet.tables import Row, Table, columns, show, stdout
 from saunet.tables.drawing import Point, draw_speed, save
-from saunet.tools.benchmark.suite import Measurement, Networks, Plan, run_suite
+from saunet.tools.benchmark.measure import Measurement, Networks, Plan, run_suite
 
-PAPER_METHODS: dict[str, str] = {
-    "mono_r18": "Mono R18",
-    "mono_r50": "Mono R50",
-    "packnet": "PackNet",
-    "sau_net": "SAU-Net",
-}
+PAPER_METHODS = {"mono_r18": "Mono R18", "mono_r50": "Mono R50", "packnet": "PackNet", "sau_net": "SAU-Net"}
 """What the paper calls our models."""
 
 
@@ -110,19 +105,17 @@ def benchmark(options: BenchmarkOptions) -> BenchmarkResult:
     Returns:
         What was measured; `BenchmarkResult.show` prints the tables.
     """
-    folder = Path(options.output_dir) if options.output_dir is not None else None
-    if folder is not None:
-        check_folder(folder)
+    folder = None if options.output_dir is None else check_folder(options.output_dir)
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     plan = replace(options, devices=tuple(str(usable_device(name)) for name in options.devices))
     with bar() as shown:
         task = shown.add_task("")
-        results = run_suite(
-            options.models,
-            plan,
-            lambda text, done, total: shown.update(task, description=text, completed=done, total=total),
-        )
+
+        def progress(text: str, done: int, total: int) -> None:
+            shown.update(task, description=text, completed=done, total=total)
+
+        results = run_suite(options.models, plan, progress)
     if folder is not None:
         write_measurements(results, folder / "benchmark.json")
         if options.figure:
@@ -132,12 +125,6 @@ def benchmark(options: BenchmarkOptions) -> BenchmarkResult:
 
 def size_table(results: Sequence[Measurement]) -> Table:
     """Return parameters and FLOPs by model and image size, with the paper's Table 2 where it has the system."""
-    columns = (
-        *(Column(heading) for heading in ("model", "size")),
-        *(Column(f"{part} M", ".1f") for part in ("depth", "pose", "total")),
-        Column("paper M"),
-        Column("GFLOP", ".1f"),
-    )
     printed = {row.method: row.megaparameters for row in published().table2}
     rows = []
     for row in {(row.model, row.size): row for row in results}.values():
@@ -146,7 +133,8 @@ def size_table(results: Sequence[Measurement]) -> Table:
         paper = f"{printed[method]} ({method})" if method else None
         rows.append(Row((row.model, row.size, *counts, paper, row.flops / 1e9)))
     title = "Size: M = 10^6 parameters; GFLOP of the depth network for one image"
-    return Table("sizes", title, columns, tuple(rows))
+    headings = columns("model", "size", "depth M|.1f", "pose M|.1f", "total M|.1f", "paper M", "GFLOP|.1f")
+    return Table("sizes", title, headings, tuple(rows))
 
 
 def speed_table(results: Sequence[Measurement], width: int = 160) -> Table:
@@ -155,37 +143,20 @@ def speed_table(results: Sequence[Measurement], width: int = 160) -> Table:
     Settings that all measurements share are in the title. Where the rest does not fit into so many columns of text,
     they stand in one column that wraps, so that no number is cut.
     """
-    settings: dict[str, list[str]] = {
-        "model": [row.model for row in results],
-        "size": [row.size for row in results],
-        "device": [row.device for row in results],
-        "precision": [row.precision for row in results],
-        "mode": [row.mode for row in results],
-        "batch": [str(row.batch_size) for row in results],
-    }
+    keys = ("model", "size", "device", "precision", "mode", "batch_size")
+    settings = {key.removesuffix("_size"): [str(getattr(row, key)) for row in results] for key in keys}
     shared = [name for name, values in settings.items() if len(set(values)) == 1 and name != "model"]
     said = "".join(f", {'batch ' * (name == 'batch')}{settings.pop(name)[0]}" for name in shared)
-    numbers = (
-        *(Column(heading, ".1f") for heading in ("median", "p90")),
-        Column("warm-up", ".0f"),
-        Column("images/s", ".1f"),
-        Column("peak MB", ".0f"),
-        Column("of matmul", ".0%"),
-    )
-    measured = [
-        (
-            *(1e3 * seconds for seconds in (row.median, row.p90, row.warmup)),
-            row.throughput,
-            None if row.memory is None else row.memory / 1e6,
-            row.ceiling_share,
-        )
-        for row in results
-    ]
     title = f"Speed: ms per call{said}; matmul is the speed of one large matrix product"
+    numbers = columns("median|.1f", "p90|.1f", "warm-up|.0f", "images/s|.1f", "peak MB|.0f", "of matmul|.0%")
 
     def table(headings: Sequence[str], labels: Sequence[Sequence[str]]) -> Table:
-        rows = tuple(Row((*label, *values)) for label, values in zip(labels, measured, strict=True))
-        return Table("speed", title, (*map(Column, headings), *numbers), rows)
+        rows = []
+        for label, row in zip(labels, results, strict=True):
+            times = (1e3 * seconds for seconds in (row.median, row.p90, row.warmup))
+            memory = None if row.memory is None else row.memory / 1e6
+            rows.append(Row((*label, *times, row.throughput, memory, row.ceiling_share)))
+        return Table("speed", title, (*columns(*headings), *numbers), tuple(rows))
 
     labels = list(zip(*settings.values(), strict=True))
     wide = table(list(settings), labels)
@@ -208,13 +179,8 @@ def draw_figure(results: Sequence[Measurement], path: Path, abs_rel: Mapping[str
     """Draw time per image against accuracy; models of unknown accuracy stand beside."""
     printed = {row.method: row.errors[0] for row in published().table1}
     accuracy = {model: printed[method] for model, method in PAPER_METHODS.items()} | dict(abs_rel or {})
-    points = [
-        Point(
-            row.model,
-            accuracy.get(row.model),
-            row.median / row.batch_size,
-            f"{row.size}, {row.device} {row.precision} {row.mode}, batch {row.batch_size}",
-        )
-        for row in results
-    ]
+    points = []
+    for row in results:
+        setting = f"{row.size}, {row.device} {row.precision} {row.mode}, batch {row.batch_size}"
+        points.append(Point(row.model, accuracy.get(row.model), row.median / row.batch_size, setting))
     save(draw_speed(points, "Abs Rel, KITTI Eigen (as published unless given)"), path)
