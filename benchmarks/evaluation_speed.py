@@ -15,8 +15,8 @@ from collections.abc import Iterator
 import torch
 
 from saunet.evaluation import NetworkPredictor, score
-from saunet.evaluation.buckets import Buckets
-from saunet.evaluation.tool import with_statistics
+from saunet.evaluation.scoring import Buckets
+from saunet.evaluation.statistics import with_statistics
 from saunet.metrics.baselines import ConstantDepth
 from saunet.metrics.protocols import protocol
 from saunet.models.depth import DepthNet

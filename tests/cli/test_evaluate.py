@@ -228,7 +228,7 @@ def test_odometry_runs_on_a_plain_install(
     tool: Tool, smoke_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without matplotlib, the default `figure=true` draws nothing and says so once."""
-    monkeypatch.setattr("saunet.evaluation.tool_odometry.find_spec", lambda name: None)
+    monkeypatch.setattr("saunet.evaluation.paths.find_spec", lambda name: None)
     outcome = tool("odometry", checkpoint(smoke_run), "data=synthetic_tiny", "output_dir=out")
     assert outcome.code == 0, outcome.err
     assert outcome.out.count("pip install 'saunet[plot]'") == 1

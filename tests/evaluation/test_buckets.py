@@ -12,7 +12,7 @@ from rich.console import Console
 
 from saunet.errors import ConfigError
 from saunet.evaluation import score, write_results
-from saunet.evaluation.buckets import Buckets, BucketSums, depth_edges, near_edge
+from saunet.evaluation.scoring import Buckets, BucketSums, depth_edges, near_edge
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import evaluate_image, protocol, sample_image
 from saunet.tables import show

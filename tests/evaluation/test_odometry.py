@@ -18,6 +18,7 @@ from saunet.errors import ConfigError
 from saunet.evaluation import paths
 from saunet.evaluation.paths import (
     STRAIGHT,
+    OdometryOptions,
     Path3d,
     draw_path,
     path_errors,
@@ -28,6 +29,7 @@ from saunet.evaluation.paths import (
     write_path,
 )
 from saunet.io.trajectories import read_kitti, read_tum
+from saunet.registry import Spec
 
 
 def winding(frames=120, step=2.0):
@@ -224,13 +226,13 @@ def test_a_segment_that_does_not_fit_is_said():
     [
         ({"snippet": 0}, "snippet is 0; it counts frames and must be at least 2"),
         ({"snippet": 1}, "snippet is 1"),
-        ({"lengths": [10.0, -5.0]}, "lengths is -5.0; it must be greater than 0"),
-        ({"lengths": [math.inf]}, "lengths is inf"),
+        ({"lengths": (10.0, -5.0)}, "lengths is -5.0; it must be greater than 0"),
+        ({"lengths": (math.inf,)}, "lengths is inf"),
     ],
 )
 def test_settings_without_sense_are_refused(options, words):
     with pytest.raises(ConfigError, match=words):
-        path_errors(a_path(31), **options)
+        OdometryOptions(checkpoint="best.ckpt", data=Spec({}), **options)
 
 
 def test_the_errors_stand_in_the_picture(tmp_path):

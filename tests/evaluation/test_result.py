@@ -14,8 +14,7 @@ import pytest
 from rich.console import Console
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation.files import as_json, markdown, read_rows, write_results
-from saunet.evaluation.result import EvaluationResult, ImageRow, ViewRow, summarize
+from saunet.evaluation.result import EvaluationResult, ImageRow, ViewRow, as_json, markdown, read_rows, write_results
 from saunet.metrics.functional import ERROR_HEADINGS
 from saunet.metrics.protocols import protocol
 from saunet.tables import show
@@ -44,11 +43,10 @@ def test_summary_is_the_mean_over_images():
 
 
 def test_summary_of_blank_images_only():
-    summary = summarize([ImageRow("m", "metric", "a", 0, math.nan, NAN)])
+    blank = ImageRow("m", "metric", "a", 0, math.nan, NAN)
+    (summary,) = EvaluationResult((protocol("metric"),), ("m", "no rows"), (blank,)).summaries()
     assert (summary.images, summary.images_without_truth) == (0, 1)
-    assert math.isnan(summary.errors[0])
-    with pytest.raises(DataError, match="0 rows"):
-        summarize([])
+    assert all(map(math.isnan, (*summary.errors, summary.scale, summary.scale_std)))
 
 
 def test_select_names_the_nearest():

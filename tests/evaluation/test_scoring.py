@@ -10,7 +10,7 @@ from torch import nn
 
 from saunet.errors import ConfigError, DataError
 from saunet.evaluation import NetworkPredictor, score
-from saunet.evaluation.buckets import Buckets
+from saunet.evaluation.scoring import Buckets
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.functional import ERROR_NAMES, flip_blend

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from saunet.errors import ConfigError, DataError
+from saunet.errors import DataError
 from saunet.evaluation.result import EvaluationResult, ImageRow
 from saunet.evaluation.statistics import bootstrap_mean, compare, drive_of, spreads
 from saunet.metrics.protocols import protocol
@@ -152,8 +152,6 @@ def test_what_cannot_be_compared():
         compare(rows(base, blank=range(5)), rows(base))
     with pytest.raises(DataError, match="5 rows with 4 groups"):
         bootstrap_mean(base, ["a"] * 4)
-    with pytest.raises(ConfigError, match="level is"):
-        bootstrap_mean(base, each(base), level=1.5)
 
 
 def test_rows_of_two_protocols_are_not_compared():

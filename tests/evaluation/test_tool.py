@@ -15,7 +15,8 @@ import torch
 from saunet.errors import ConfigError, DataError
 from saunet.evaluation import EvaluateOptions, evaluate, write_results
 from saunet.evaluation.scoring import score_views
-from saunet.evaluation.tool import evaluate_network, passes, with_statistics
+from saunet.evaluation.statistics import with_statistics
+from saunet.evaluation.tool import evaluate_network, passes
 from saunet.metrics.baselines import ConstantDepth
 from saunet.metrics.protocols import protocol
 from saunet.registry import Spec
@@ -213,6 +214,7 @@ def test_statistics_and_the_earlier_run(options, tmp_path):
         ({"intervals": 95.0}, "intervals is 95"),
         ({"split": "train"}, "split is 'train'"),
         ({"match": "nam"}, "match is 'nam'"),
+        ({"predicted": "depths"}, "predicted is 'depths'"),
         ({"distances": (5.0,)}, "at least two limits"),
     ],
 )

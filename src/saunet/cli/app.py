@@ -88,8 +88,8 @@ TOOLS: dict[str, Tool] = {
     ),
     "odometry": Tool(
         "the camera's path through whole sequences, with its errors",
-        "saunet.evaluation.tool_odometry:OdometryOptions",
-        "saunet.evaluation.tool_odometry:odometry",
+        "saunet.evaluation.paths:OdometryOptions",
+        "saunet.evaluation.paths:odometry",
         ("odometry last.ckpt data.root=/data/kitti/odometry",),
         positional="checkpoint",
     ),

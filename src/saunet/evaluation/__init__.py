@@ -2,22 +2,10 @@
 
 from __future__ import annotations
 
-from saunet.evaluation.files import write_results
-from saunet.evaluation.predictors import NetworkPredictor, Predictor
-from saunet.evaluation.result import EvaluationResult
+from saunet.evaluation.paths import OdometryOptions, odometry
+from saunet.evaluation.predictors import NetworkPredictor
+from saunet.evaluation.result import write_results
 from saunet.evaluation.scoring import score
 from saunet.evaluation.tool import EvaluateOptions, evaluate
-from saunet.evaluation.tool_odometry import OdometryOptions, OdometryResult, odometry
 
-__all__ = [
-    "EvaluateOptions",
-    "EvaluationResult",
-    "NetworkPredictor",
-    "OdometryOptions",
-    "OdometryResult",
-    "Predictor",
-    "evaluate",
-    "odometry",
-    "score",
-    "write_results",
-]
+__all__ = ["EvaluateOptions", "NetworkPredictor", "OdometryOptions", "evaluate", "odometry", "score", "write_results"]

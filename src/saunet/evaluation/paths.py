@@ -1,9 +1,11 @@
-"""A predicted path: how far off it is (snippets, aligned, KITTI's relative errors), its files, its picture."""
+"""`odometry`: the path of the camera through whole sequences, its errors, its files and its picture."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -11,22 +13,27 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from saunet.data.drive import Drive
-from saunet.evaluation.files import without_nan
-from saunet.io.atomic import write_bytes, write_json
+from saunet.errors import ConfigError, positive, usable_device
+from saunet.evaluation.predictors import file_stem
+from saunet.evaluation.result import without_nan
+from saunet.io.atomic import check_folder, write_bytes, write_json
 from saunet.io.trajectories import write_kitti, write_tum
 from saunet.metrics.odometry import (
     KITTI_LENGTHS,
     Similarity,
-    align_trajectory,
     relative_motions,
     segment_errors,
     snippet_ate,
     trajectory_ate,
+    umeyama,
 )
-from saunet.tables import Column, Row, Table, csv_text
+from saunet.prediction.odometer import Odometer, follow
+from saunet.registry import Spec
+from saunet.tables import Row, Table, columns, csv_text, show
 from saunet.tables.drawing import new_figure, save
+from saunet.weights.files import read_model
+from saunet.weights.locate import locate
 
-_RED = "tab:red"
 PUBLISHED_SNIPPET = 5
 """Frames in a snippet of the published numbers."""
 MODEL = "pose network"
@@ -48,7 +55,6 @@ class PathErrors:
     snippet_ate: float
     """Mean error of snippets in meters, each with its own scale; of five frames as published (Zhou et al.)."""
     snippet_std: float
-    """Its standard deviation over snippets."""
     ate: float
     """Root mean square distance of positions in meters after 7-DoF alignment of the whole path."""
     scale: float
@@ -78,12 +84,12 @@ class Path3d:
     """``T_world_cam`` in meters."""
     predictor: str = MODEL
 
-    @property
+    @cached_property
     def alignment(self) -> Similarity:
         """The similarity that brings the prediction onto the truth; nothing moves where there is no truth."""
         if self.true is None:
             return Similarity(1.0, np.eye(3), np.zeros(3))
-        return align_trajectory(self.predicted, self.true)
+        return umeyama(self.predicted[:, :3, 3], self.true[:, :3, 3])
 
     @property
     def turn(self) -> float:
@@ -111,12 +117,8 @@ def path_of(drive: Drive, predicted: Float64[ndarray, "n 4 4"]) -> Path3d:
     """Return a predicted path beside what its recording knows of all frames: when they were taken, and true poses."""
     times = drive.timestamps
     poses = [pose for number in drive.indices if (pose := drive.pose(number)) is not None]
-    return Path3d(
-        drive.name,
-        predicted,
-        None if times is None or np.isnan(times).any() else times,
-        np.stack(poses) if len(poses) == len(predicted) else None,
-    )
+    times = None if times is None or np.isnan(times).any() else times
+    return Path3d(drive.name, predicted, times, np.stack(poses) if len(poses) == len(predicted) else None)
 
 
 def straight_ahead(path: Path3d) -> Path3d:
@@ -138,38 +140,18 @@ def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None 
     if lengths is None and 0 < meters <= min(KITTI_LENGTHS):
         chosen = tuple(round(share * meters, 1) for share in (0.2, 0.4, 0.6, 0.8))
     snippets = snippet_ate(relative_motions(path.predicted), relative_motions(true), snippet)
+    mean, std, ate = float(snippets.mean()), float(snippets.std()), trajectory_ate(path.predicted, true)
     relative = segment_errors(path.aligned, true, chosen, step=10 if len(true) > 100 else 1)
-    return PathErrors(
-        path.sequence,
-        path.predictor,
-        len(true),
-        meters,
-        snippet,
-        snippets.mean,
-        snippets.std,
-        trajectory_ate(path.predicted, true),
-        path.alignment.scale,
-        path.turn,
-        relative.t_rel,
-        relative.r_rel,
-        relative.segments,
-        chosen,
-    )
+    about = (path.sequence, path.predictor, len(true), meters, snippet)
+    return PathErrors(*about, mean, std, ate, path.alignment.scale, path.turn, *relative, chosen)
 
 
 def path_table(errors: Sequence[PathErrors]) -> Table:
     """Return one line per sequence and predictor."""
     snippet = errors[0].snippet
-    columns = (
-        Column("sequence"),
-        Column("frames"),
-        Column("path m", ".1f"),
-        Column(f"{snippet}-frame ATE m"),
-        Column("ATE m", ".3f"),
-        Column("scale", ".3g"),
-        Column("turned °", ".0f"),
-        Column("t_rel %", ".2f"),
-        Column("r_rel °/100m", ".2f"),
+    headings = columns(
+        *("sequence", "frames", "path m|.1f", f"{snippet}-frame ATE m", "ATE m|.3f", "scale|.3g", "turned °|.0f"),
+        *("t_rel %|.2f", "r_rel °/100m|.2f"),
     )
     rows = []
     for one in errors:
@@ -180,16 +162,16 @@ def path_table(errors: Sequence[PathErrors]) -> Table:
         rows.append(Row((*about, told, *numbers), "dim" if trivial else "plain"))
     published = "as published" if snippet == PUBLISHED_SNIPPET else f"published numbers use {PUBLISHED_SNIPPET} frames"
     notes = [f"{snippet}-frame ATE: own scale per snippet, {published}; the rest after 7-DoF alignment"]
-    lengths = [f"{row.lengths[0]:g} to {row.lengths[-1]:g} m" for row in errors if row.segments]
+    lengths = {f"{row.lengths[0]:g} to {row.lengths[-1]:g} m" for row in errors if row.segments}
     if lengths:
-        notes.append(f"t_rel and r_rel over segments of {', '.join(sorted(set(lengths)))}")
+        notes.append(f"t_rel and r_rel over segments of {', '.join(sorted(lengths))}")
     bare = {row.sequence: row for row in errors if not row.segments}
     notes += [
         f"no segment of {min(row.lengths):g} m or more fits into the {row.meters:.1f} m of {name}"
         for name, row in bare.items()
     ]
     title = "odometry: the path of the camera from the pose network"
-    return Table("odometry", title, columns, tuple(rows), tuple(notes))
+    return Table("odometry", title, headings, tuple(rows), tuple(notes))
 
 
 def write_path(path: Path3d, folder: Path) -> None:
@@ -208,16 +190,16 @@ def write_path(path: Path3d, folder: Path) -> None:
 
 def write_errors(errors: Sequence[PathErrors], folder: Path, settings: dict[str, object]) -> None:
     """Write ``odometry.json`` and ``odometry.csv``, one entry per sequence and predictor."""
-    rows: list[dict[str, object]] = [without_nan(asdict(row)) for row in errors]
-    write_json(folder / "odometry.json", {"settings": settings, "results": rows})
+    rows = [asdict(row) for row in errors]
+    write_json(folder / "odometry.json", {"settings": settings, "results": without_nan(rows)})
     if rows:
-        lines = ({**asdict(row), "lengths": " ".join(map(str, row.lengths))}.values() for row in errors)
+        lines = ({**row, "lengths": " ".join(map(str, row["lengths"]))}.values() for row in rows)
         write_bytes(folder / "odometry.csv", csv_text(list(rows[0]), map(tuple, lines)).encode())
 
 
 def draw_path(path: Path3d, file: Path, errors: Sequence[PathErrors] = ()) -> None:
     """Draw a path from above and, where the true one is known, both and the distance between them."""
-    known = path.true is not None
+    known, red = path.true is not None, "tab:red"
     figure, (above, *more) = new_figure(1 + known, 9.0 if known else 5.0, 4.5)
     ours = spots = path.aligned[:, :3, 3]
     unit = "m" if known else "network's own unit"
@@ -227,12 +209,12 @@ def draw_path(path: Path3d, file: Path, errors: Sequence[PathErrors] = ()) -> No
         above.plot(theirs[:, 0], theirs[:, 2], color="0.45", linewidth=4, alpha=0.6, label="true")
         driven = np.concatenate(([0.0], np.linalg.norm(np.diff(theirs, axis=0), axis=1).cumsum()))
         off = np.linalg.norm(ours - theirs, axis=1)
-        more[0].plot(driven, off, color=_RED)
+        more[0].plot(driven, off, color=red)
         more[0].set(xlabel="distance driven (m)", ylabel="distance from the true position (m)", ylim=(0, None))
         more[0].set_title(f"off by {np.sqrt((off**2).mean()):.2f} m (root mean square)", fontsize=10)
     label = "predicted,\n7-DoF aligned" if known else "predicted"
-    above.plot(ours[:, 0], ours[:, 2], color=_RED, linewidth=1.5, label=label)
-    above.plot(ours[0, 0], ours[0, 2], "o", color=_RED, markersize=6, label="start")
+    above.plot(ours[:, 0], ours[:, 2], color=red, linewidth=1.5, label=label)
+    above.plot(ours[0, 0], ours[0, 2], "o", color=red, markersize=6, label="start")
     # Equal scales, and room to the sides of a straight road, which would otherwise be a line in a sliver.
     center, reach = (spots.max(0) + spots.min(0)) / 2, max(np.ptp(spots[:, 0]), np.ptp(spots[:, 2]), 1e-6) * 0.55
     above.set(xlim=(center[0] - reach, center[0] + reach), ylim=(center[2] - reach, center[2] + reach))
@@ -249,3 +231,123 @@ def _told(errors: PathErrors) -> str:
     relative = f", t_rel {errors.t_rel:.1f} %" if errors.segments else ""
     snippets = f"{errors.snippet}-frame ATE {errors.snippet_ate:.4f} m"
     return f"{errors.predictor}: {snippets}{relative}, turned by {errors.turn:.0f}° to align"
+
+
+@dataclass(frozen=True, kw_only=True)
+class OdometryOptions:
+    """Which path `odometry` predicts, and how it is compared.
+
+    Args:
+        checkpoint: A trained model with a pose network.
+        data: The data module, whose test split is followed; the size of its images follows the checkpoint.
+        snippet: Frames in a snippet; published numbers use 5.
+        lengths: Segment lengths in meters for t_rel and r_rel; by default KITTI's 100 to 800 m, or 20 to 80 % of a path
+            that is shorter than 100 m.
+        batch_size: Frames that the network sees at once.
+        figure: Draw each path, if matplotlib is installed.
+        device: Where to predict; ``auto`` takes a GPU if there is one.
+        output_dir: Folder for the results; None writes none.
+
+    Raises:
+        ConfigError: if an option cannot work.
+
+    Examples:
+        >>> data = saunet.Spec.of("data", "kitti_odometry", root="/data/kitti/odometry")
+        >>> saunet.OdometryOptions(checkpoint="best.ckpt", data=data).snippet
+        5
+    """
+
+    checkpoint: str
+    data: Spec
+    snippet: int = 5
+    lengths: tuple[float, ...] | None = None
+    batch_size: int = 8
+    figure: bool = True
+    device: str = "auto"
+    output_dir: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.snippet < 2:
+            raise ConfigError(
+                f"snippet is {self.snippet}; it counts frames and must be at least 2 (published numbers use 5)"
+            )
+        for length in self.lengths or ():
+            positive("lengths", length)
+        positive("batch_size", self.batch_size)
+
+
+@dataclass(frozen=True)
+class OdometryResult:
+    """The predicted paths and their errors."""
+
+    paths: tuple[Path3d, ...]
+    errors: tuple[PathErrors, ...]
+    """Of each path with a true one, followed by those of constant motion straight ahead."""
+    notes: tuple[str, ...] = ()
+    """What could not be done, and why."""
+    folder: Path | None = None
+    """Where the files were written."""
+
+    @property
+    def table(self) -> Table | None:
+        """One line per sequence and predictor; None if no sequence has a true path."""
+        return path_table(self.errors) if self.errors else None
+
+    def show(self) -> None:
+        """Print the notes, the table, and where the files are."""
+        print("".join(f"{note}\n" for note in self.notes), end="")
+        show([self.table] if self.table else [])
+        if self.folder is not None:
+            print(f"results: {self.folder}")
+
+
+def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda text: None) -> OdometryResult:
+    """Predict the path through each test sequence and compare it with the true one where that is known.
+
+    Args:
+        options: What and how.
+        progress: Called with the name of each sequence.
+
+    Returns:
+        The paths and their errors; `OdometryResult.show` prints them.
+
+    Raises:
+        ConfigError: if the model has no pose network, or it was not trained on neighboring frames.
+        CheckpointError: if the checkpoint cannot be read.
+        DataError: if the data cannot be read, or a file cannot be written.
+
+    Examples:
+        >>> data = saunet.Spec.of("data", "synthetic_tiny")
+        >>> odometry(OdometryOptions(checkpoint="best.ckpt", data=data)).show()  # doctest: +SKIP
+    """
+    folder = None if options.output_dir is None else check_folder(options.output_dir)
+    device, source = usable_device(options.device), locate(options.checkpoint)
+    record = read_model(source).record
+    odometer = Odometer.from_model(source, device=str(device), batch_size=options.batch_size)
+    data = options.data.build(height=record.height, width=record.width, offsets=list(record.offsets))
+    data.setup("test")
+    drawn = options.figure and find_spec("matplotlib") is not None
+    paths, errors, notes = [], [], []
+    for drive in data.datasets["test"].drives:
+        progress(drive.name)
+        path = path_of(drive, follow(odometer, drive))
+        mine = []
+        if path.true is not None:
+            mine = [path_errors(each, options.snippet, options.lengths) for each in (path, straight_ahead(path))]
+        else:
+            notes.append(f"{drive.name}: no true poses, so the path is written and not compared")
+        if path.times is None:
+            notes.append(f"{drive.name}: the times of its frames are unknown, so no TUM files are written")
+        if folder is not None:
+            place = folder / file_stem(drive.name)
+            write_path(path, place)
+            if drawn:
+                draw_path(path, place / "path.png", mine)
+        paths.append(path)
+        errors += mine
+    if options.figure and not drawn:
+        notes.append("paths are not drawn, which needs matplotlib: run `pip install 'saunet[plot]'`")
+    scale = None if record.scale is None else {"factor": record.scale.factor, "source": record.scale.source}
+    if folder is not None:
+        write_errors(errors, folder, {"checkpoint": options.checkpoint, "scale": scale})
+    return OdometryResult(tuple(paths), tuple(errors), tuple(notes), folder)

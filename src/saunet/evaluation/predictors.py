@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor, nn
 
-from saunet.errors import DataError, one_of
+from saunet.errors import DataError
 from saunet.io.colormaps import depth_to_png16
 from saunet.io.images import natural_order, read_depth, write_image
 from saunet.io.plain import read_array
@@ -31,11 +31,9 @@ SUFFIXES: tuple[str, ...] = (".npy", ".png")
 
 
 class NetworkPredictor:
-    """A depth network, or a trivial predictor, as something that can be scored.
+    """A depth network, or a trivial predictor, as something that can be scored; put into evaluation mode.
 
-    Args:
-        network: Takes images (b 3 h w) and returns a `DepthPyramid` or a disparity (b 1 h w); put into evaluation mode.
-        flip: Also predict the mirrored image and blend (`flip_blend`): slower and a little better.
+    ``flip`` also predicts the mirrored image and blends: slower and a little better.
     """
 
     def __init__(self, network: nn.Module, flip: bool = False) -> None:
@@ -43,7 +41,6 @@ class NetworkPredictor:
 
     @torch.inference_mode()
     def __call__(self, batch: EvalBatch) -> Tensor:
-        """Return the disparity of the batch's target images, b 1 h w."""
         image = batch["target"]
         disparity = self._disparity(image)
         return flip_blend(disparity, self._disparity(image.flip(-1))) if self.flip else disparity
@@ -51,19 +48,6 @@ class NetworkPredictor:
     def _disparity(self, image: Tensor) -> Tensor:
         output = self.network(image)
         return output.disparity[0] if isinstance(output, DepthPyramid) else output
-
-
-class NetworkMotion:
-    """A pose network as the source of the camera's motion; put into evaluation mode."""
-
-    def __init__(self, network: nn.Module) -> None:
-        self.network = network.eval()
-
-    @torch.inference_mode()
-    def __call__(self, batch: EvalBatch) -> Tensor:
-        """Return ``T_src_tgt`` of the batch's sources, b s 4 4."""
-        motion: Tensor = self.network(batch["target"], batch["sources"])
-        return motion
 
 
 class FilePredictor:
@@ -77,40 +61,18 @@ class FilePredictor:
         values: ``disparity`` (up to scale) or ``depth``; by default disparity in an array and depth in a folder.
         match: How files of a folder find their image: ``order`` takes them by the numbers in their names, ``name``
             looks for the `file_stem` of each image's name.
-
-    Raises:
-        ConfigError: for another word.
-        DataError: if the files are missing, cannot be read, or do not fit the images.
     """
 
     def __init__(self, path: Path, names: Sequence[str] = (), values: str | None = None, match: str = "order") -> None:
-        one_of("match", match, ("order", "name"))
-        if values is not None:
-            one_of("predicted", values, ("disparity", "depth"))
-        self.path = path
-        self.values = values or ("depth" if path.is_dir() else "disparity")
-        self._array: ndarray | None = None
-        self._files: list[Path] = []
-        self._by_stem: dict[str, Path] = {}
-        if existing(path).is_dir():
-            self._files = sorted((f for f in path.iterdir() if f.suffix.lower() in SUFFIXES), key=natural_order)
-            if not self._files:
-                raise DataError(f"'{path}' holds no prediction; its files must end in {' or '.join(SUFFIXES)}")
-            if match == "name":
-                self._by_stem = {file.stem: file for file in self._files}
-                return
-        else:
-            self._array = _load_array(path)
-            if self._array.ndim == 4 and self._array.shape[1] == 1:
-                self._array = self._array[:, 0]
-            if self._array.ndim != 3:
-                raise DataError(f"'{path}' holds shape {self._array.shape}; predictions are images x height x width")
-        found = len(self._files) if self._array is None else len(self._array)
-        if found != len(names):
+        found: Sequence[Path] | ndarray = _files(path) if existing(path).is_dir() else _images(path)
+        self.path, self.values = path, values or ("depth" if path.is_dir() else "disparity")
+        self._by_stem = path.is_dir() and match == "name"
+        if not self._by_stem and len(found) != len(names):
             raise DataError(
-                f"'{path}' holds {found} predictions for {len(names)} images; give one for each, in the same order"
+                f"'{path}' holds {len(found)} predictions for {len(names)} images; give one for each, in the same order"
             )
-        self._place = {name: place for place, name in enumerate(names)}
+        keys = [file.stem for file in found] if self._by_stem else names
+        self._found: dict[str, Path | ndarray] = dict(zip(keys, found, strict=True))
 
     def __call__(self, batch: EvalBatch) -> Float[Tensor, "b 1 h w"]:
         """Return the disparity of the batch's images; they must be of one size."""
@@ -120,28 +82,23 @@ class FilePredictor:
         return torch.stack(maps)
 
     def _read(self, name: str) -> Float[Tensor, "1 h w"]:
-        if self._array is not None:
-            return self._disparity(np.array(self._array[self._index(name)], dtype=np.float32), self.path)
-        file = self._by_name(name) if self._by_stem else self._files[self._index(name)]
-        if file.suffix.lower() == ".png":
-            return self._disparity(read_depth(file), file)
-        array = np.squeeze(np.array(_load_array(file), dtype=np.float32))
-        if array.ndim != 2:
-            raise DataError(f"'{file}' holds shape {array.shape}; a prediction is height x width")
-        return self._disparity(array, file)
-
-    def _index(self, name: str) -> int:
-        if name not in self._place:
-            raise DataError(f"'{self.path}' has no prediction for image '{name}'; it belongs to another split")
-        return self._place[name]
-
-    def _by_name(self, name: str) -> Path:
-        if file_stem(name) not in self._by_stem:
+        stem = file_stem(name)
+        source = self._found.get(stem if self._by_stem else name)
+        if source is None and self._by_stem:
             raise DataError(
-                f"'{self.path}' has no file '{file_stem(name)}.npy' or '.png' for image '{name}'; "
+                f"'{self.path}' has no file '{stem}.npy' or '.png' for image '{name}'; "
                 "name the files so, or let them follow the order of the images (match=order)"
             )
-        return self._by_stem[file_stem(name)]
+        if source is None:
+            raise DataError(f"'{self.path}' has no prediction for image '{name}'; it belongs to another split")
+        if not isinstance(source, Path):
+            return self._disparity(np.array(source, dtype=np.float32), self.path)
+        if source.suffix.lower() == ".png":
+            return self._disparity(read_depth(source), source)
+        array = np.squeeze(np.array(_load_array(source), dtype=np.float32))
+        if array.ndim != 2:
+            raise DataError(f"'{source}' holds shape {array.shape}; a prediction is height x width")
+        return self._disparity(array, source)
 
     def _disparity(self, values: ndarray, path: Path) -> Float[Tensor, "1 h w"]:
         if self.values == "disparity":
@@ -160,12 +117,8 @@ class ExportingPredictor:
     """A predictor that also writes what it predicts, one 16-bit PNG per image (KITTI's format), named by `file_stem`.
 
     The folder can be scored again (``predictions=FOLDER match=name``) with the same result, up to the PNG's 1/256 m.
-
-    Args:
-        predict: The predictor.
-        folder: Where files go; made if missing.
-        protocol: Its factor, its scaling and its limits make depth of disparity. With median scaling an image needs
-            ground truth, and one that has none is not written.
+    The protocol's factor, scaling and limits make depth of disparity. With median scaling an image needs ground truth,
+    and one that has none is not written.
     """
 
     def __init__(self, predict: Predictor, folder: Path, protocol: Protocol) -> None:
@@ -173,7 +126,6 @@ class ExportingPredictor:
         self.written = self.left_out = 0
 
     def __call__(self, batch: EvalBatch) -> Float[Tensor, "b 1 h w"]:
-        """Return the disparity of the batch's images, having written their depth."""
         disparity = self.predict(batch)
         for name, image, truth in zip(batch["name"], disparity[:, 0].cpu(), truths_of(batch), strict=True):
             depth = self._depth(image, truth.cpu())
@@ -209,7 +161,6 @@ def truths_of(batch: EvalBatch) -> list[Float[Tensor, "_ _"]]:
 
 
 def existing(path: Path) -> Path:
-    """Return the path of predictions if there is something at it."""
     if not path.exists():
         raise DataError(f"no predictions at '{path}'; give a .npy array or a folder of .npy or .png files")
     return path
@@ -218,6 +169,22 @@ def existing(path: Path) -> Path:
 def file_stem(name: str) -> str:
     """Return the file name, without ending, that stands for an image: all but letters, digits, - and . become ``_``."""
     return re.sub(r"[^A-Za-z0-9.-]+", "_", name)
+
+
+def _files(folder: Path) -> list[Path]:
+    files = sorted((file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES), key=natural_order)
+    if not files:
+        raise DataError(f"'{folder}' holds no prediction; its files must end in {' or '.join(SUFFIXES)}")
+    return files
+
+
+def _images(path: Path) -> ndarray:
+    array = _load_array(path)
+    if array.ndim == 4 and array.shape[1] == 1:
+        array = array[:, 0]
+    if array.ndim != 3:
+        raise DataError(f"'{path}' holds shape {array.shape}; predictions are images x height x width")
+    return array
 
 
 def _load_array(path: Path) -> ndarray:

@@ -1,26 +1,26 @@
-"""What an evaluation found: one row for each image, predictor and protocol, their means, and the tables of both."""
+"""What an evaluation found: a row for each image, predictor and protocol, their means, and tables and files of both."""
 
 from __future__ import annotations
 
+import csv
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, astuple, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from saunet.errors import ConfigError, DataError, one_of
 from saunet.fingerprint import fingerprint
-from saunet.metrics.functional import ERROR_HEADINGS, HIGHER_IS_BETTER
+from saunet.io.atomic import write_bytes, write_json
+from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
 from saunet.metrics.protocols import Protocol
-from saunet.tables import Column, Row, Table, show
+from saunet.tables import Row, Table, columns, csv_text, show
 
-ERROR_COLUMNS: tuple[Column, ...] = tuple(
-    Column(heading.rpartition(" ")[0], ".3f", 1 if up else -1)
-    for heading, up in zip(ERROR_HEADINGS, HIGHER_IS_BETTER, strict=True)
-)
-"""Columns of the seven errors."""
+ERROR_COLUMNS = columns(*(f"{heading}|.3f" for heading in ERROR_HEADINGS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,6 @@ class ImageRow:
     predictor: str
     protocol: str
     name: str
-    """The image's name."""
     pixels: int
     """Pixels compared; 0 where the image has no ground truth, and then the numbers are NaN."""
     scale: float
@@ -60,7 +59,7 @@ class ViewRow:
     predictor: str
     protocol: str
     name: str
-    group: str
+    condition: str
     """The condition or the recording that the image belongs to."""
     warped: float
     """Photometric error after warping the neighbors by depth and motion, SAU-Net eqs. (8) to (10)."""
@@ -80,9 +79,7 @@ class Summary:
     protocol: str
     errors: tuple[float, ...]
     scale: float
-    """Mean of median(truth)/median(prediction)."""
     scale_std: float
-    """Its standard deviation over images."""
     images: int
     images_without_truth: int
 
@@ -111,20 +108,18 @@ class Spread:
     by: str
     """What was resampled: whole ``drive``s, or single ``image``s where there are too few drives."""
     groups: int
-    """How many of them there are."""
     low: tuple[float, ...]
     high: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One error of two predictors on the same images."""
+    """The means of one error of two predictors on the same images."""
 
     name: str
     """One of `saunet.metrics.functional.ERROR_NAMES`."""
     first: float
     second: float
-    """Means over the images."""
     difference: float
     """``second - first``."""
     low: float
@@ -144,36 +139,28 @@ class Comparison:
     protocol: str
     first: str
     second: str
-    """What the tables call them."""
     images: int
     level: float
-    """Of the intervals."""
     by: str
-    """What was resampled, ``drive`` or ``image``."""
     groups: int
-    """How many of them there are."""
     differences: tuple[Difference, ...]
-    """One for each of the seven errors."""
 
     def table(self, *notes: str) -> Table:
         """Return the differences as a table; bold where the interval leaves out zero."""
-        columns = (
-            Column("error"),
-            *(Column(heading, ".4f") for heading in ("first", "second")),
-            Column("difference", "+.4f"),
-            *(Column(f"{self.level:.0%} {end}".replace("%", " %"), "+.4f") for end in ("low", "high")),
-            Column("second better", ".0%"),
-            Column("p", ".2g"),
+        level = f"{self.level:.0%}".replace("%", " %")
+        headings = columns(
+            *("error", "first|.4f", "second|.4f", "difference|+.4f", f"{level} low|+.4f", f"{level} high|+.4f"),
+            *("second better|.0%", "p|.2g"),
         )
         rows = []
         for column, one in zip(ERROR_COLUMNS, self.differences, strict=True):
-            values = (one.first, one.second, one.difference, one.low, one.high, one.better, one.p_value)
             sure = one.low > 0 or one.high < 0
             good = (one.difference > 0) == (column.better > 0)
-            rows.append(Row((column.label, *values), marks={3: "good" if good else "bad"} if sure else {}))
+            cells = (column.label, *astuple(one)[1:])
+            rows.append(Row(cells, marks={3: "good" if good else "bad"} if sure else {}))
         title = f"{self.protocol}: second '{self.second}' against first '{self.first}'"
-        told = f"{self.images} images, paired; {interval_note(self)}"
-        return Table("comparison", title, columns, tuple(rows), (*notes, told))
+        told = f"{self.images} images, paired; {_interval(self)}"
+        return Table("comparison", title, headings, tuple(rows), (*notes, told))
 
 
 @dataclass(frozen=True)
@@ -221,13 +208,9 @@ class EvaluationResult:
         scored = {row.protocol for row in mine if row.pixels}
         views = tuple(row for row in self.views if row.name.startswith(start))
         known = scored | {row.protocol for row in views}
-        return EvaluationResult(
-            tuple(rules for rules in self.protocols if rules.name in known),
-            self.predictors,
-            tuple(row for row in mine if row.protocol in scored),
-            views=views,
-            settings=self.settings,
-        )
+        protocols = tuple(rules for rules in self.protocols if rules.name in known)
+        rows = tuple(row for row in mine if row.protocol in scored)
+        return EvaluationResult(protocols, self.predictors, rows, views=views, settings=self.settings)
 
     def fingerprint(self, protocol: str) -> str:
         """Return the SHA-256 of the names of the images under one protocol, those without ground truth included.
@@ -239,22 +222,27 @@ class EvaluationResult:
 
     def summaries(self) -> tuple[Summary, ...]:
         """Return one summary for each protocol and predictor that has rows, in the order they were asked for."""
-        groups: dict[tuple[str, str], list[ImageRow]] = {
-            (rules.name, predictor): [] for rules in self.protocols for predictor in self.predictors
-        }
-        for row in self.rows:
-            groups[row.protocol, row.predictor].append(row)
-        return tuple(summarize(rows) for rows in groups.values() if rows)
+        found = []
+        for rules, predictor in itertools.product(self.protocols, self.predictors):
+            rows = self.select(predictor, rules.name)
+            scored = [row for row in rows if row.pixels]
+            errors: list[float] = np.array([row.errors for row in scored] or [(math.nan,) * 7]).mean(0).tolist()
+            scales = np.array([row.scale for row in scored] or [math.nan])
+            means = (tuple(errors), float(scales.mean()), float(scales.std()))
+            if rows:
+                found.append(Summary(predictor, rules.name, *means, len(scored), len(rows) - len(scored)))
+        return tuple(found)
 
     def view_summaries(self) -> tuple[ViewSummary, ...]:
         """Return the means without ground truth by protocol, predictor and condition, ``all`` of each last."""
         found = []
         for protocol, predictor in dict.fromkeys((row.protocol, row.predictor) for row in self.views):
             mine = [row for row in self.views if (row.protocol, row.predictor) == (protocol, predictor)]
-            groups = list(dict.fromkeys(row.group for row in mine))
-            for group in [*(groups if len(groups) > 1 else []), "all"]:
-                numbers = [(r.warped, r.unwarped, r.explained, r.visible) for r in mine if group in ("all", r.group)]
-                found.append(ViewSummary(protocol, predictor, group, len(numbers), *np.mean(numbers, axis=0).tolist()))
+            conditions = list(dict.fromkeys(row.condition for row in mine))
+            for condition in [*(conditions if len(conditions) > 1 else []), "all"]:
+                rows = [row for row in mine if condition in ("all", row.condition)]
+                numbers = np.mean([(row.warped, row.unwarped, row.explained, row.visible) for row in rows], axis=0)
+                found.append(ViewSummary(protocol, predictor, condition, len(rows), *numbers.tolist()))
         return tuple(found)
 
     @property
@@ -285,15 +273,16 @@ class EvaluationResult:
                     f"the results under '{protocol.name}' come from {len(names[0])} and {len(names[1])} images that "
                     "are not the same; evaluate both on one split"
                 )
-        return EvaluationResult(
-            tuple(rules.values()),
-            tuple(dict.fromkeys((*self.predictors, *other.predictors))),
-            (*self.rows, *other.rows),
-            (*self.buckets, *other.buckets),
-            (*self.views, *other.views),
-            (*self.spreads, *other.spreads),
-            (*self.comparisons, *other.comparisons),
-            {**self.settings, **other.settings},
+        return replace(
+            self,
+            protocols=tuple(rules.values()),
+            predictors=tuple(dict.fromkeys((*self.predictors, *other.predictors))),
+            rows=(*self.rows, *other.rows),
+            buckets=(*self.buckets, *other.buckets),
+            views=(*self.views, *other.views),
+            spreads=(*self.spreads, *other.spreads),
+            comparisons=(*self.comparisons, *other.comparisons),
+            settings={**self.settings, **other.settings},
         )
 
     def tables(self, ranges: bool = False) -> list[Table]:
@@ -301,13 +290,14 @@ class EvaluationResult:
         found = []
         summaries, views = self.summaries(), self.view_summaries()
         for protocol in self.protocols:
-            mine = [summary for summary in summaries if summary.protocol == protocol.name]
-            found += [self._means(protocol, mine, ranges)] if mine else []
-            seen = [view for view in views if view.protocol == protocol.name]
-            found += [self._views(protocol, seen)] if seen else []
+            if mine := [summary for summary in summaries if summary.protocol == protocol.name]:
+                found.append(self._means(protocol, mine, ranges))
+            if seen := [view for view in views if view.protocol == protocol.name]:
+                found.append(_view_table(protocol, seen))
         for protocol in self.protocols:  # of the other predictors, the places of their errors are in the files
-            rows = [row for row in self.buckets if (row.protocol, row.predictor) == (protocol.name, self.predictors[0])]
-            found += [_bucket_table(rows)] if rows else []
+            place = (protocol.name, self.predictors[0])
+            if rows := [row for row in self.buckets if (row.protocol, row.predictor) == place]:
+                found.append(_bucket_table(rows))
         return found + [comparison.table() for comparison in self.comparisons]
 
     @property
@@ -327,67 +317,155 @@ class EvaluationResult:
             print(sentence)
 
     def _means(self, protocol: Protocol, summaries: Sequence[Summary], ranges: bool) -> Table:
-        known = {(spread.predictor, spread.protocol): spread for spread in self.spreads}
-        rows, notes = [], [_images_note(summaries[0])]
+        spreads = {(spread.predictor, spread.protocol): spread for spread in self.spreads}
+        first = summaries[0]
+        note = f"{first.images} image{'' if first.images == 1 else 's'}"
+        if first.images_without_truth:
+            note += f"; {first.images_without_truth} more without a ground-truth pixel to compare, left out"
+        rows, notes = [], [note]
         for summary in summaries:
             rows.append(Row((summary.predictor, *summary.errors, f"{summary.scale:.3g} ± {summary.scale_std:.2g}")))
-            spread = known.get((summary.predictor, summary.protocol))
-            if spread is not None:
+            if spread := spreads.get((summary.predictor, summary.protocol)):
                 ends = zip(spread.low, spread.high, strict=True)
                 cells = [f"{low:.3f} to {high:.3f}" if ranges else f"±{(high - low) / 2:.3f}" for low, high in ends]
                 rows.append(Row(("", *cells, ""), "dim"))
-                notes[1:] = [f"{'range' if ranges else '±'}: {interval_note(spread)}"]
-        columns = (Column("predictor"), *ERROR_COLUMNS, Column("scale"))
-        return Table("metrics", f"{protocol.name}: {protocol.summary}", columns, tuple(rows), tuple(notes))
-
-    def _views(self, protocol: Protocol, views: Sequence[ViewSummary]) -> Table:
-        numbers = (("warped", -1), ("unwarped", 0), ("explained", 1), ("visible", 0))
-        columns = (
-            *(Column(heading) for heading in ("predictor", "condition")),
-            *(Column(heading, ".4f", better) for heading, better in numbers),  # type: ignore[arg-type]
-            Column("images"),
-        )
-        rows = [Row((v.predictor, v.condition, v.warped, v.unwarped, v.explained, v.visible, v.images)) for v in views]
-        note = "photometric errors of neighbors, warped and as they are; fractions of pixels"
-        title = f"{protocol.name}: {protocol.summary}"
-        return Table("views", title, columns, tuple(rows), (note,), bold_best=False)
+                notes[1:] = [f"{'range' if ranges else '±'}: {_interval(spread)}"]
+        headings = (*columns("predictor"), *ERROR_COLUMNS, *columns("scale"))
+        return Table("metrics", f"{protocol.name}: {protocol.summary}", headings, tuple(rows), tuple(notes))
 
 
-def summarize(rows: Iterable[ImageRow]) -> Summary:
-    """Return the means of rows that share predictor and protocol."""
-    rows = list(rows)
-    keys = {(row.predictor, row.protocol) for row in rows}
-    if len(keys) != 1:
-        raise DataError(
-            f"{len(rows)} rows of {len(keys)} predictors and protocols; a summary needs rows of exactly one"
-        )
-    ((predictor, protocol),) = keys
-    scored = [row for row in rows if row.pixels]
-    if not scored:
-        return Summary(predictor, protocol, (math.nan,) * 7, math.nan, math.nan, 0, len(rows))
-    errors = np.array([row.errors for row in scored]).mean(0)
-    scales = np.array([row.scale for row in scored])
-    moments = float(scales.mean()), float(scales.std())
-    return Summary(predictor, protocol, tuple(errors.tolist()), *moments, len(scored), len(rows) - len(scored))
-
-
-def interval_note(of: Spread | Comparison) -> str:
+def _interval(of: Spread | Comparison) -> str:
     """Return what intervals mean, such as ``95 % bootstrap over 28 drives``."""
     note = f"{of.level:.0%} bootstrap over {of.groups} {of.by}s".replace("%", " %")
     return note if of.by == "drive" else f"{note}, which are alike: too narrow"
 
 
-def _images_note(summary: Summary) -> str:
-    """Return how many images a summary stands for, such as ``697 images``, and how many had no ground truth."""
-    note = f"{summary.images} image{'' if summary.images == 1 else 's'}"
-    if summary.images_without_truth:
-        note += f"; {summary.images_without_truth} more without a ground-truth pixel to compare, left out"
-    return note
+def _view_table(protocol: Protocol, views: Sequence[ViewSummary]) -> Table:
+    headings = columns(
+        "predictor", "condition", "warped ↓|.4f", "unwarped|.4f", "explained ↑|.4f", "visible|.4f", "images"
+    )
+    rows = [Row((v.predictor, v.condition, v.warped, v.unwarped, v.explained, v.visible, v.images)) for v in views]
+    note = "photometric errors of neighbors, warped and as they are; fractions of pixels"
+    title = f"{protocol.name}: {protocol.summary}"
+    return Table("views", title, headings, tuple(rows), (note,), bold_best=False)
 
 
 def _bucket_table(rows: Sequence[BucketRow]) -> Table:
-    """Return one predictor's errors by distance, region and edges under one protocol."""
-    columns = (Column("where"), *ERROR_COLUMNS, Column("pixels"))
+    headings = (*columns("where"), *ERROR_COLUMNS, *columns("pixels"))
     cells = tuple(Row((row.bucket, *row.errors, row.pixels), group=f"by {row.group}") for row in rows)
     title = f"{rows[0].protocol}: where the errors of '{rows[0].predictor}' are"
-    return Table("buckets", title, columns, cells, ("over pixels, not images",), bold_best=False)
+    return Table("buckets", title, headings, cells, ("over pixels, not images",), bold_best=False)
+
+
+def markdown(result: EvaluationResult) -> str:
+    """Return all tables as Markdown, intervals as ranges."""
+    return "\n\n".join([*(table.markdown() for table in result.tables(ranges=True)), *result.warnings]) + "\n"
+
+
+def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
+    """Write ``metrics.json``, ``metrics.csv``, ``metrics.md`` and ``per_image.csv``, each whole or not at all.
+
+    What else the result holds goes to ``buckets.csv``, ``views.csv`` (an image a line) and ``comparison.csv``.
+    """
+    summaries = [_summary(summary, result.spreads) for summary in result.summaries()]
+    header = [*_names(Summary), *(f"{name}_{end}" for end in ("low", "high") for name in ERROR_NAMES)]
+    texts = {
+        "per_image.csv": _csv(ImageRow, result.rows),
+        "metrics.csv": csv_text(header, ([row.get(name) for name in header] for row in summaries)),
+    }
+    if result.buckets:
+        texts["buckets.csv"] = _csv(BucketRow, result.buckets)
+    if result.views:
+        texts["views.csv"] = _csv(ViewRow, result.views)
+    if result.comparisons:
+        lines = ((c.protocol, c.first, c.second, *astuple(d)) for c in result.comparisons for d in c.differences)
+        names = ("protocol", "before", "now", "error", "mean_before", "mean_now", *_names(Difference)[3:])
+        texts["comparison.csv"] = csv_text(names, lines)
+    texts["metrics.md"] = markdown(result)
+    for name, text in texts.items():
+        write_bytes(folder / name, text.encode())
+    write_json(folder / "metrics.json", as_json(result))
+    return {name: folder / name for name in (*texts, "metrics.json")}
+
+
+def as_json(result: EvaluationResult) -> dict[str, object]:
+    """Return the summaries and the exact rules they were computed under as plain data; NaN becomes None.
+
+    ``images`` holds the `fingerprint` of each protocol's images, by which others tell whether numbers compare.
+    """
+    content: dict[str, object] = {
+        "settings": dict(result.settings),
+        "protocols": [asdict(protocol) for protocol in result.protocols],
+        "results": [_summary(summary, result.spreads) for summary in result.summaries()],
+        "images": {protocol.name: result.fingerprint(protocol.name) for protocol in result.protocols},
+    }
+    if result.spreads:
+        spread = result.spreads[0]
+        content["intervals"] = {"level": spread.level, "by": spread.by, "groups": spread.groups}
+    rest = {
+        "buckets": [_plain(row) for row in result.buckets],
+        "views": [_plain(view) for view in result.view_summaries()],
+        "comparisons": [asdict(comparison) for comparison in result.comparisons],
+        "warnings": list(result.warnings),
+    }
+    plain: dict[str, object] = without_nan(content | {key: value for key, value in rest.items() if value})
+    return plain
+
+
+def read_rows(path: Path) -> tuple[ImageRow, ...]:
+    """Read the rows of an evaluation back, for comparisons."""
+    path = path / "per_image.csv" if path.is_dir() else path
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            table = csv.DictReader(file)
+            missing = [name for name in _names(ImageRow) if name not in (table.fieldnames or ())]
+            if missing:
+                raise DataError(f"'{path}' has no column '{missing[0]}'; give a per_image.csv written by an evaluation")
+            return tuple(
+                ImageRow(
+                    *(row["predictor"], row["protocol"], row["name"], int(row["pixels"])),
+                    scale=float(row["scale"] or math.nan),
+                    errors=tuple(float(row[name] or math.nan) for name in ERROR_NAMES),
+                )
+                for row in table
+            )
+    except DataError:
+        raise
+    except OSError as error:
+        raise DataError(f"cannot read '{path}': {error.strerror}; give a per_image.csv of an evaluation") from error
+    except (ValueError, TypeError, csv.Error) as error:
+        raise DataError(f"'{path}' holds a line that is not a row of numbers ({error}); evaluate again") from error
+
+
+def without_nan(value: Any) -> Any:
+    """Return plain data with None in place of NaN, which JSON cannot hold."""
+    if isinstance(value, dict):
+        return {key: without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _names(kind: type) -> list[str]:
+    """Return the names of a row's values, each error by its own."""
+    names = (each.name for each in fields(kind))
+    return [each for name in names for each in (ERROR_NAMES if name == "errors" else (name,))]
+
+
+def _plain(row: Any) -> dict[str, Any]:
+    values = (getattr(row, each.name) for each in fields(row))
+    flat = [each for value in values for each in (value if isinstance(value, tuple) else (value,))]
+    return dict(zip(_names(type(row)), flat, strict=True))
+
+
+def _csv(kind: type, rows: Iterable[Any]) -> str:
+    return csv_text(_names(kind), (tuple(_plain(row).values()) for row in rows))
+
+
+def _summary(summary: Summary, spreads: Sequence[Spread]) -> dict[str, object]:
+    row = _plain(summary)
+    for spread in spreads:
+        if (spread.predictor, spread.protocol) == (summary.predictor, summary.protocol):
+            for end, values in (("low", spread.low), ("high", spread.high)):
+                row |= {f"{name}_{end}": value for name, value in zip(ERROR_NAMES, values, strict=True)}
+    return row

@@ -1,25 +1,150 @@
-"""Scoring predictors on batches of images: against ground truth, or by how well they explain the neighboring frames."""
+"""Scoring predictors on batches: against ground truth, also by bucket, or by how they explain neighboring frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
 
-from saunet.errors import ConfigError, DataError, one_of
-from saunet.evaluation.buckets import Buckets, BucketSums
+from saunet.errors import ConfigError, DataError, one_of, positive
 from saunet.evaluation.predictors import Motion, Predictor, truths_of
-from saunet.evaluation.result import EvaluationResult, ImageRow, ViewRow
+from saunet.evaluation.result import BucketRow, EvaluationResult, ImageRow, ViewRow
 from saunet.geometry.depth import disparity_to_depth
 from saunet.geometry.warp import synthesize
 from saunet.io.progress import bar
 from saunet.losses.functional import automask, combine_sources, photometric_error
-from saunet.metrics.protocols import GROUND_TRUTHS, Protocol, sample_errors, sample_image
+from saunet.metrics.functional import error_terms, root_terms
+from saunet.metrics.protocols import GROUND_TRUTHS, Protocol, Sample, sample_errors, sample_image
 from saunet.types import EvalBatch
 
 _NO_IMAGE = "there is no image to evaluate; check the split and the data root"
+EDGE_RATIO = 1.25
+"""Depths that differ by more than this factor make an edge, the strictest threshold of Bochkovskii et al., Depth Pro,
+2024, who compare neighboring pixels by this ratio too."""
+DENSE = 0.5
+"""Fraction of known pixels from which on a ground truth is dense enough to have depth edges between neighbors."""
+
+
+@dataclass(frozen=True)
+class Buckets:
+    """How pixels are sorted."""
+
+    distances: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0, 50.0, 80.0)
+    """Limits of the distance ranges in meters, ascending."""
+    edge_radius: int = 4
+    """Pixels of the ground truth to the left and right that are looked at for a depth edge."""
+    edge_ratio: float = EDGE_RATIO
+    """Depths that differ by more than this factor make an edge."""
+
+    def __post_init__(self) -> None:
+        positive("edge_radius", self.edge_radius)
+        if not self.edge_ratio > 1:
+            raise ConfigError(f"edge_ratio is {self.edge_ratio}; it must be greater than 1")
+        if len(self.distances) < 2 or list(self.distances) != sorted(set(self.distances)):
+            raise ConfigError(f"distances are {list(self.distances)}; give at least two limits in ascending order")
+
+    @property
+    def names(self) -> tuple[tuple[str, str], ...]:
+        """(group, bucket) of each map that `maps` returns."""
+        return (
+            *(("distance", f"{low:g}-{high:g} m") for low, high in pairwise(self.distances)),
+            *(("row", f"{name} third") for name in ("top", "middle", "bottom")),
+            *(("column", f"{name} third") for name in ("left", "center", "right")),
+            *(("edge", name) for name in ("near an edge", "elsewhere")),
+            *(("edges", f"{side} depth edges") for side in ("at", "off")),
+        )
+
+    def maps(self, truth: Float[Tensor, "h w"]) -> Bool[Tensor, "k h w"]:
+        """Return which pixels of a ground truth (0 where unknown) fall into each bucket, in the order of `names`."""
+        height, width = truth.shape
+        row = (torch.arange(height, device=truth.device) * 3 // height)[:, None].expand(height, width)
+        column = (torch.arange(width, device=truth.device) * 3 // width)[None].expand(height, width)
+        edge = near_edge(truth, self.edge_radius, self.edge_ratio)
+        distances = [(truth >= low) & (truth < high) for low, high in pairwise(self.distances)]
+        thirds = [part == third for part in (row, column) for third in range(3)]
+        edges, dense = depth_edges(truth), bool((truth > 0).float().mean() >= DENSE)
+        return torch.stack((*distances, *thirds, edge, ~edge, edges & dense, ~edges & dense))
+
+
+def near_edge(truth: Float[Tensor, "h w"], radius: int, ratio: float) -> Bool[Tensor, "h w"]:
+    """Find pixels whose measured neighbors in the same row differ in depth by more than a factor.
+
+    Only the row is looked at: along it a flat road keeps its depth, while upwards it recedes without any edge. Works
+    for dense depth and for scan lines, but takes in walls that recede fast; `depth_edges` is sharper.
+    """
+    if truth.numel() == 0:
+        return truth > 0
+    closeness = torch.where(truth > 0, 1 / truth.clamp(min=1e-6), 0.0)
+    near = _row_maximum(closeness, radius)  # inverse of the nearest depth; 0 where none is known
+    return _row_maximum(truth, radius) * near > ratio
+
+
+def depth_edges(truth: Float[Tensor, "h w"], radius: int = 2) -> Bool[Tensor, "h w"]:
+    """Find pixels at depth edges of a dense ground truth and on thin things, which lie between two edges.
+
+    Two neighbors in a row or column make an edge if their depths differ by more than `EDGE_RATIO` and neither surface
+    continues to the other. A plane's inverse depth is linear in the image, so the change from each pixel to the one
+    beyond it predicts the step between the two, and roads and walls that recede fast are no edges. Both pixels and all
+    within ``radius`` of either are returned. Unknown pixels make no edges.
+    """
+    if truth.numel() == 0:
+        return truth > 0
+    edge = _row_edges(truth) | _row_edges(truth.T).T
+    grown = max_pool2d(edge[None].float(), 2 * radius + 1, stride=1, padding=radius)
+    return grown[0] > 0
+
+
+def _row_edges(truth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Mark both pixels of each pair of neighbors in a row between which there is an edge."""
+    inverse = torch.where(truth > 0, 1 / truth.clamp(min=1e-6), torch.nan)
+    step = inverse.diff(dim=1)  # NaN beside an unknown pixel compares as False
+    first, second = inverse[:, :-1], inverse[:, 1:]
+    jump = torch.maximum(first, second) > EDGE_RATIO * torch.minimum(first, second)
+    before, after = pad(step, (1, 0))[:, :-1], pad(step, (0, 1))[:, 1:]
+    for beyond in (before, after):
+        continued = (step - beyond).abs() <= step.abs() / 2
+        jump = jump & ~continued
+    return pad(jump, (1, 0)) | pad(jump, (0, 1))
+
+
+def _row_maximum(values: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
+    """Largest of the non-negative values within ``radius`` columns, by windows that double: faster than pooling."""
+    found, window, wanted = pad(values, (radius, radius)), 1, 2 * radius + 1
+    while window < wanted:
+        step = min(window, wanted - window)
+        found = torch.maximum(found[:, :-step], found[:, step:])
+        window += step
+    return found
+
+
+class BucketSums:
+    """The errors of one predictor under one protocol, summed by bucket."""
+
+    def __init__(self, buckets: Buckets) -> None:
+        self.buckets = buckets
+        self._sums = torch.zeros(len(buckets.names), 7, dtype=torch.float64)
+        self._counts = torch.zeros(len(buckets.names), dtype=torch.float64)
+
+    def add(self, sample: Sample, maps: Bool[Tensor, "k h w"]) -> None:
+        """Add an image; ``maps`` are those of its ground truth."""
+        inside = maps[:, sample.mask].double()
+        self._sums += (inside @ error_terms(sample.prediction, sample.target).T).cpu()
+        self._counts += inside.sum(1).cpu()
+
+    def rows(self, predictor: str, protocol: str) -> tuple[BucketRow, ...]:
+        """Return the buckets that hold pixels."""
+        errors = root_terms(self._sums / self._counts[:, None]).tolist()
+        counted: list[int] = self._counts.long().tolist()
+        return tuple(
+            BucketRow(predictor, protocol, group, bucket, count, tuple(row))
+            for (group, bucket), count, row in zip(self.buckets.names, counted, errors, strict=True)
+            if count
+        )
 
 
 @torch.inference_mode()
@@ -33,26 +158,11 @@ def score(
     total: int | None = None,
     progress: bool = True,
 ) -> EvaluationResult:
-    """Score predictors on the same images.
+    """Score predictors, by the name that tables show, on the same images under protocols for their ground truth.
 
-    Only one batch is held at a time. Batches and predictions may lie on any device; numbers are computed where the
-    ground truth lies.
-
-    Args:
-        predictors: By the name that tables show.
-        batches: Images with ``depth`` and ``depth_size``; a batch in which no image has any may come without.
-        protocols: Rules to score under, all of which must accept ``ground_truth``.
-        ground_truth: What the batches' depth is, one of `GROUND_TRUTHS`.
-        buckets: Also sum the errors by these buckets of pixels.
-        total: Number of images, for the progress bar.
-        progress: Show a progress bar on a terminal or in a notebook.
-
-    Returns:
-        One row for each predictor, protocol and image, also for images without ground truth.
-
-    Raises:
-        ConfigError: if there is no predictor or protocol, two protocols share a name, or one needs other ground truth.
-        DataError: if there is no image, none has ground truth, or a prediction does not fit or is not finite.
+    Only one batch is held at a time; one in which no image has depth may come without ``depth``. Batches and
+    predictions may lie on any device; numbers are computed where the ground truth lies. Each predictor, protocol and
+    image becomes a row, also an image without ground truth.
     """
     _check_request(predictors, protocols, ground_truth)
     rows: list[ImageRow] = []
@@ -131,19 +241,8 @@ def score_views(
     """Warp the neighbors of each image into it by predicted depth and motion, and compare.
 
     A small error does not prove good depth (a flat wall is explained by any), but a model that does not beat the
-    neighbors as they are has learned nothing, and conditions that are worse than others show.
-
-    Args:
-        predictors: Depth and motion by the name that tables show; both at one scale.
-        batches: Images with neighbors.
-        protocol: One that needs no ground truth.
-        group_of: Gives the condition or the recording of an image by its name.
-        total: Number of images, for the progress bar.
-        progress: Show a progress bar on a terminal or in a notebook.
-
-    Raises:
-        ConfigError: if the protocol needs ground truth.
-        DataError: if there is no image, or a batch comes without neighbors.
+    neighbors as they are has learned nothing, and conditions that are worse than others show. ``group_of`` gives the
+    condition or the recording of an image by its name.
     """
     if protocol.ground_truth != "none":
         raise ConfigError(

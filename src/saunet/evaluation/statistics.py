@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 from scipy import stats
 
-from saunet.errors import DataError, in_range
-from saunet.evaluation.result import Comparison, Difference, EvaluationResult, ImageRow, Spread
-from saunet.metrics.functional import ERROR_NAMES, HIGHER_IS_BETTER
+from saunet.errors import ConfigError, DataError
+from saunet.evaluation.result import ERROR_COLUMNS, Comparison, Difference, EvaluationResult, ImageRow, Spread
+from saunet.metrics.functional import ERROR_NAMES
 
 FEWEST_DRIVES = 5
 """With fewer drives than this, resampling them says nothing: images are resampled, and the result says so."""
@@ -32,19 +34,16 @@ def groups_of(names: Sequence[str]) -> tuple[str, int, list[str]]:
     return ("drive", count, drives) if count >= FEWEST_DRIVES else ("image", len(names), list(names))
 
 
-def spreads(result: EvaluationResult, level: float = 0.95, seed: int = 0) -> tuple[Spread, ...]:
+def spreads(result: EvaluationResult, level: float = 0.95) -> tuple[Spread, ...]:
     """Compute intervals of all means of a result that rest on at least two images."""
     found = []
-    for protocol in result.protocols:
-        for predictor in result.predictors:
-            rows = [row for row in result.select(predictor, protocol.name) if row.pixels]
-            if len(rows) < 2:
-                continue
-            by, count, groups = groups_of([row.name for row in rows])
-            values = np.array([row.errors for row in rows], dtype=np.float64)
-            low, high = bootstrap_mean(values, groups, level=level, seed=seed)
-            spread = Spread(predictor, protocol.name, level, by, count, tuple(low.tolist()), tuple(high.tolist()))
-            found.append(spread)
+    for protocol, predictor in itertools.product(result.protocols, result.predictors):
+        values = result.errors(predictor, protocol.name)
+        if len(values) > 1:
+            rows = result.select(predictor, protocol.name)
+            by, count, groups = groups_of([row.name for row in rows if row.pixels])
+            low, high = (tuple(each.tolist()) for each in bootstrap_mean(values, groups, level=level))
+            found.append(Spread(predictor, protocol.name, level, by, count, low, high))
     return tuple(found)
 
 
@@ -56,26 +55,14 @@ def bootstrap_mean(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> tuple[Float64[ndarray, " k"], Float64[ndarray, " k"]]:
-    """Compute the bounds of a bootstrap interval of the mean of each column; NaN for fewer than two groups.
+    """Compute the bounds of a bootstrap interval of the mean of each column; NaN for fewer than two groups of rows.
 
     Whole groups are resampled: neighboring frames of a drive are alike, so resampling images makes intervals too
     narrow. Percentiles of the resampled mean of few groups are too narrow as well: they see the spread over n, not over
     n - 1 degrees of freedom, and the tails of a normal distribution, not of Student's t (Hesterberg, What Teachers
     Should Know about the Bootstrap, The American Statistician 69, 2015). So both bounds are moved away from the mean by
     sqrt(n / (n - 1)) * t / z. BCa intervals correct for neither.
-
-    Args:
-        values: One row per image.
-        groups: The group of each row.
-        level: Fraction of intervals that should contain the true mean.
-        resamples: How often to resample.
-        seed: Of the resampling.
-
-    Raises:
-        ConfigError: if the level is not in (0, 1).
-        DataError: if there is no row, or not one group for each.
     """
-    in_range("level", level, 1e-6, 1 - 1e-6)
     sums, counts = _by_group(values, groups)
     number = len(sums)
     if number < 2:
@@ -102,30 +89,44 @@ def bootstrap_mean(
     return center + wider * (found.low - center), center + wider * (found.high - center)
 
 
+def with_statistics(
+    result: EvaluationResult, level: float | None, earlier: Sequence[ImageRow] | None = None, source: str | None = None
+) -> EvaluationResult:
+    """Add bootstrap intervals of the means, and what changed since another evaluation of the same images.
+
+    The first predictors of both are compared, under each protocol that both have. Without a level there are no
+    intervals of the means, and comparisons use 0.95.
+    """
+    comparisons = []
+    if earlier is not None:
+        who = earlier[0].predictor if earlier else ""
+        names = (f"{who} of {source}", result.predictors[0])
+        for rules in result.protocols:
+            rows = [row for row in earlier if (row.predictor, row.protocol) == (who, rules.name)]
+            now = result.select(result.predictors[0], rules.name)
+            if rows and now:
+                comparisons.append(compare(rows, now, names=names, level=level or 0.95))
+        if not comparisons:
+            there = ", ".join(dict.fromkeys(row.protocol for row in earlier)) or "none"
+            raise ConfigError(
+                f"'{source}' has no protocol in common with this evaluation (its protocols: {there}); "
+                "evaluate both under the same one"
+            )
+    return replace(result, spreads=spreads(result, level) if level else (), comparisons=tuple(comparisons))
+
+
 def compare(
     first: Sequence[ImageRow],
     second: Sequence[ImageRow],
     *,
     names: tuple[str, str] = ("first", "second"),
     level: float = 0.95,
-    seed: int = 0,
 ) -> Comparison:
     """Compare two predictors image by image, paired by name.
 
     Whole drives are resampled and flipped, since frames of a drive are alike. With fewer than `FEWEST_DRIVES` drives,
     images are resampled, intervals are too narrow, and there is no p value: frames that are alike would make chance
     look like proof.
-
-    Args:
-        first: Rows of one predictor under one protocol.
-        second: Rows of the other under the same one, for the same images.
-        names: What to call them.
-        level: Of the intervals.
-        seed: Of the resampling.
-
-    Raises:
-        ConfigError: if the level is not in (0, 1).
-        DataError: if the images or protocols are not the same, a name occurs twice, or none has ground truth.
     """
     one, other = ({row.name: row for row in rows} for rows in (first, second))
     if one.keys() != other.keys() or len(one) != len(first) or len(other) != len(second):
@@ -143,18 +144,15 @@ def compare(
     )
     delta = theirs - ours
     by, count, groups = groups_of(images)
-    low, high = (bound.tolist() for bound in bootstrap_mean(delta, groups, level=level, seed=seed))
-    p_values = _sign_flip(_by_group(delta, groups)[0], seed) if by == "drive" else [None] * 7
-    better = ((np.sign(delta) * np.where(HIGHER_IS_BETTER, 1.0, -1.0) + 1) / 2).mean(0).tolist()
-    one_mean, other_mean, change = (array.mean(0).tolist() for array in (ours, theirs, delta))
-    differences = tuple(
-        Difference(name, one_mean[k], other_mean[k], change[k], low[k], high[k], better[k], p_values[k])
-        for k, name in enumerate(ERROR_NAMES)
-    )
-    return Comparison(protocols[0], *names, len(images), level, by, count, differences)
+    low, high = (bound.tolist() for bound in bootstrap_mean(delta, groups, level=level))
+    p_values = _sign_flip(_by_group(delta, groups)[0]) if by == "drive" else [None] * 7
+    better = ((np.sign(delta) * [column.better for column in ERROR_COLUMNS] + 1) / 2).mean(0).tolist()
+    means = (array.mean(0).tolist() for array in (ours, theirs, delta))
+    differences = itertools.starmap(Difference, zip(ERROR_NAMES, *means, low, high, better, p_values, strict=True))
+    return Comparison(protocols[0], *names, len(images), level, by, count, tuple(differences))
 
 
-def _sign_flip(sums: Float64[ndarray, "g k"], seed: int) -> list[float]:
+def _sign_flip(sums: Float64[ndarray, "g k"]) -> list[float]:
     """Return two-sided p values of a permutation test that exchanges the predictors' labels within each group."""
     found = stats.permutation_test(
         (sums,),
@@ -164,7 +162,7 @@ def _sign_flip(sums: Float64[ndarray, "g k"], seed: int) -> list[float]:
         n_resamples=RESAMPLES,
         batch=max(1, 4_000_000 // sums.size),
         axis=0,
-        random_state=np.random.default_rng(seed),
+        random_state=np.random.default_rng(0),
     )
     p_values: list[float] = found.pvalue.tolist()
     return p_values
@@ -173,7 +171,6 @@ def _sign_flip(sums: Float64[ndarray, "g k"], seed: int) -> list[float]:
 def _by_group(
     values: Float64[ndarray, "n k"], groups: Sequence[str]
 ) -> tuple[Float64[ndarray, "g k"], Float64[ndarray, " g"]]:
-    """Sums and counts of each group."""
     if len(values) == 0 or len(groups) != len(values):
         raise DataError(f"{len(values)} rows with {len(groups)} groups; give at least one row, and a group for each")
     labels, index = np.unique(np.array(groups), return_inverse=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,20 +17,10 @@ from saunet.data.loading.module import surroundings
 from saunet.data.loading.stored import cache_truths
 from saunet.data.loading.windows import measured_distance
 from saunet.errors import ConfigError, DataError, one_of, usable_device
-from saunet.evaluation.buckets import Buckets
-from saunet.evaluation.files import read_rows, write_results
-from saunet.evaluation.predictors import (
-    ExportingPredictor,
-    FilePredictor,
-    Motion,
-    NetworkMotion,
-    NetworkPredictor,
-    Predictor,
-    existing,
-)
-from saunet.evaluation.result import EvaluationResult, ImageRow
-from saunet.evaluation.scoring import score, score_views
-from saunet.evaluation.statistics import compare, drive_of, spreads
+from saunet.evaluation.predictors import ExportingPredictor, FilePredictor, NetworkPredictor, Predictor, existing
+from saunet.evaluation.result import EvaluationResult, read_rows, write_results
+from saunet.evaluation.scoring import Buckets, score, score_views
+from saunet.evaluation.statistics import drive_of, with_statistics
 from saunet.io.atomic import check_folder, write_json
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
 from saunet.metrics.protocols import Protocol as Rules
@@ -37,8 +28,8 @@ from saunet.metrics.protocols import protocol
 from saunet.models.depth import DepthNet
 from saunet.registry import Spec
 from saunet.runs.checkpoint import store_scale
-from saunet.runs.record import ModelRecord, Scale
-from saunet.scale import MetricDepth, MetricMotion, ScaleEstimate, estimate_scale
+from saunet.runs.record import ModelRecord
+from saunet.scale import MetricDepth, MetricMotion, estimate_scale
 from saunet.scale.options import ScaleOptions
 from saunet.scale.recorded import read_speeds
 from saunet.types import EvalBatch
@@ -65,11 +56,9 @@ class EvaluationData(Protocol):
     def protocols(self) -> Sequence[str]:
         """Names of the protocols that fit it, its own first."""
 
-    def setup(self, stage: str | None = None) -> None:
-        """Find the images of a stage's splits."""
+    def setup(self, stage: str | None = None) -> None: ...
 
-    def batches(self, split: str, device: str | torch.device) -> Iterator[EvalBatch]:
-        """Yield the batches of a split, on a device."""
+    def batches(self, split: str, device: str | torch.device) -> Iterator[EvalBatch]: ...
 
     def listed(self, split: str) -> list[str]:
         """Return the names of a split's images, in the order of its list."""
@@ -178,31 +167,23 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
     """
     earlier = read_rows(Path(options.compare)) if options.compare else None
     device = usable_device(options.device)
-    folder = Path(options.output_dir) if options.output_dir is not None else None
-    if folder is not None:
-        check_folder(folder)
+    folder = None if options.output_dir is None else check_folder(options.output_dir)
     settings: dict[str, object] = {"data": options.data.name}
-    motion: Motion | None = None
+    model, pose = None, None
     if options.checkpoint is not None:
         checkpoint = read_model(options.checkpoint)
         networks = checkpoint.networks()
         passes = _passes(options, _resized(options.data, checkpoint.record), motion=networks[1] is not None)
         _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth is of the same images
         depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device)
-        predictor = NetworkPredictor(depth, options.flip)
-        motion = NetworkMotion(pose) if pose is not None else None
-        scored: _Subject = lambda data: ("model", predictor)  # noqa: E731
+        model = NetworkPredictor(depth, options.flip)
         settings |= {"checkpoint": options.checkpoint, "scale": scale}
     else:
         passes = _passes(options, options.data.changed(batch_size=1), motion=False)  # files may differ in size
-        path = existing(Path(str(options.predictions)))
-        scored = lambda data: (  # noqa: E731
-            "predictions",
-            FilePredictor(path, data.listed(options.split), options.predicted, options.match),
-        )
+        existing(Path(str(options.predictions)))
         settings |= {"predictions": options.predictions, "match": options.match}
     settings |= {"split": options.split, "post_processing": "monodepth blend of two flips" if options.flip else None}
-    result, exported = _score_passes(options, passes, scored, motion, device)
+    result, exported = _score_passes(options, passes, model, pose, device)
     sources = tuple(options.data.get("sources") or ())
     result = replace(result, settings=settings, sources=sources, folder=folder, notes=exported)
     if folder is not None and earlier is not None:
@@ -213,37 +194,20 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
     return result
 
 
-def evaluate_network(
-    network: nn.Module, data: EvaluationData, protocols: Sequence[str] = (), *, split: str = "test"
-) -> EvaluationResult:
-    """Score a depth network, on its device, beside the trivial predictors on one split of a data module.
-
-    Args:
-        network: Takes images, b x 3 x h x w, and returns a `saunet.types.DepthPyramid`.
-        data: A data module, not necessarily set up, at the network's size.
-        protocols: Names of protocols for its ground truth; its own by default.
-        split: ``test`` or ``val``.
-
-    Raises:
-        ConfigError: if a protocol does not fit the data set's ground truth.
-        DataError: if the split has no frame with ground truth.
-    """
-    _set_up(data, split)
+def evaluate_network(network: nn.Module, data: EvaluationData) -> EvaluationResult:
+    """Score a depth network, on its device, beside the trivial predictors on test images of its size."""
+    _set_up(data, "test")
     predictors: dict[str, Predictor] = {"model": NetworkPredictor(network), **trivial(data)}
-    batches = data.batches(split, next(network.parameters()).device)
-    rules = [protocol(name) for name in protocols or _fitting(data, motion=False)]
-    return score(predictors, batches, rules, ground_truth=data.ground_truth, total=len(data.datasets[split]))
-
-
-_Subject = Callable[[EvaluationData], tuple[str, Predictor]]
-"""Gives what is scored on a data module that is set up: its name in tables, and itself."""
+    batches = data.batches("test", next(network.parameters()).device)
+    rules = [protocol(name) for name in _fitting(data, motion=False)]
+    return score(predictors, batches, rules, ground_truth=data.ground_truth, total=len(data.datasets["test"]))
 
 
 def _resized(data: Spec, record: ModelRecord) -> Spec:
     """Return the data at the size of a model, and with the neighbors that its pose network looks at."""
-    wanted = {"height": record.height, "width": record.width}
+    wanted: dict[str, object] = {"height": record.height, "width": record.width}
     if record.pose:
-        wanted["offsets"] = list(record.offsets)  # type: ignore[assignment]
+        wanted["offsets"] = list(record.offsets)
     return data.changed(**{key: value for key, value in wanted.items() if key in data.parameters})
 
 
@@ -259,11 +223,10 @@ def _fitting(data: EvaluationData, motion: bool) -> list[str]:
 
 def _passes(options: EvaluateOptions, spec: Spec, motion: bool) -> list[tuple[EvaluationData, list[Rules]]]:
     """Return the data modules to go through, not set up, one for each ground truth, with the protocols for each."""
-    first: EvaluationData | None = spec.build()
-    assert first is not None
-    own, choice = first.ground_truth, spec.parameters.get("depth")
+    spare: list[EvaluationData] = [spec.build()]
+    own, choice = spare[0].ground_truth, spec.parameters.get("depth")
     kinds = tuple(dict.fromkeys([own, *get_args(choice.annotation if choice else None)]))
-    rules = [protocol(name) for name in options.protocols or _fitting(first, motion)]
+    rules = [protocol(name) for name in options.protocols or _fitting(spare[0], motion)]
     found = []
     for kind, each in passes(rules, own).items():
         if kind not in ("none", *kinds):
@@ -276,11 +239,8 @@ def _passes(options: EvaluateOptions, spec: Spec, motion: bool) -> list[tuple[Ev
                 f"protocol '{each[0].name}' needs the motion of the camera, which only a model with a pose network "
                 "predicts; evaluate such a checkpoint, or choose a protocol with ground truth"
             )
-        # The data that were asked for their own ground truth serve the pass that wants it; others start anew.
-        data = first if kind in (own, "none") and first is not None else None
-        first = None if data is first else first
-        if data is None:
-            data = spec.build(**({} if kind in (own, "none") else {"depth": kind}))
+        truth = {} if kind in (own, "none") else {"depth": kind}
+        data = spare.pop() if spare and not truth else spec.build(**truth)
         if kind == "none":
             data.neighbors = (*data.neighbors, options.split)
         found.append((data, each))
@@ -298,32 +258,34 @@ def passes(protocols: Sequence[Rules], own: str) -> dict[str, list[Rules]]:
 def _score_passes(
     options: EvaluateOptions,
     passes: Sequence[tuple[EvaluationData, list[Rules]]],
-    scored: _Subject,
-    motion: Motion | None,
+    model: NetworkPredictor | None,
+    pose: nn.Module | None,
     device: torch.device,
 ) -> tuple[EvaluationResult, tuple[str, ...]]:
     """Go through the images once for each ground truth; return the result, and what was exported."""
-    split, joined, exporter = options.split, None, None
+    split, name, exporter = options.split, "model" if model else "predictions", None
     buckets = Buckets(tuple(options.distances)) if options.buckets else None
+    results: list[EvaluationResult] = []
     for data, rules in passes:
         _set_up(data, split)
         if options.truth_cache:
             cache_truths(data.datasets[split].drives, options.truth_cache)
-        name, predictor = scored(data)
+        predictor: Predictor = model or FilePredictor(
+            Path(str(options.predictions)), data.listed(split), options.predicted, options.match
+        )
         if options.export and exporter is None:  # in the first pass, which is of the first protocol's truth
             predictor = exporter = ExportingPredictor(predictor, Path(options.export), rules[0])
         batches, total = data.batches(split, device), len(data.datasets[split])
         if rules[0].ground_truth == "none":
-            assert motion is not None
-            pair, group_of = {name: (predictor, motion)}, _conditions(data, split)
-            found = [score_views(pair, batches, rule, group_of=group_of, total=total) for rule in rules]
+            assert pose is not None
+            pair = {name: (predictor, lambda batch: pose(batch["target"], batch["sources"]))}
+            group_of = _conditions(data, split)
+            results += [score_views(pair, batches, rule, group_of=group_of, total=total) for rule in rules]
         else:
             predictors = {name: predictor, **(trivial(data, options.truth_cache) if options.baselines else {})}
             truth = data.ground_truth
-            found = [score(predictors, batches, rules, ground_truth=truth, buckets=buckets, total=total)]
-        for result in found:
-            joined = joined.joined(result) if joined else result
-    assert joined is not None
+            results.append(score(predictors, batches, rules, ground_truth=truth, buckets=buckets, total=total))
+    joined = functools.reduce(EvaluationResult.joined, results)
     asked = [protocol(name) for name in options.protocols or [rule.name for _, rules in passes for rule in rules]]
     return replace(joined, protocols=tuple(asked)), (str(exporter),) if exporter else ()
 
@@ -331,16 +293,16 @@ def _score_passes(
 def _conditions(data: EvaluationData, split: str) -> Callable[[str], str]:
     """Return how images are grouped: by the condition that their recording names, or else by recording."""
     dataset = data.datasets[split]
-    named = {drive.name: drive.condition for drive in dataset.drives}
-    by_image = {
-        dataset.name(place): named[dataset.drives[position].name] for place, (position, _) in enumerate(dataset.windows)
+    conditions = {
+        dataset.name(place): dataset.drives[position].condition for place, (position, _) in enumerate(dataset.windows)
     }
-    return lambda image: by_image.get(image) or drive_of(image)
+    return lambda image: conditions.get(image) or drive_of(image)
 
 
 def trivial(data: EvaluationData, truth_cache: str | None = None) -> dict[str, Predictor]:
     """Return constant depth and, where the training split has depth, its mean map; say so where it has none."""
-    found, mean = {"constant depth": NetworkPredictor(ConstantDepth())}, MeanDepthMap()
+    found: dict[str, Predictor] = {"constant depth": NetworkPredictor(ConstantDepth())}
+    mean = MeanDepthMap()
     try:
         data.setup("fit")
         if truth_cache:
@@ -348,44 +310,10 @@ def trivial(data: EvaluationData, truth_cache: str | None = None) -> dict[str, P
         for depth in data.ground_truths("train"):
             mean.update(depth[None], torch.tensor([depth.shape[-2:]]))
         mean.depth_map()
+        found["mean depth map"] = NetworkPredictor(mean)
     except DataError as reason:
         print(f"the mean depth map is left out: {reason}", file=sys.stderr)
-        return dict(found)
-    return {**found, "mean depth map": NetworkPredictor(mean)}
-
-
-def with_statistics(
-    result: EvaluationResult, level: float | None, earlier: Sequence[ImageRow] | None = None, source: str | None = None
-) -> EvaluationResult:
-    """Add bootstrap intervals of the means, and what changed since another evaluation of the same images.
-
-    Args:
-        result: The evaluation.
-        level: Of the intervals, such as 0.95; None leaves them out (comparisons then use 0.95).
-        earlier: Rows of the other evaluation, whose first predictor is compared with the first one here, under each
-            protocol that both have.
-        source: Where the earlier rows come from.
-
-    Raises:
-        ConfigError: if the level is not between 0 and 1, or the evaluations share no protocol.
-        DataError: if the earlier evaluation is of other images.
-    """
-    comparisons = []
-    if earlier is not None:
-        who = earlier[0].predictor if earlier else ""
-        for rules in result.protocols:
-            rows = [row for row in earlier if (row.predictor, row.protocol) == (who, rules.name)]
-            now = result.select(result.predictors[0], rules.name)
-            if rows and now:
-                names = (f"{who} of {source}", result.predictors[0])
-                comparisons.append(compare(rows, now, names=names, level=level or 0.95))
-        if not comparisons:
-            there = ", ".join(dict.fromkeys(row.protocol for row in earlier)) or "none"
-            raise ConfigError(
-                f"'{source}' has no protocol in common with this evaluation (its protocols: {there}); "
-                "evaluate both under the same one"
-            )
-    return replace(result, spreads=spreads(result, level) if level else (), comparisons=tuple(comparisons))
+    return found
 
 
 def _scaled(
@@ -399,7 +327,6 @@ def _scaled(
     depth, pose = networks[0].to(device).eval(), None if networks[1] is None else networks[1].to(device).eval()
     method, scale, report = options.scale.method, record.scale, dict[str, object]()
     if options.scale.measures:
-        height = options.scale.camera_height
         batches = surroundings(
             data,
             options.split,
@@ -409,27 +336,22 @@ def _scaled(
             odometer=_odometer(options, data) if method == "speed" else None,
             most=options.scale.frames,
         )
-        height = data.camera_height if height is None else height
+        height = data.camera_height if options.scale.camera_height is None else options.scale.camera_height
         estimate = estimate_scale(method, batches, lambda image: depth(image).depth[0], pose, height)
-        report = {key: value for key, value in estimate.as_json().items() if key != "per_frame"}  # scale.json has it
-        scale = _kept(options, estimate)
+        print(estimate)
+        measured = estimate.as_json()
+        report = {key: value for key, value in measured.items() if key != "per_frame"}  # scale.json has it
+        if options.output_dir is not None:
+            write_json(Path(options.output_dir) / "scale.json", measured)
+        scale = estimate.scale()
+        if options.scale.store:
+            store_scale(str(options.checkpoint), scale)
+            print(f"stored in {options.checkpoint}")
     scale = options.scale.chosen(scale)
     if scale is None:
         return depth, pose, {"method": method, "factor": None}
     report = {"method": method, **(report or {"source": scale.source, "factor": scale.factor})}
     return MetricDepth(depth, scale), None if pose is None else MetricMotion(pose, scale), report
-
-
-def _kept(options: EvaluateOptions, estimate: ScaleEstimate) -> Scale:
-    """Print a measured scale, write it to the results and, if that is wanted, into the checkpoint."""
-    print(estimate)
-    if options.output_dir is not None:
-        write_json(Path(options.output_dir) / "scale.json", estimate.as_json())
-    scale = estimate.scale()
-    if options.scale.store:
-        store_scale(str(options.checkpoint), scale)
-        print(f"stored in {options.checkpoint}")
-    return scale
 
 
 def _odometer(options: EvaluateOptions, data: EvaluationData) -> Callable[[Drive, int, int], float]:

@@ -65,8 +65,8 @@ def replacing(path: str | Path, error: type[SaunetError] = DataError) -> Iterato
             temporary.unlink(missing_ok=True)
 
 
-def check_folder(folder: str | Path, error: type[SaunetError] = DataError) -> None:
-    """Check that files can be written to a folder, which need not exist, before anything long is started."""
+def check_folder(folder: str | Path, error: type[SaunetError] = DataError) -> Path:
+    """Return a folder, which need not exist, once it is sure that files can be written to it."""
     place = Path(folder).absolute()
     while not os.path.lexists(place):
         place = place.parent
@@ -74,6 +74,7 @@ def check_folder(folder: str | Path, error: type[SaunetError] = DataError) -> No
         raise error(f"cannot write to {folder}: {place} is not a folder; choose another one")
     if not os.access(place, os.W_OK | os.X_OK):
         raise error(f"cannot write to {folder}: no right to write to {place}; change the rights, or choose another one")
+    return Path(folder)
 
 
 def write_bytes(path: str | Path, data: bytes, error: type[SaunetError] = DataError) -> None:

@@ -11,37 +11,22 @@ from saunet.errors import DataError, positive
 
 
 class ConstantDepth(nn.Module):
-    """The same depth everywhere; under median scaling, the best that no information gives.
-
-    Args:
-        depth: Meters.
-
-    Raises:
-        ConfigError: if the depth is not positive.
-    """
+    """The same depth in meters everywhere; under median scaling, the best that no information gives."""
 
     def __init__(self, depth: float = 10.0) -> None:
         super().__init__()
         self.depth = positive("depth", depth)
 
     def forward(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return the disparity (1/meter) for images, at their size."""
         return image.new_full((image.shape[0], 1, *image.shape[-2:]), 1 / self.depth, dtype=torch.float32)
 
 
 class MeanDepthMap(nn.Module):
     """The mean depth of the training ground truth at each place of the image: "the road is below, the sky above".
 
-    Ground truths of any size are collected on one grid that covers the image. Cells that no measurement ever hit take
-    the mean of their row, rows without any take the nearest row that has one.
-
-    Args:
-        height: Rows of the grid; sparse ground truth wants a coarse one.
-        width: Columns of the grid.
-        max_depth: Measurements at or beyond this many meters are left out, as the protocols do.
-
-    Raises:
-        ConfigError: if a size or the limit is not positive.
+    Ground truths of any size are collected on one grid that covers the image, a coarse one since they may be sparse.
+    Cells that no measurement ever hit take the mean of their row, rows without any take the nearest row that has one.
+    Measurements at or beyond ``max_depth`` meters are left out, as the protocols do.
     """
 
     depth_sum: Tensor
@@ -56,12 +41,7 @@ class MeanDepthMap(nn.Module):
 
     @torch.no_grad()
     def update(self, depth: Float[Tensor, "b 1 hg wg"], depth_size: Int[Tensor, "b 2"]) -> None:
-        """Add the ground truths of a batch.
-
-        Args:
-            depth: Meters, 0 where unknown, padded to a common size.
-            depth_size: Native (height, width) of each inside the padding; (0, 0) for an image without any.
-        """
+        """Add the ground truths of a batch, as in `saunet.types.EvalBatch`."""
         height, width = self.depth_sum.shape
         depth = depth.to(self.depth_sum)
         for padded, (rows, columns) in zip(depth[:, 0], depth_size.tolist(), strict=True):
@@ -88,7 +68,6 @@ class MeanDepthMap(nn.Module):
         return torch.where(seen, mean, row_mean[:, None]).float()
 
     def forward(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return the disparity (1/meter) for images, at their size."""
         disparity = 1 / self.depth_map()[None, None].to(image.device)
         size = (image.shape[-2], image.shape[-1])
         resized = interpolate(disparity, size=size, mode="bilinear", align_corners=False)

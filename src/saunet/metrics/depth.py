@@ -51,10 +51,7 @@ class DepthMetrics(Metric):
             self.add_state(name, torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
 
     def update(
-        self,
-        disparity: Float[Tensor, "b 1 h w"],
-        depth: Float[Tensor, "b 1 hg wg"],
-        depth_size: Int[Tensor, "b 2"],
+        self, disparity: Float[Tensor, "b 1 h w"], depth: Float[Tensor, "b 1 hg wg"], depth_size: Int[Tensor, "b 2"]
     ) -> None:
         """Add the images of a batch.
 
@@ -87,9 +84,8 @@ class DepthMetrics(Metric):
         errors = self.error_sum / count
         scale = self.ratio_sum / count
         variance = self.ratio_square_sum / count - scale.square()
-        values = dict(zip(ERROR_NAMES, errors.unbind(), strict=True))
         return {
-            **values,
+            **dict(zip(ERROR_NAMES, errors.unbind(), strict=True)),
             "scale": scale,
             "scale_std": variance.clamp(min=0).sqrt(),
             "images": count,

@@ -11,26 +11,19 @@ ABS_REL, SQ_REL, RMSE, RMSE_LOG, A1, A2, A3 = range(7)
 ERROR_NAMES: tuple[str, ...] = ("abs_rel", "sq_rel", "rmse", "rmse_log", "a1", "a2", "a3")
 """The seven depth errors in the field's column order."""
 ERROR_HEADINGS: tuple[str, ...] = ("Abs Rel ↓", "Sq Rel ↓", "RMSE ↓", "RMSE log ↓", "δ1 ↑", "δ2 ↑", "δ3 ↑")
-"""Column headings of `ERROR_NAMES`; the arrow points to better."""
-HIGHER_IS_BETTER: tuple[bool, ...] = (False, False, False, False, True, True, True)
-"""Which of `ERROR_NAMES` grow with quality."""
-RISING: tuple[str, ...] = tuple(name for name, up in zip(ERROR_NAMES, HIGHER_IS_BETTER, strict=True) if up)
-"""The names of those that do."""
+RISING: tuple[str, ...] = ERROR_NAMES[A1:]
+"""The errors that grow with quality."""
 
 _GARG_ROWS = (0.40810811, 0.99189189)
 _GARG_COLUMNS = (0.03594771, 0.96405229)
 
 
 def error_terms(prediction: Float[Tensor, " *shape"], target: Float[Tensor, " *shape"]) -> Float[Tensor, "k=7 *shape"]:
-    """Compute what each pixel adds to the seven Eigen errors, SAU-Net eqs. (15)-(19), float64.
+    """Compute what each pixel's depth in meters adds to the seven Eigen errors, SAU-Net eqs. (15)-(19), float64.
 
     The standard definitions, for the equations are misprinted: with ``d`` the prediction and ``D*`` the truth, mean
     |d-D*|/D*; mean (d-D*)²/D*; root of mean (d-D*)²; root of mean (ln d - ln D*)²; and the fraction of pixels with
     max(d/D*, D*/d) below 1.25, 1.25², 1.25³. RMSE and RMSE log are still squared here (see `root_terms`).
-
-    Args:
-        prediction: Depth in meters, positive.
-        target: True depth in meters, positive.
     """
     d, truth = prediction.double(), target.double()
     quotient, off = d / truth, (d - truth).abs()
@@ -77,17 +70,10 @@ def garg_crop(height: int, width: int) -> tuple[int, int, int, int]:
 def flip_blend(
     disparity: Float[Tensor, "b 1 h w"], disparity_of_flipped: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """Blend the disparity of an image with that of its mirror image (Monodepth's post-processing).
+    """Blend the disparity of an image with that of its mirror image, still mirrored (Monodepth's post-processing).
 
     The left 5 % takes the mirrored prediction alone and the right 5 % the direct one (where each saw more context), the
     middle their average, with linear ramps between.
-
-    Args:
-        disparity: Prediction for the image.
-        disparity_of_flipped: Prediction for the mirrored image, still mirrored.
-
-    Returns:
-        The blended disparity, at the dtype of ``disparity``.
     """
     width = disparity.shape[-1]
     other = disparity_of_flipped.flip(-1)

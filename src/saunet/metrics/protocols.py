@@ -15,41 +15,27 @@ from saunet.errors import ConfigError, one_of, positive
 from saunet.metrics.functional import error_terms, garg_crop, median, root_terms
 
 GROUND_TRUTHS: tuple[str, ...] = ("lidar_x", "camera_z", "improved", "exact", "none")
-"""The LiDAR's own forward coordinate; the camera's z of the same points; KITTI's accumulated maps; a renderer's; none.
-
-Without depth, predictions are scored by how well they explain the neighboring frames (`saunet.evaluation.views`)."""
+"""The LiDAR's own forward coordinate; the camera's z of the same points; KITTI's accumulated maps; a renderer's; none,
+where predictions are scored by how well they explain the neighboring frames."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """Everything that decides what an error means: ground truth, pixels, scale and limits.
-
-    The prediction's disparity is always resized to the ground truth's native size before it becomes depth.
-
-    Args:
-        name: The name that results carry.
-        summary: One line for tables and help.
-        ground_truth: Which depth it compares with, one of `GROUND_TRUTHS`.
-        min_depth: Lower limit of the prediction in meters, applied after scaling.
-        max_depth: Upper limit of the prediction in meters.
-        capped: Only ground truth strictly between the limits counts; otherwise all of it above zero.
-        crop: ``garg`` keeps the part of the image where the LiDAR reaches; ``none`` keeps all.
-        scaling: ``median`` scales each image by median(truth)/median(prediction); ``none`` takes meters as predicted.
-        factor: Fixed factor on the predicted depth, before any median scaling (5.4 for stereo-trained Monodepth2).
-
-    Raises:
-        ConfigError: for a word that is not allowed or limits that contradict each other.
-    """
+    """Everything that decides what an error means: ground truth, pixels, scale and limits."""
 
     name: str
     summary: str = ""
     ground_truth: Literal["lidar_x", "camera_z", "improved", "exact", "none"] = "camera_z"
     min_depth: float = 1e-3
+    """Limits of the prediction in meters, applied after scaling."""
     max_depth: float = 80.0
     capped: bool = True
+    """Only ground truth strictly between the limits counts; otherwise all of it above zero."""
     crop: Literal["garg", "none"] = "garg"
     scaling: Literal["median", "none"] = "median"
+    """``median`` scales each image by median(truth)/median(prediction); ``none`` takes meters as predicted."""
     factor: float = 1.0
+    """On the predicted depth, before any median scaling (5.4 for stereo-trained Monodepth2)."""
 
     def __post_init__(self) -> None:
         one_of("ground_truth", self.ground_truth, GROUND_TRUTHS)
@@ -61,11 +47,10 @@ class Protocol:
             raise ConfigError(f"max_depth is {self.max_depth}; it must be greater than min_depth {self.min_depth}")
 
     def accepts(self, ground_truth: str) -> bool:
-        """Tell whether this protocol can be computed on that kind of depth (a renderer's depth is a camera z)."""
+        """Return whether this can be computed on that kind of depth (a renderer's depth is a camera z)."""
         return ground_truth == self.ground_truth or (self.ground_truth == "camera_z" and ground_truth == "exact")
 
     def mask(self, ground_truth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-        """Return the pixels of a ground truth that count."""
         low, high = (self.min_depth, self.max_depth) if self.capped else (0.0, math.inf)
         mask = (ground_truth > low) & (ground_truth < high)
         if self.crop == "garg":
@@ -76,7 +61,7 @@ class Protocol:
         return mask
 
 
-_PROTOCOLS = (
+_NAMED = (
     Protocol("eigen_lidar_x", "the field's classic numbers: depth is the LiDAR's own x, Garg crop", "lidar_x"),
     Protocol("eigen_camera_z", "the same points with depth as the camera sees it (z), Garg crop", "camera_z"),
     Protocol(
@@ -92,12 +77,10 @@ _PROTOCOLS = (
         scaling="none",
     ),
 )
-PROTOCOLS: dict[str, Protocol] = {protocol.name: protocol for protocol in _PROTOCOLS}
-"""The named protocols, each with its one-line summary."""
+PROTOCOLS: dict[str, Protocol] = {protocol.name: protocol for protocol in _NAMED}
 
 
 def protocol(name: str) -> Protocol:
-    """Return a named protocol."""
     return PROTOCOLS[one_of("protocol", name, PROTOCOLS)]
 
 
@@ -106,9 +89,9 @@ class Sample:
     """The pixels of one image that a protocol compares, scaled and clamped."""
 
     prediction: Float[Tensor, " n"]
-    """Predicted depth in meters, float64."""
+    """Meters, float64."""
     target: Float[Tensor, " n"]
-    """True depth in meters, float64."""
+    """Meters, float64."""
     mask: Bool[Tensor, "h w"]
     """Where they lie in the ground truth, row by row: ``some_map[mask]`` follows the same order."""
     ratio: Float[Tensor, ""]
@@ -117,26 +100,20 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class ImageErrors:
-    """What a protocol says about one image."""
+    """What a protocol says about one image; NaN with no pixels."""
 
     errors: Float[Tensor, "7"]
-    """As in `saunet.metrics.functional.ERROR_NAMES`, float64; NaN with no pixels."""
+    """As in `saunet.metrics.functional.ERROR_NAMES`, float64."""
     ratio: Float[Tensor, ""]
-    """median(truth)/median(prediction), whether or not it was applied; NaN with no pixels."""
+    """As in `Sample`."""
     pixels: int
-    """Number of pixels compared."""
 
 
 def sample_image(disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "hg wg"], protocol: Protocol) -> Sample:
     """Bring a prediction to the pixels that a protocol compares.
 
-    Args:
-        disparity: Inverse depth at any size; resized bilinearly with half-pixel centers; 0 and below is far away.
-        ground_truth: Depth in meters at its native size, 0 where unknown; 0 x 0 for an image without any.
-        protocol: The rules.
-
-    Returns:
-        Prediction and truth, pixel by pixel.
+    Disparity of any size is resized to the native size of the ground truth, and becomes depth then; 0 and below is far
+    away. Ground truth is depth in meters, 0 where unknown; 0 x 0 for an image without any.
     """
     mask = protocol.mask(ground_truth)
     target = ground_truth[mask].double()
@@ -151,12 +128,7 @@ def sample_image(disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "h
 
 
 def resize_disparity(disparity: Float[Tensor, "h w"], size: tuple[int, int]) -> Float[Tensor, "_ _"]:
-    """Resize a disparity map bilinearly with half-pixel centers, in single precision or better, and keep it positive.
-
-    Args:
-        disparity: Inverse depth.
-        size: (height, width).
-    """
+    """Resize bilinearly with half-pixel centers, in single precision or better, and keep disparity positive."""
     single = disparity.to(torch.promote_types(disparity.dtype, torch.float32))[None, None]
     # The floor lies far below any real disparity (a billion meters): it keeps medians and products finite.
     return interpolate(single, size=size, mode="bilinear", align_corners=False)[0, 0].clamp(min=1e-9)
@@ -165,11 +137,9 @@ def resize_disparity(disparity: Float[Tensor, "h w"], size: tuple[int, int]) -> 
 def evaluate_image(
     disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "hg wg"], protocol: Protocol
 ) -> ImageErrors:
-    """Compute the seven errors of one image under a protocol; arguments as in `sample_image`."""
     return sample_errors(sample_image(disparity, ground_truth, protocol))
 
 
 def sample_errors(sample: Sample) -> ImageErrors:
-    """Compute the seven errors over the pixels of a sample."""
     errors = root_terms(error_terms(sample.prediction, sample.target).mean(-1))
     return ImageErrors(errors, sample.ratio, sample.target.numel())
