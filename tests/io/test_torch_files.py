@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from saunet.errors import CheckpointError
-from saunet.io.torch_files import read_plain
+from saunet.io.plain import read_torch
 
 
 def legacy() -> bytes:
@@ -30,7 +30,7 @@ def with_another_storage() -> bytes:
 
 def test_plain_content_comes_back(tmp_path: Path) -> None:
     (tmp_path / "x.pt").write_bytes(legacy())
-    assert torch.equal(read_plain(tmp_path / "x.pt", "a checkpoint")["a"], torch.zeros(3))
+    assert torch.equal(read_torch(tmp_path / "x.pt", "a checkpoint")["a"], torch.zeros(3))
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_broken_files_end_in_one_sentence(data: bytes, tmp_path: Path) -> None:
     with pytest.raises(
         CheckpointError, match=r"x\.pt is (not a checkpoint, or is damaged|damaged or truncated)"
     ) as error:
-        read_plain(tmp_path / "x.pt", "a checkpoint")
+        read_torch(tmp_path / "x.pt", "a checkpoint")
     assert "\n" not in str(error.value)
     assert error.value.__cause__ is not None
 
@@ -64,7 +64,7 @@ def test_a_broken_archive_at_every_byte(tmp_path: Path) -> None:
     for place in range(len(data)):
         (tmp_path / "x.pt").write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
         with contextlib.suppress(CheckpointError):
-            read_plain(tmp_path / "x.pt", "a checkpoint")
+            read_torch(tmp_path / "x.pt", "a checkpoint")
 
 
 @pytest.mark.parametrize("kind", [MemoryError, KeyboardInterrupt])
@@ -76,4 +76,4 @@ def test_what_is_not_the_files_fault_is_not_hidden(
 
     monkeypatch.setattr(torch, "load", fail)
     with pytest.raises(kind):
-        read_plain(tmp_path / "x.pt", "a checkpoint")
+        read_torch(tmp_path / "x.pt", "a checkpoint")

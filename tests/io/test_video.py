@@ -65,13 +65,6 @@ def test_every_frame_of_every_container(tmp_path: Path, name: str, options: dict
     assert apart(frames[7].image, numbered(7)) < 14  # blocks of MPEG-2 and WMV; exact colors are another test's
     assert len(list(reader)) == 20  # again from the start
     assert Path(name).suffix.lower() in module.VIDEO_SUFFIXES
-    for at in (0.0, 0.52, 0.95, 0.2):
-        began, image = reader.at(at)
-        assert number_of(image) == int(at * 20 + 1e-6)
-        assert began == pytest.approx(number_of(image) / 20, abs=1e-3)
-    for wrong in (-1.0, 9.0):
-        with pytest.raises(DataError, match=f"no frame at {wrong:g} s"):
-            reader.at(wrong)
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
@@ -102,8 +95,6 @@ def test_bare_streams_have_no_times_of_their_own(tmp_path: Path) -> None:
     assert (reader.fps, reader.declared) == (None, None)
     assert [(number_of(f.image), f.time) for f in reader.frames()] == [(i, None) for i in range(12)]
     assert [f.time for f in VideoReader(path, rate=20).frames()] == pytest.approx(np.arange(12) / 20)
-    with pytest.raises(DataError, match="bare stream without times"):
-        reader.at(0.1)
     said = VideoReader(write_video(tmp_path / "a.h264", 12, form="h264"))  # x264 writes the rate
     assert said.fps == 20
     assert [number_of(image) for image in said] == list(range(12))

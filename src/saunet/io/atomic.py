@@ -10,6 +10,8 @@ import platform
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import TracebackType
+from typing import TypeVar
 
 from saunet.errors import DataError, SaunetError
 
@@ -44,7 +46,6 @@ def replacing(path: str | Path, error: type[SaunetError] = DataError) -> Iterato
 
     The temporary name keeps the suffix, for writers that choose a format by it. Missing parent folders are made. Nobody
     ever reads half a file, even after Ctrl-C, a full disk or a power cut (data reach the disk before the name does).
-
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem[:100]}.{_HOST}.{os.getpid()}.partial{path.suffix}")
@@ -63,6 +64,26 @@ def replacing(path: str | Path, error: type[SaunetError] = DataError) -> Iterato
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+S = TypeVar("S", bound="Session")
+
+
+class Session:
+    """An object with a ``with`` block, which runs at the ``yield`` of its `session`: where files are completed."""
+
+    def session(self) -> Iterator[None]:
+        yield
+
+    def __enter__(self: S) -> S:
+        self._block = contextlib.contextmanager(self.session)()
+        self._block.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._block.__exit__(kind, error, trace)
 
 
 def check_folder(folder: str | Path, error: type[SaunetError] = DataError) -> Path:

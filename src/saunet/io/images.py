@@ -1,12 +1,9 @@
-"""Images from and to disk, for training and prediction alike.
-
-Whatever a camera or a user hands over becomes RGB bytes, a broken file is named and never passed on, and files are
-written whole. There is one reader and one resize, so that a model sees in use what it saw in training.
-"""
+"""The one reader, writer and resize of images, so that a model sees in use what it saw in training."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import re
 from collections.abc import Sequence
@@ -25,19 +22,17 @@ from saunet.io.atomic import write_bytes
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 """File name endings that are taken for images when a folder is read."""
 
-
 _NUMBER = re.compile(r"(\d{9,}\.\d+|\d+)", re.ASCII)
 """A number in a name; with decimals only where they are those of a time, in seconds since 1970."""
 
 
 def natural_order(name: str | Path) -> tuple[list[tuple[int, int | Fraction, str]], str]:
     """Return the key that sorts names of files by the numbers in them: ``frame_2`` before ``frame_10``."""
-    text = str(name)
     parts: list[tuple[int, int | Fraction, str]] = [
         (0, Fraction(part) if "." in part else int(part), "") if index % 2 else (1, 0, part)
-        for index, part in enumerate(_NUMBER.split(text))
+        for index, part in enumerate(_NUMBER.split(str(name)))
     ]
-    return parts, text  # frame_1 and frame_01 are equal as numbers
+    return parts, str(name)  # frame_1 and frame_01 are equal as numbers
 
 
 def name_times(names: Sequence[str]) -> list[float] | None:
@@ -88,10 +83,11 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
 
     Gray images get three equal channels, 16-bit ones are scaled by the bits that the images of their folder use (16, 12
     or 10), so that white stays white, transparency is dropped, and the camera's EXIF rotation is applied.
-
     """
     image = _decode(path, _COLOR)
-    bits = 8 if image.dtype == np.uint8 else max(_folder_bits(Path(path)), _bits(image))
+    bits = 8
+    if image.dtype != np.uint8:
+        bits = max(_folder_bits(Path(path).resolve().parent, Path(path).suffix.lower()), _bits(image))
     return as_rgb_bytes(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), str(path), bits)
 
 
@@ -136,7 +132,6 @@ def as_rgb_bytes(
 
 _COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
 _SAMPLED = 8  # images of a folder that are looked at for the bits in use
-_known_bits: dict[Path, int] = {}
 
 
 def _bits(image: NDArray[Any]) -> int:
@@ -145,30 +140,27 @@ def _bits(image: NDArray[Any]) -> int:
     return 10 if 0 < brightest < 2**10 else 12 if 0 < brightest < 2**12 else 16
 
 
-def _folder_bits(path: Path) -> int:
+@functools.cache
+def _folder_bits(folder: Path, suffix: str) -> int:
     """Return the bits that a folder's 16-bit images use, by some of them, so that all are scaled alike; say it once."""
-    folder = path.resolve().parent
-    if folder not in _known_bits:
-        beside = sorted((p for p in folder.iterdir() if p.suffix.lower() == path.suffix.lower()), key=natural_order)
-        found = [10]
-        for index in np.unique(np.linspace(0, len(beside) - 1, _SAMPLED).astype(int)):
-            with contextlib.suppress(DataError):
-                image = _decode(beside[index], _COLOR)
-                found += [_bits(image)] if image.dtype == np.uint16 else []
-        _known_bits[folder] = bits = max(found)
-        if bits < 16:
-            logging.getLogger(__name__).warning(
-                "%s: 16-bit images that use %d bits, as sensors of %d bits have them; %d is white in them",
-                folder, bits, bits, 2**bits - 1,
-            )  # fmt: skip
-    return _known_bits[folder]
+    beside = sorted((path for path in folder.iterdir() if path.suffix.lower() == suffix), key=natural_order)
+    bits = 10
+    for index in np.unique(np.linspace(0, len(beside) - 1, _SAMPLED).astype(int)):
+        with contextlib.suppress(DataError):
+            image = _decode(beside[index], _COLOR)
+            bits = max(bits, _bits(image)) if image.dtype == np.uint16 else bits
+    if bits < 16:
+        logging.getLogger(__name__).warning(
+            "%s: 16-bit images that use %d bits, as sensors of %d bits have them; %d is white in them",
+            folder, bits, bits, 2**bits - 1,
+        )  # fmt: skip
+    return bits
 
 
 def resize(array: NDArray[Any], height: int, width: int) -> NDArray[Any]:
     """Resize h x w or h x w x c, averaging areas when it shrinks and interpolating linearly when it grows.
 
     Pixel u moves to (u + 0.5) * s - 0.5. An array that has the size already is returned itself.
-
     """
     if array.shape[:2] == (height, width):
         return array

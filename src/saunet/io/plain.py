@@ -1,8 +1,7 @@
-"""Plain data from files that anyone may have written: JSON, YAML and NumPy arrays, with limits set beforehand.
+"""Plain data from files that anyone may have written, with limits set beforehand; nothing in a file is ever run.
 
 Whatever is wrong with the content ends in one sentence: size, depth, repeated keys, numbers without end, aliases that
 grow exponentially, damaged headers. What the system refuses (no such file, no rights) is an `OSError` as always.
-Nothing in a file is ever run.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ import ast
 import io
 import json
 import math
+import pickle
 import struct
 import tokenize
 import zipfile
@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from saunet.errors import SaunetError, UnreadableError
+from saunet.errors import CheckpointError, SaunetError, UnreadableError
 
 JSON_BYTES = 256 << 20
 """Largest JSON file; a manifest of a million frames has 10 MB."""
@@ -40,12 +40,11 @@ ALIASES = 16
 _EXCERPT = 160
 
 
-class _LimitError(ValueError):
-    """What a limit was exceeded by."""
+class _LimitError(ValueError): ...
 
 
 def read_bytes(path: str | Path, most: int = JSON_BYTES, error: type[SaunetError] = UnreadableError) -> bytes:
-    """Return a file's content if it has at most so many bytes, as a sentence of class ``error`` else."""
+    """Return a file's content if it has at most so many bytes."""
     with Path(path).open("rb") as stream:
         data = stream.read(most + 1)
     if len(data) > most:
@@ -54,7 +53,7 @@ def read_bytes(path: str | Path, most: int = JSON_BYTES, error: type[SaunetError
 
 
 def read_text(path: str | Path, most: int = JSON_BYTES, error: type[SaunetError] = UnreadableError) -> str:
-    """Return a file's text (UTF-8) if it has at most so many bytes, as a sentence of class ``error`` else."""
+    """Return a file's text (UTF-8) if it has at most so many bytes."""
     try:
         return read_bytes(path, most, error).decode("utf-8-sig")
     except UnicodeDecodeError as reason:
@@ -62,7 +61,7 @@ def read_text(path: str | Path, most: int = JSON_BYTES, error: type[SaunetError]
 
 
 def read_json(path: str | Path, error: type[SaunetError] = UnreadableError) -> Any:
-    """Return what a JSON file holds, as a sentence of class ``error`` if it cannot be read."""
+    """Return what a JSON file holds; what cannot be read is a sentence of class ``error``, here and in the others."""
     return parse_json(read_text(path, error=error), str(path), error)
 
 
@@ -81,7 +80,6 @@ def parse_json(text: str | bytes, source: str, error: type[SaunetError] = Unread
 
 
 def read_yaml(path: str | Path, error: type[SaunetError] = UnreadableError) -> Any:
-    """Return what a YAML file holds, as a sentence of class ``error`` if it cannot be read."""
     return parse_yaml(read_text(path, YAML_BYTES, error), str(path), error)
 
 
@@ -99,10 +97,7 @@ def parse_yaml(text: str, source: str, error: type[SaunetError] = UnreadableErro
 
 
 def read_array(path: str | Path, *, mapped: bool = False, error: type[SaunetError] = UnreadableError) -> NDArray[Any]:
-    """Return the numbers in a ``.npy`` file, of any shape, as a sentence of class ``error`` if it cannot be read.
-
-    With ``mapped`` the array stays in the file until it is looked at.
-    """
+    """Return the numbers in a ``.npy`` file, of any shape; ``mapped``, they stay in it until they are looked at."""
     path = Path(path)
     try:
         with path.open("rb") as stream:
@@ -116,7 +111,7 @@ def read_array(path: str | Path, *, mapped: bool = False, error: type[SaunetErro
 def read_arrays(
     path: str | Path | io.BufferedIOBase, error: type[SaunetError] = UnreadableError
 ) -> dict[str, NDArray[Any]]:
-    """Return the arrays in a ``.npz`` file by name, as a sentence of class ``error`` if it cannot be read."""
+    """Return the arrays in a ``.npz`` file by name."""
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(each.file_size for each in archive.infolist()) > ARRAY_BYTES:
@@ -129,6 +124,27 @@ def read_arrays(
             return found
     except (*_DAMAGED, zipfile.BadZipFile, zlib.error, RuntimeError) as reason:  # RuntimeError: a password
         raise error(f"{path} cannot be read as a .npz file of numbers ({_excerpt(reason)})") from reason
+
+
+def read_torch(path: Path, what: str) -> Any:
+    """Return what ``torch.save`` wrote, on the CPU: plain containers, numbers, text and tensors."""
+    import torch
+
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
+    except pickle.UnpicklingError as reason:
+        if any(mark in str(reason) for mark in ("GLOBAL", "Unsupported class", "Trying to")):
+            raise CheckpointError(
+                f"{path} holds pickled objects, which could run code when read, so it is refused; "
+                "save plain containers and tensors only, as saunet train does"
+            ) from reason
+        raise CheckpointError(f"{path} is not {what}, or is damaged; copy it again") from reason
+    except OSError as reason:
+        raise CheckpointError(f"cannot read {path}: {reason.strerror or reason}") from reason
+    except Exception as reason:  # the unpickler trusts what it reads: a broken file can raise anything
+        raise CheckpointError(f"{path} is damaged or truncated and cannot be read; copy it again") from reason
 
 
 _DAMAGED = (
@@ -227,15 +243,10 @@ def _constant(text: str) -> float:
 
 def _check_depth(plain: Any) -> None:
     """Check the nesting, level by level, without recursion."""
-    level = [plain]
+    level = [plain] if isinstance(plain, dict | list) else []
     for _ in range(DEPTH + 1):
-        level = [
-            child
-            for each in level
-            if isinstance(each, dict | list)
-            for child in (each.values() if isinstance(each, dict) else each)
-            if isinstance(child, dict | list)
-        ]
+        inside = [each.values() if isinstance(each, dict) else each for each in level]
+        level = [child for each in inside for child in each if isinstance(child, dict | list)]
         if not level:
             return
     raise _LimitError(f"more than {DEPTH} levels of nesting")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import math
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import av
@@ -18,7 +19,7 @@ from av.error import FFmpegError
 from jaxtyping import UInt8
 
 from saunet.errors import ConfigError, DataError, UnreadableError, one_of, positive
-from saunet.io.atomic import replacing
+from saunet.io.atomic import Session, replacing
 
 _CONTAINERS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ts", ".mts", ".m2ts", ".3gp")
 _OTHERS = (".3g2", ".flv", ".vob", ".lrv", ".ogv", ".h264", ".264", ".h265", ".265", ".hevc", ".mjpg", ".mjpeg")
@@ -52,14 +53,11 @@ class VideoFrame:
     image: Picture
 
 
-class VideoReader:
+class VideoReader(Session):
     """Frames of a video file as RGB bytes, as a player shows them: in order, rotated, deinterlaced, in true colors.
 
-    Iterating reads from the start each time; one frame is in memory at a time.
-
-    Args:
-        source: The file.
-        rate: Frames per second of a bare stream (``.hevc``, ``.h264``) that does not contain its rate.
+    Iterating reads from the start each time; one frame is in memory at a time. ``rate`` is for a bare stream
+    (``.hevc``, ``.h264``) that does not contain its own.
 
     Attributes:
         fps: Mean frames per second; None if nobody knows.
@@ -70,9 +68,6 @@ class VideoReader:
         damaged: After reading to the end: frames that could be decoded in part or not at all.
         plain: After reading to the end: frames of one single color.
         count: Frames decoded since the start of the last reading.
-
-    Raises:
-        DataError: if it does not exist, is not a video that can be read, or contains no frame.
     """
 
     def __init__(self, source: str | Path, rate: float | int | None = None) -> None:
@@ -83,10 +78,7 @@ class VideoReader:
             raise UnreadableError(f"{source} is empty (0 bytes); copy it again")
         self.missing = self.damaged = self.plain = self.count = 0
         self._broken = False
-        self._origin = 0.0  # time stamp of the first frame
-        container = self._open()
-        try:
-            stream = self._stream(container)
+        with self._opened() as (container, stream):
             first = next(self._decoded(container, stream), None)
             if first is None:
                 raise UnreadableError(
@@ -94,14 +86,10 @@ class VideoReader:
                 )
             self.height, self.width = _rgb(first, self.name).shape[:2]
             self._timed = container.format.name not in _RAW and first.time is not None
-            self._origin = float(first.time) if self._timed else 0.0
+            self._origin = float(first.time) if self._timed else 0.0  # time stamp of the first frame
             mean, usual = self._rates(container, stream)
             self.fps, self._pace = mean or rate, usual or rate
             self.declared = self._count(container, stream)
-        except FFmpegError as reason:
-            raise self._unreadable() from reason
-        finally:
-            container.close()
 
     def __iter__(self) -> Iterator[Picture]:
         return (frame.image for frame in self.frames())
@@ -112,15 +100,7 @@ class VideoReader:
         return self._timed or self.fps is not None
 
     def frames(self, fps: float | int | None = None) -> Iterator[VideoFrame]:
-        """Yield frames with their times.
-
-        Args:
-            fps: Take the frames nearest to equal steps of time, so many per second; None, or more than there are,
-                takes all.
-
-        Raises:
-            DataError: if the size of the picture changes on the way, or every frame has one single color.
-        """
+        """Yield frames with their times: all, or those nearest to equal steps of time, ``fps`` of them per second."""
         stamped = self._stamped()
         if fps is not None and self._pace is not None and fps < self._pace * (1 - 1e-3):
             stamped = nearest_steps(stamped, positive("fps", fps))
@@ -135,64 +115,29 @@ class VideoReader:
             self.plain += _one_color(image)
             yield VideoFrame(number, seconds, image)
 
-    def at(self, seconds: float | int) -> tuple[float, Picture]:
-        """Return the frame that is shown at a time (seconds since the first frame), and the time at which it began."""
-        if not self._timed:
-            raise DataError(f"{self.name} is a bare stream without times; convert it to mp4 to read it by time")
-        wanted = seconds + self._origin + 1e-6
-        for before in (0.0, 5.0, None) if seconds >= 0 else ():  # some formats seek past the time asked for
-            container = self._open()
-            try:
-                stream = self._stream(container)
-                if before is not None and not _seek(container, stream, max(self._origin, wanted - before)):
-                    continue
-                found = later = None
-                for frame in self._decoded(container, stream):
-                    if frame.time > wanted:
-                        later = frame
-                        break
-                    found = frame
-                if found is not None and (later or wanted < found.time + 1 / (self.fps or 1)):
-                    return float(found.time) - self._origin, _rgb(found, self.name)
-            except FFmpegError as reason:
-                raise self._unreadable() from reason
-            finally:
-                container.close()
-        raise DataError(f"{self.name} shows no frame at {seconds:g} s; it is shorter")
-
     def close(self) -> None:
         """Nothing is held open between two iterations."""
 
-    def __enter__(self) -> VideoReader:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def _open(self) -> Any:
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[tuple[Any, Any]]:
+        """Open the file anew, as container and stream; what FFmpeg cannot read is one sentence."""
         try:
             # "file:" keeps names with colons from being taken for addresses; playlists must not open others either
-            return av.open(f"file:{self.path}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
+            options = {"protocol_whitelist": "file"}
+            with av.open(f"file:{self.path}", options=options, metadata_errors="replace") as container:
+                stream: Any = container.streams.best("video")  # never a cover picture
+                if stream is None:
+                    raise UnreadableError(f"{self.name} contains no video, only sound or text")
+                if stream.codec_context is None:
+                    raise UnreadableError(f"{self.name} has a codec that cannot be decoded; convert it to H.264")
+                stream.thread_type = "AUTO"
+                yield container, stream
         except FFmpegError as reason:
             if isinstance(reason, PermissionError):
                 raise UnreadableError(f"cannot read {self.name}: {reason.strerror}") from reason
-            raise self._unreadable() from reason
-
-    def _unreadable(self) -> UnreadableError:
-        return UnreadableError(
-            f"{self.name} is not a video that can be read, or is truncated; copy it again or convert it to mp4"
-        )
-
-    def _stream(self, container: Any) -> Any:
-        stream = container.streams.best("video")  # never a cover picture
-        if stream is None:
-            raise UnreadableError(f"{self.name} contains no video, only sound or text")
-        if stream.codec_context is None:
-            raise UnreadableError(f"{self.name} has a codec that cannot be decoded; convert it to H.264")
-        stream.thread_type = "AUTO"
-        return stream
+            raise UnreadableError(
+                f"{self.name} is not a video that can be read, or is truncated; copy it again or convert it to mp4"
+            ) from reason
 
     def _decoded(self, container: Any, stream: Any) -> Iterator[Any]:
         """Yield decoded frames, deinterlaced where they are interlaced."""
@@ -216,10 +161,9 @@ class VideoReader:
         """Yield all frames with number and time; a clock that jumps back continues where it was."""
         self.missing = self.damaged = self.plain = self.count = 0
         self._broken = False
-        container = self._open()
         step, shift, last = 1 / (self.fps or 25), -self._origin, -math.inf
-        try:
-            for number, frame in enumerate(self._decoded(container, self._stream(container))):
+        with self._opened() as (container, stream):
+            for number, frame in enumerate(self._decoded(container, stream)):
                 self.count = number + 1
                 if not self._timed:
                     yield number, number / self.fps if self.fps else None, frame
@@ -229,8 +173,6 @@ class VideoReader:
                     shift, seconds = shift + last + step - seconds, last + step
                 last = seconds
                 yield number, seconds, frame
-        finally:
-            container.close()
         if self.plain and self.plain == self.count:
             raise DataError(
                 f"every one of the {self.plain} frames of {self.name} has one single color; it was not decoded, or the "
@@ -245,12 +187,9 @@ class VideoReader:
             rate = stream.codec_context.framerate
             known = float(rate) if rate and 0 < rate < 1000 else None
             return known, known
-        again = self._open()
-        try:
-            packets = _some(_packets(again, self._stream(again)), 300)
+        with self._opened() as again:
+            packets = itertools.islice((packet for packet in _packets(*again) if packet is not None), 300)
             stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
-        finally:
-            again.close()
         stamps = stamps[:-16] if len(stamps) > 200 else stamps  # the last ones may not be the next ones
         steps = np.diff(stamps) * float(stream.time_base)
         average = float(stream.average_rate or 0) or None
@@ -267,8 +206,7 @@ class VideoReader:
 class CameraReader:
     """Frames of a camera that is connected, until somebody stops it; times are those of arrival."""
 
-    declared, timed = None, True
-    missing = damaged = plain = 0
+    declared, timed, missing = None, True, 0
 
     def __init__(self, number: int) -> None:
         self.name = f"camera {number}"
@@ -283,22 +221,17 @@ class CameraReader:
         fps = self._capture.get(cv2.CAP_PROP_FPS)
         self.fps = float(fps) if 0 < fps < 1000 else 25.0
 
-    def frames(self, fps: float | int | None = None) -> Iterator[VideoFrame]:
-        """Yield frames as they come, at most ``fps`` a second."""
-        start, number = time.monotonic(), 0
-        while True:
+    def frames(self) -> Iterator[VideoFrame]:
+        """Yield frames as they come."""
+        start = time.monotonic()
+        for number in itertools.count():
             done, frame = self._capture.read()
             if not done:
                 return
             yield VideoFrame(number, time.monotonic() - start, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
-            number += 1
 
     def close(self) -> None:
-        """Release the camera."""
         self._capture.release()
-
-    def __iter__(self) -> Iterator[Picture]:
-        return (frame.image for frame in self.frames())
 
 
 def nearest_steps(
@@ -323,25 +256,29 @@ def nearest_steps(
         yield previous
 
 
-class VideoWriter:
+class VideoWriter(Session):
     """Writes RGB frames to an mp4 file that gets its name only when it is complete.
 
     Use it as a context manager; leaving it by an error discards the file.
-
     """
 
     def __init__(self, path: str | Path, fps: float | int, codec: str = "h264") -> None:
         self.path = Path(path)
         one_of(f"the suffix of {self.path.name}", self.path.suffix.lower(), [".mp4"])
         self.fps, self.codec = positive("fps", fps), one_of("codec", codec, CODECS)
-        self.count, self._last = 0, -1
+        self.count, self._last, self._size = 0, -1, (0, 0)
         self._container: Any = None
-        self._size = (0, 0)
-        self._replacing = replacing(self.path)
 
-    def __enter__(self) -> VideoWriter:
-        self._temporary = self._replacing.__enter__()
-        return self
+    def session(self) -> Iterator[None]:
+        with replacing(self.path) as self._temporary:
+            try:
+                yield
+                if self._container is not None:
+                    self._container.mux(self._stream.encode(None))
+            finally:
+                if self._container is not None:
+                    self._container.close()
+            self._check()
 
     def write(self, frame: Picture, seconds: float | int | None = None) -> None:
         """Append a frame, shown from ``seconds`` on; all have the size of the first, made even as codecs need it."""
@@ -379,27 +316,6 @@ class VideoWriter:
         context.time_base = Fraction(1, 30_000 if self.codec == "mp4v" else _TICKS)
         context.colorspace = context.color_primaries = context.color_trc = 1  # BT.709
         context.color_range = 1  # of television: 16 to 235
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        problem: BaseException | None = error
-        try:
-            if self._container is not None:
-                try:
-                    if kind is None:
-                        self._container.mux(self._stream.encode(None))
-                finally:
-                    self._container.close()
-            if kind is None:
-                self._check()
-        except Exception as reason:
-            problem = problem or reason
-        self._replacing.__exit__(
-            type(problem) if problem else None, problem, problem.__traceback__ if problem else None
-        )
-        if problem is not None and problem is not error:
-            raise problem
 
     def _check(self) -> None:
         if self.count == 0:
@@ -456,21 +372,6 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
         yield from container.demux(stream)
     except FFmpegError:
         yield None
-
-
-def _seek(container: Any, stream: Any, seconds: float) -> bool:
-    """Go to the key frame before a time stamp; False where a format cannot."""
-    if container.format.name == "mpeg":  # its time stamps are off by half a frame afterwards
-        return False
-    try:
-        container.seek(math.floor(seconds / stream.time_base), stream=stream)
-    except FFmpegError:
-        return False
-    return True
-
-
-def _some(items: Iterable[Any], count: int) -> Iterator[Any]:
-    return (item for item, _ in zip((each for each in items if each is not None), range(count), strict=False))
 
 
 def _rgb(frame: Any, name: str) -> Picture:

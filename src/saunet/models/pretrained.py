@@ -31,7 +31,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, suggest
-from saunet.io.torch_files import read_plain
+from saunet.io.plain import read_torch
 
 log = logging.getLogger(__name__)
 
@@ -292,7 +292,7 @@ def _verified(path: Path, public: PublicWeights, fix: str) -> Path:
 
 def read_state(path: Path) -> dict[str, Tensor]:
     """Read the weights in a file, whatever they are wrapped in, without running anything from it."""
-    content = read_plain(path, "a file of weights")
+    content = read_torch(path, "a file of weights")
     for wrapper in ("model", "state_dict", "model_state_dict"):
         if isinstance(content, dict) and isinstance(content.get(wrapper), dict):
             content = content[wrapper]

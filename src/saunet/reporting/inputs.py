@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from saunet.errors import CheckpointError, DataError
-from saunet.io.torch_files import read_plain
+from saunet.io.plain import read_torch
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.runs.folder import (
     Explained,
@@ -104,7 +104,7 @@ def _as_trained(run: Run) -> Run:
     if not run.record.get("resumed") or run.checkpoint is None or not isinstance(optim, Mapping):
         return run
     try:
-        groups = read_plain(run.checkpoint, "a checkpoint")["optimizer_states"][0]["param_groups"]
+        groups = read_torch(run.checkpoint, "a checkpoint")["optimizer_states"][0]["param_groups"]
     except (CheckpointError, KeyError, IndexError, TypeError):  # without it, what was asked for is all that is known
         return run
     kept = {key: groups[0].get(name) for key, name in _KEPT.items()}

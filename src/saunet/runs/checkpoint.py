@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, ConfigError
 from saunet.io.atomic import replacing
-from saunet.io.torch_files import read_plain
+from saunet.io.plain import read_torch
 from saunet.models.depth import DepthNet
 from saunet.registry import instantiate
 from saunet.runs.record import ModelRecord, Scale
@@ -145,7 +145,7 @@ def _load_plain(path: Path) -> Any:
         raise CheckpointError(f"{path} is a folder; give the checkpoint file in it, such as {path / 'last.ckpt'}")
     if not path.exists():
         raise CheckpointError(f"no checkpoint at {path}; check the path")
-    return read_plain(path, "a checkpoint")
+    return read_torch(path, "a checkpoint")
 
 
 def _more(names: Sequence[str]) -> str:
