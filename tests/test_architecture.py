@@ -57,7 +57,7 @@ ALLOWED: dict[str, set[str]] = {
         "weights",
         "exporting",
     },
-    "exporting": {"errors", "lazy", "io", "metrics", "models", "prediction", "runs", "weights"},
+    "exporting": {"errors", "lazy", "io", "tables", "metrics", "models", "prediction", "runs", "weights"},
     "evaluation": {
         "errors",
         "registry",

@@ -1,4 +1,4 @@
-"""A depth network written as one file: ONNX, a torch.export program, an AOTInductor package, or plain weights."""
+"""A depth network written as one file, and run from it: ONNX, a torch.export program, an AOTInductor package."""
 
 from __future__ import annotations
 
@@ -47,7 +47,6 @@ class FinestDisparity(nn.Module):
         self.network = network
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
-        """Return disparity in 1/meter (up to scale) of RGB in [0, 1]."""
         return self.network(image).disparity[0]  # type: ignore[no-any-return]
 
 
@@ -67,11 +66,11 @@ def export_onnx(
                 program, input_names=[INPUT], output_names=[OUTPUT], opset_version=opset, dynamo=True, verbose=False
             )
     except torch.onnx.OnnxExporterError as reason:
-        names = f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
-        raise ConfigError(f"{names} cannot be exported to ONNX; export the format 'program'") from reason
+        raise ConfigError(f"{_name(network)} cannot be exported to ONNX; export the format 'program'") from reason
     if exported.model.opset_imports[""] != opset:
-        names = f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
-        raise ConfigError(f"{names} has operations that opset {opset} does not have; export with opset={OPSETS[-1]}")
+        raise ConfigError(
+            f"{_name(network)} has operations that opset {opset} does not have; export with opset={OPSETS[-1]}"
+        )
     exported.model.ir_version = _IR_VERSIONS[opset]
     exported.model.metadata_props[METADATA] = json.dumps(record.to_plain())
     exported.save(str(path))
@@ -79,11 +78,7 @@ def export_onnx(
 
 
 def export_program(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> Batch:
-    """Write a depth network as a torch.export program: ``torch.export.load(path).module()(image)`` needs no saunet.
-
-    See `export_onnx` for the arguments.
-
-    """
+    """Write a depth network as a torch.export program: ``torch.export.load(path).module()(image)`` needs no saunet."""
     program, takes = _program(network, record, batch)
     content = io.BytesIO()  # torch's own writer, on a full disk, cannot even be closed and ends the process
     with _quiet():
@@ -95,9 +90,7 @@ def export_program(network: DepthNet, record: ModelRecord, path: str | Path, bat
 def export_compiled(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> Batch:
     """Write a depth network as an AOTInductor package: machine code for this kind of processor, minutes to make.
 
-    ``torch._inductor.aoti_load_package(path)(image)`` runs it, and so does C++ with libtorch, without Python. See
-    `export_onnx` for the arguments.
-
+    ``torch._inductor.aoti_load_package(path)(image)`` runs it, and so does C++ with libtorch, without Python.
     """
     if shutil.which("g++") is None and shutil.which("clang++") is None and shutil.which("cl") is None:
         raise ConfigError("the format 'compiled' needs a C++ compiler and found none; install g++, or leave it out")
@@ -114,12 +107,7 @@ def export_compiled(network: DepthNet, record: ModelRecord, path: str | Path, ba
 
 def run_eager(network: DepthNet) -> Run:
     """Return the network as a function of arrays."""
-
-    def run(image: NDArray[np.float32]) -> NDArray[np.float32]:
-        with torch.inference_mode():
-            return network(torch.from_numpy(image)).disparity[0].numpy()  # type: ignore[no-any-return]
-
-    return run
+    return _run(FinestDisparity(network))
 
 
 def run_onnx(path: Path) -> Run:
@@ -132,17 +120,15 @@ def run_onnx(path: Path) -> Run:
 
 
 def run_program(path: Path) -> Run:
-    """Return a torch.export program as a function of arrays."""
     with _quiet():
-        return _run_module(torch.export.load(path).module())
+        return _run(torch.export.load(path).module())
 
 
 def run_compiled(path: Path) -> Run:
-    """Return an AOTInductor package as a function of arrays."""
-    return _run_module(torch._inductor.aoti_load_package(str(path)))
+    return _run(torch._inductor.aoti_load_package(str(path)))
 
 
-def _run_module(module: Callable[[Tensor], Tensor]) -> Run:
+def _run(module: Callable[[Tensor], Tensor]) -> Run:
     def run(image: NDArray[np.float32]) -> NDArray[np.float32]:
         with torch.no_grad():
             return module(torch.from_numpy(image)).numpy()
@@ -153,19 +139,22 @@ def _run_module(module: Callable[[Tensor], Tensor]) -> Run:
 def _program(network: DepthNet, record: ModelRecord, batch: str) -> tuple[torch.export.ExportedProgram, Batch]:
     one_of("batch", batch, BATCHES)
     module = FinestDisparity(network).eval()
-    names = f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
     if batch != "one":
         try:
             return _trace(module, torch.zeros(2, 3, record.height, record.width), dynamic=True), "any"
         except _TRACING_ERRORS as reason:
             if batch == "any":
                 raise ConfigError(
-                    f"{names} fixes its batch size when it is exported; export with batch=one"
+                    f"{_name(network)} fixes its batch size when it is exported; export with batch=one"
                 ) from reason
     try:
         return _trace(module, torch.zeros(1, 3, record.height, record.width), dynamic=False), "one"
     except _TRACING_ERRORS as reason:
-        raise ConfigError(f"{names} cannot be exported: {str(reason).splitlines()[0]}") from reason
+        raise ConfigError(f"{_name(network)} cannot be exported: {str(reason).splitlines()[0]}") from reason
+
+
+def _name(network: DepthNet) -> str:
+    return f"{type(network.encoder).__name__} with {type(network.decoder).__name__}"
 
 
 def _trace(module: nn.Module, image: Tensor, dynamic: bool) -> torch.export.ExportedProgram:

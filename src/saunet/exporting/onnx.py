@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,6 @@ class OnnxPredictor(ImagePredictor):
         batch = self._session.get_inputs()[0].shape[0]
         self._batch: int | None = batch if isinstance(batch, int) else None
         self.flip = flip
-        self._fingerprint: str | None = None
 
     def disparity(self, images: Float32[np.ndarray, "b 3 h w"]) -> Float32[np.ndarray, "b h w"]:
         """Run the network: RGB in [0, 1] to disparity at the same size, before any scale."""
@@ -60,19 +60,14 @@ class OnnxPredictor(ImagePredictor):
         parts = []
         for start in range(0, len(images), size):
             part = images[start : start + size]
-            missing = size - len(part) if self._batch else 0
-            padded = np.concatenate([part, np.repeat(part[-1:], missing, axis=0)]) if missing else part
+            padded = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
             parts.append(self._session.run([OUTPUT], {INPUT: padded})[0][: len(part), 0])
         return np.asarray(np.concatenate(parts))
 
-    @property
+    @functools.cached_property
     def fingerprint(self) -> str:
         """A short hash of the file and of the settings that change results."""
-        if self._fingerprint is None:
-            digest = hashlib.sha256(self.path.read_bytes())
-            digest.update(b"flip" if self.flip else b"")
-            self._fingerprint = digest.hexdigest()[:16]
-        return self._fingerprint
+        return hashlib.sha256(self.path.read_bytes() + (b"flip" if self.flip else b"")).hexdigest()[:16]
 
 
 def flip_blend(

@@ -5,9 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
+
+from saunet.tables import Column, Row, Table
 
 Run = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """From images (b 3 h w) to disparity (b 1 h w)."""
@@ -21,7 +24,7 @@ class Parity:
     batch: str
     """How many images the file takes at once: ``any`` or ``one``."""
     difference: float
-    """Largest difference in disparity, as a share of the network's range of disparity."""
+    """Largest difference in disparity, as a fraction of the network's range of disparity."""
     depth_difference: float
     """Largest relative difference in depth."""
     random: int
@@ -76,3 +79,17 @@ def milliseconds(runs: Sequence[Run], image: NDArray[np.float32], repeats: int =
             run(image)
             row[index] = time.perf_counter() - start
     return [round(float(value) * 1000, 3) for value in np.median(times[2:], axis=0)]
+
+
+def parity_table(reports: Sequence[Parity]) -> Table:
+    """Return the comparisons for a terminal and for the card."""
+    columns = {"file": "", "MB": ".1f", "batch": "", "differs by": ".1e", "random": "", "real": ""}
+    columns |= {"eager ms": ".1f", "this ms": ".1f", "depth differs by": ".1g"}
+    shown = attrgetter("file", "megabytes", "batch", "difference", "random", "real", "eager_ms", "exported_ms")
+    rows = [Row((*shown(each), each.depth_difference)) for each in reports]
+    notes = (
+        "differs by: largest difference in disparity over all images, random and real, as a fraction of its range",
+        "eager ms, this ms: the original network's and this file's time for one image",
+    )
+    title = "Files: against the original network on the CPU"
+    return Table("parity", title, tuple(Column(*each) for each in columns.items()), tuple(rows), notes)

@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 from saunet.errors import CheckpointError, ConfigError, DataError, one_of
 from saunet.exporting import exporters
 from saunet.exporting.card import model_card
-from saunet.exporting.parity import Parity, Run, compare, timed
+from saunet.exporting.parity import Parity, Run, compare, parity_table, timed
 from saunet.io.atomic import remove_partial_files, replacing, write_bytes, write_json
 from saunet.io.images import network_input, read_image
 from saunet.io.plain import read_json
 from saunet.io.progress import bar
 from saunet.models.depth import DepthNet
-from saunet.prediction.sources import image_paths
+from saunet.prediction.sources import find_sources
 from saunet.runs.record import ModelRecord
+from saunet.tables import show
 from saunet.weights.files import read_model, restored, write_safetensors
 from saunet.weights.locate import CARD, CONFIG, POSE, WEIGHTS
 
@@ -95,18 +96,9 @@ class ExportResult:
 
     def show(self) -> None:
         """Print the comparisons as a table."""
-        from rich.console import Console
-        from rich.table import Table
-
         if not any(report.real for report in self.reports):
             print("images is not set, so only random images were compared", file=sys.stderr)
-        table = Table("file", "MB", "batch", "differs by", "random", "real", "eager ms", "this ms", box=None)
-        for each in self.reports:
-            times = (f"{each.eager_ms:.1f}", f"{each.exported_ms:.1f}")
-            seen = (f"{each.difference:.1e}", str(each.random), str(each.real))
-            table.add_row(each.file, f"{each.megabytes:.1f}", each.batch, *seen, *times)
-        Console().print(table)
-        print("differs by: largest difference in disparity over all images, as a fraction of its range")
+        show([parity_table(self.reports)])
         print(f"exported, with report.json and a model card: {self.output}")
 
 
@@ -130,18 +122,16 @@ def export(options: ExportOptions) -> ExportResult:
         >>> saunet.export(options).reports[0].difference < 1e-6
         True
     """
-    formats, evaluation = tuple(dict.fromkeys(options.formats)), options.evaluation
+    formats, folder = tuple(dict.fromkeys(options.formats)), Path(options.output)
     read = read_model(options.checkpoint)
-    folder = Path(options.output)
-    if read.path.name == WEIGHTS and read.path.resolve().parent == folder.resolve():
-        raise ConfigError(f"the output folder {folder} holds the model itself; choose another")
-    metrics = read_metrics(evaluation) if evaluation is not None else None
+    earlier = check_target(folder, read.path, (CONFIG, *FILES.values(), POSE, REPORT, CARD), options.overwrite)
+    metrics = read_metrics(options.evaluation) if options.evaluation is not None else None
     splits = _splits(read.path)
     network, pose = read.networks()
     record = public_record(read.record)
     network.eval()
     random, real = random_images(record), real_images(record, options.images or ())
-    _clear(folder, options.overwrite)
+    remove(earlier)
     remove_partial_files(folder)
     eager, span = exporters.run_eager(network), 1 / record.min_depth - 1 / record.max_depth
     reports, runs = list[Parity](), list[Run]()
@@ -150,24 +140,20 @@ def export(options: ExportOptions) -> ExportResult:
         for name in formats:
             path = folder / FILES[name]
             with replacing(path) as temporary:
-                takes = "any"
                 if name == "safetensors":
-                    parts = {"depth": network} if pose is None else {"depth": network, "pose": pose}
+                    takes, parts = "any", {"depth": network} if pose is None else {"depth": network, "pose": pose}
                     write_safetensors(named_state(parts), temporary)
                 else:
                     takes = _EXPORTERS[name](network, record, temporary, options)
-                size = temporary.stat().st_size / 2**20
                 run = _RUNNERS[name](temporary, record)
-                report = compare(path.name, eager, run, random, real, span, takes, size)
-                if math.isnan(report.difference):
-                    raise CheckpointError(
-                        f"the exported {path.name} gives NaN where the network gives disparity, so it is not written; "
-                        "report encoder and decoder"
-                    )
+                report = compare(path.name, eager, run, random, real, span, takes, temporary.stat().st_size / 2**20)
+                found = f"{report.difference:.2g} of the disparity range, more than {TOLERANCE:g}"
+                wrong = "gives NaN where the network gives disparity"
+                if not math.isnan(report.difference):
+                    wrong = f"differs from the network by {found}"
                 if not report.difference <= TOLERANCE:
                     raise CheckpointError(
-                        f"the exported {path.name} differs from the network by {report.difference:.2g} of the "
-                        f"disparity range, more than {TOLERANCE:g}, so it is not written; report encoder and decoder"
+                        f"the exported {path.name} {wrong}, so it is not written; report encoder and decoder"
                     )
             reports.append(report)
             runs.append(run)
@@ -209,17 +195,25 @@ def _splits(checkpoint: Path) -> Mapping[str, str]:
         raise DataError(f"{path} cannot be read ({reason}); it belongs to the run, or move the checkpoint") from reason
 
 
-def _clear(folder: Path, overwrite: bool) -> None:
-    """Remove an earlier export, its config first: what is left of it must not be taken for the new model."""
-    names = (CONFIG, *FILES.values(), POSE, REPORT, CARD)
-    present = [name for name in names if (folder / name).exists()]
+def check_target(folder: Path, model: Path, names: Sequence[str], overwrite: bool) -> list[Path]:
+    """Return an earlier model's files in a folder, having checked that they may go and are not ``model`` itself."""
+    if model.name == WEIGHTS and model.resolve().parent == folder.resolve():
+        raise ConfigError(f"the output folder {folder} holds the model itself; choose another")
+    present = [folder / name for name in names if (folder / name).exists()]
     if present and not overwrite:
-        raise ConfigError(f"{folder} holds {present[0]} already; choose another output folder, or set overwrite=true")
-    for name in present:
+        raise ConfigError(
+            f"{folder} holds {present[0].name} already; choose another output folder, or set overwrite=true"
+        )
+    return present
+
+
+def remove(earlier: Sequence[Path]) -> None:
+    """Remove an earlier model, its config first: what is left of it must not be taken for the new one."""
+    for path in earlier:
         try:
-            (folder / name).unlink()
+            path.unlink()
         except OSError as reason:
-            raise DataError(f"cannot replace {folder / name}: {reason.strerror or reason}") from reason
+            raise DataError(f"cannot replace {path}: {reason.strerror or reason}") from reason
 
 
 def public_record(record: ModelRecord) -> ModelRecord:
@@ -234,14 +228,13 @@ def public_record(record: ModelRecord) -> ModelRecord:
 
 def random_images(record: ModelRecord) -> list[NDArray[np.float32]]:
     """Return two images of random colors at the network's size, each 1 3 h w, always the same."""
-    images = np.random.default_rng(0).random((2, 1, 3, record.height, record.width), dtype=np.float32)
-    return list(images)
+    return list(np.random.default_rng(0).random((2, 1, 3, record.height, record.width), dtype=np.float32))
 
 
 def real_images(record: ModelRecord, images: str | Path | Sequence[str | Path]) -> list[NDArray[np.float32]]:
     """Return at most eight of the images of files, folders or patterns at the network's size, each 1 3 h w."""
     several = [images] if isinstance(images, str | Path) else list(images)
-    paths = [path for item in several for path in image_paths(item)]
+    paths = [frame.image for item in several for frame in find_sources(item)]
     chosen = [paths[index] for index in np.linspace(0, len(paths) - 1, min(len(paths), _REAL_AT_MOST)).astype(int)]
     return [network_input(read_image(path), record.height, record.width)[None] for path in chosen]
 
@@ -249,10 +242,6 @@ def real_images(record: ModelRecord, images: str | Path | Sequence[str | Path]) 
 def named_state(parts: Mapping[str, torch.nn.Module]) -> dict[str, torch.Tensor]:
     """Return the weights of networks under a checkpoint's names, such as ``depth.encoder.conv1.weight``."""
     return {f"{part}.{name}": value for part, module in parts.items() for name, value in module.state_dict().items()}
-
-
-def _run_weights(path: Path, record: ModelRecord) -> Run:
-    return exporters.run_eager(restored(path, record).networks()[0].eval())
 
 
 def _versions() -> dict[str, str]:
@@ -274,5 +263,5 @@ _RUNNERS: dict[str, Callable[[Path, ModelRecord], Run]] = {
     "onnx": lambda path, record: exporters.run_onnx(path),
     "program": lambda path, record: exporters.run_program(path),
     "compiled": lambda path, record: exporters.run_compiled(path),
-    "safetensors": _run_weights,
+    "safetensors": lambda path, record: exporters.run_eager(restored(path, record).networks()[0].eval()),
 }

@@ -19,13 +19,8 @@ from saunet.weights.locate import CONFIG, POSE, WEIGHTS, locate
 def read_model(source: str | Path) -> Checkpoint:
     """Read a trained model into memory, without running anything from it.
 
-    Args:
-        source: A checkpoint, a folder written by ``saunet export`` (or the safetensors file in it), the name of a
-            shipped model, or a hub id; see `saunet.weights.locate.locate`.
-
-    Raises:
-        CheckpointError: if it is missing, broken, not a saunet model, or names a component that is not registered.
-        ConfigError: if it is on the hub and huggingface_hub is missing.
+    It is a checkpoint, a folder written by ``saunet export`` (or the safetensors file in it), the name of a shipped
+    model, or a hub id; see `saunet.weights.locate.locate`.
     """
     path = locate(source)
     if path.is_dir() and (path / CONFIG).is_file() and not (path / WEIGHTS).is_file():
@@ -38,15 +33,11 @@ def read_model(source: str | Path) -> Checkpoint:
         return read_checkpoint(path)
     if not path.is_file():
         raise CheckpointError(f"no model at {path}; check the path")
-    return restored(path, read_config(path.with_name(CONFIG)))
+    return restored(path, _read_config(path.with_name(CONFIG)))
 
 
 def restored(path: Path, record: ModelRecord) -> Checkpoint:
-    """Return the weights of a safetensors file, and of a pose network's beside it, together with their record.
-
-    Raises:
-        CheckpointError: if a file is broken or the record names a component that is not registered.
-    """
+    """Return the weights of a safetensors file, and of a pose network's beside it, together with their record."""
     try:
         record.check_registered()
     except CheckpointError as error:
@@ -59,21 +50,11 @@ def restored(path: Path, record: ModelRecord) -> Checkpoint:
 
 
 def write_safetensors(state: Mapping[str, Tensor], path: str | Path) -> None:
-    """Write named tensors as safetensors.
-
-    Raises:
-        OSError: if the system refuses.
-    """
     plain = {name: value.detach().cpu().contiguous() for name, value in state.items()}
     Path(path).write_bytes(save(plain, {"format": "pt"}))  # save_file would let its owner alone read the file
 
 
-def read_config(path: Path) -> ModelRecord:
-    """Read the record of an exported folder.
-
-    Raises:
-        CheckpointError: if it is missing or not one.
-    """
+def _read_config(path: Path) -> ModelRecord:
     try:
         return ModelRecord.from_plain(read_json(path))
     except OSError as reason:

@@ -16,7 +16,7 @@ CONFIG, WEIGHTS, POSE, CARD = "config.json", "model.safetensors", "pose.safetens
 HUB = "hf://"
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+(@[\w./-]+)?")
 _FILE_SUFFIXES = (".ckpt", ".onnx", ".safetensors", ".pt", ".pth", ".pt2")
-_WANTED = (CONFIG, WEIGHTS, POSE, "model.onnx", CARD)
+_WANTED = [CONFIG, WEIGHTS, POSE, "model.onnx", CARD]
 """What is fetched from the hub: numbers and text, nothing that could be run."""
 
 
@@ -28,13 +28,8 @@ def shipped() -> list[str]:
 def locate(source: str | Path) -> Path:
     """Return the local path of a model, fetched from the hub where ``source`` is a hub id.
 
-    Args:
-        source: The name of a shipped model such as ``street`` (``./street`` is a local folder of that name), a path, or
-            a hub id: ``hf://organization/name``, or short ``organization/name``, with ``@revision`` for a certain one.
-
-    Raises:
-        CheckpointError: if it cannot be fetched, or is the default model and this installation ships none.
-        ConfigError: if the package huggingface_hub is missing, or the id is not one.
+    A text is the name of a shipped model such as ``street`` (``./street`` is a local folder of that name), a path, or a
+    hub id: ``hf://organization/name``, or short ``organization/name``, with ``@revision`` for a certain one.
     """
     text, path = str(source), Path(source).expanduser()
     if isinstance(source, Path):
@@ -65,7 +60,7 @@ def _fetch(name: str) -> Path:
         ) from missing
     repository, _, revision = name.partition("@")
     try:
-        return Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(_WANTED)))
+        return Path(snapshot_download(repository, revision=revision or None, allow_patterns=_WANTED))
     except Exception as reason:  # the hub's errors, the network's and the HTTP client's share no base class
         first = next((line.strip() for line in str(reason).splitlines() if line.strip()), "")
         raise CheckpointError(
