@@ -152,6 +152,6 @@ def load(source: Any = DEFAULT, *, device: str = "cpu", flip: bool = False, keep
     """
     if not isinstance(source, str | Path) or not str(source):
         raise CheckpointError(f"saunet.load got {source!r}; give the path of a checkpoint or an exported folder")
-    from saunet.prediction.load import load as load_any
+    from saunet.prediction.prediction import load as load_any
 
     return load_any(source, device=device, flip=flip, keep_aspect=keep_aspect)

@@ -264,20 +264,20 @@ class TestBadInput:
         code = (
             "import os, resource, signal, sys\n"
             "from saunet.cli.app import main\n"
-            "from saunet.prediction import files, sinks\n"
+            "from saunet.prediction import sinks\n"
             "how, sys.argv = sys.argv[1], sys.argv[:1] + sys.argv[2:]\n"
             "signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell job ignores it\n"
             "if how == 'full':\n"
             "    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
             "    resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
             "else:\n"
-            "    left, write = [2], files.write_output\n"
+            "    left, write = [2], sinks.write_output\n"
             "    def interrupted(*arguments):\n"
             "        left[0] -= 1\n"
             "        if left[0] == 0:\n"
             "            os.kill(os.getpid(), signal.SIGINT)\n"
             "        return write(*arguments)\n"
-            "    files.write_output = sinks.write_output = interrupted\n"
+            "    sinks.write_output = interrupted\n"
             "main()\n"
         )
         for how in ("full", "interrupt"):

@@ -21,8 +21,8 @@ from saunet.io.colormaps import RunningRange, colorize
 from saunet.io.images import read_image, write_image
 from saunet.io.video import CameraReader, VideoFrame, VideoReader, VideoWriter
 from saunet.prediction.odometer import Odometer
+from saunet.prediction.pointcloud import ViewerWriter
 from saunet.prediction.predictor import Predictor
-from saunet.prediction.viewer import ViewerWriter
 
 Picture = NDArray[np.uint8]
 ALL = ("mp4", "color", "png16", "npy", "ply", "html", "trajectory")

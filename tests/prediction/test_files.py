@@ -15,9 +15,9 @@ from predicting import run
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import read_image, write_image
 from saunet.models.depth import DepthNet
-from saunet.prediction.files import MANIFEST
 from saunet.prediction.pointcloud import Camera
 from saunet.prediction.predictor import Predictor
+from saunet.prediction.sinks import MANIFEST
 from saunet.prediction.sources import find_sources
 
 

@@ -80,7 +80,7 @@ def test_empty_cloud(tmp_path: Path) -> None:
 
 
 def test_field_of_view() -> None:
-    camera = Camera.from_field_of_view(90.0, 50, 100)
+    camera = Camera.from_numbers([90.0], 50, 100)
     assert camera.K[0, 0] == pytest.approx(50)
     assert camera.K[0, 2] == 49.5
 

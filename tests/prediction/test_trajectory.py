@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from saunet.io.images import read_image
 from saunet.io.trajectories import read_kitti
-from saunet.prediction.trajectory import draw_from_above, write_trajectory
+from saunet.prediction.odometer import draw_from_above, write_trajectory
 
 
 def truth(count: int) -> NDArray[np.float64]:

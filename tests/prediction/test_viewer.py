@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 
 from saunet.errors import ConfigError, DataError
-from saunet.prediction.pointcloud import Camera
+from saunet.prediction.pointcloud import Camera, ViewerWriter
 from saunet.prediction.prediction import Prediction
-from saunet.prediction.viewer import ViewerWriter
 from saunet.runs.record import Scale
 
 CAMERA = Camera.from_numbers((120.0, 120.0, 79.5, 29.5), 60, 160)

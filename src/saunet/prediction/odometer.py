@@ -1,29 +1,35 @@
-"""The path of a camera from a pose network: each motion between neighboring frames predicted once, then chained."""
+"""The path of a camera: motions between neighboring frames from a pose network, chained, and drawn from above."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float64, UInt8
 from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, ConfigError, DataError, positive
-from saunet.io.images import network_input
+from saunet.io.images import network_input, write_image
 from saunet.io.progress import bar
+from saunet.io.trajectories import write_kitti
 from saunet.metrics.odometry import chain_motions
 from saunet.runs.record import Scale
 from saunet.weights.files import read_model
+
+_PAPER, _GRID, _INK, _TRACK, _START, _END = (
+    (250, 250, 250), (222, 222, 222), (60, 60, 60), (31, 90, 180), (40, 140, 60), (200, 60, 40),
+)  # fmt: skip
 
 
 class Odometer:
     """Follows the camera through a clip, frame by frame; memory does not grow but by one pose a frame.
 
     A network that sees both neighbors gives two motions at once, so it is asked at every second frame only.
-
     """
 
     def __init__(
@@ -138,3 +144,46 @@ def follow(odometer: Odometer, drive: Any, progress: bool = True) -> Float64[np.
             odometer.add(drive.image(number))
             shown.advance(task)
     return odometer.trajectory()
+
+
+def write_trajectory(picture: Path, T_world_cam: Float64[np.ndarray, "n 4 4"], metric: bool) -> None:
+    """Write a trajectory twice: drawn from above, and beside it as KITTI poses, whose name ends in ``.txt``."""
+    write_kitti(picture.with_suffix(".txt"), T_world_cam)
+    write_image(picture, draw_from_above(T_world_cam, metric))
+
+
+def draw_from_above(
+    T_world_cam: Float64[np.ndarray, "n 4 4"], metric: bool, size: int = 800
+) -> UInt8[np.ndarray, "{size} {size} 3"]:
+    """Draw where the camera went, seen from above: x to the right, z (ahead at the start) up, both at one scale."""
+    way = T_world_cam[:, [0, 2], 3]
+    extent = max(float(np.ptp(way, axis=0).max()), 1e-9) * 1.15
+    margin, top = size // 16, size // 10
+    zoom = np.array([1, -1]) * (size - margin - top) / extent
+    middle = (way.max(0) + way.min(0)) / 2
+    center = np.array([size / 2, top + (size - margin - top) / 2])
+    canvas = np.full((size, size, 3), _PAPER, np.uint8)
+    step = _round_step(extent / 5)
+    for axis in (0, 1):
+        low, high = ((middle[axis] + side * size / abs(zoom[axis])) / step for side in (-1, 1))
+        for index in range(math.ceil(low), math.floor(high) + 1):
+            at = round(center[axis] + (index * step - middle[axis]) * zoom[axis])
+            first, last = ((at, 0), (at, size)) if axis == 0 else ((0, at), (size, at))
+            cv2.line(canvas, first, last, _GRID, 1)
+    points = np.round((center + (way - middle) * zoom) * 16).astype(np.int32)  # sixteenths of a pixel
+    cv2.polylines(canvas, [points[:, None]], False, _TRACK, 2, cv2.LINE_AA, 4)
+    for index, color in ((0, _START), (-1, _END)):
+        cv2.circle(canvas, points[index].tolist(), 6 * 16, color, -1, cv2.LINE_AA, 4)
+    length = float(np.linalg.norm(np.diff(T_world_cam[:, :3, 3], axis=0), axis=1).sum())
+    unit = "m" if metric else "relative units"
+    canvas[: top - 8] = _PAPER
+    words = f"{len(way)} frames, {length:.4g} {unit} along the path; a square is {step:g} {unit}"
+    for row, text in enumerate((words, "from above; green: start, looking up; red: end")):
+        cv2.putText(canvas, text, (14, 26 + 24 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.55, _INK, 1, cv2.LINE_AA)
+    return canvas
+
+
+def _round_step(value: float) -> float:
+    """Return 1, 2 or 5 times a power of ten, the largest that is not above ``value``."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return max(factor * power for factor in (1, 2, 5) if factor * power <= value * (1 + 1e-9))

@@ -30,14 +30,12 @@ def panel(
     strip = label_height(tile_width)
     rows = math.ceil(len(tiles) / columns)
     columns = min(columns, len(tiles))
-    canvas = np.full(
-        (rows * (height + strip) + (rows + 1) * gap, columns * tile_width + (columns + 1) * gap, 3), _PAPER, np.uint8
-    )
+    down, across = strip + height + gap, tile_width + gap
+    canvas = np.full((gap + rows * down, gap + columns * across, 3), _PAPER, np.uint8)
     for index, (name, picture) in enumerate(tiles.items()):
         row, column = divmod(index, columns)
-        top, left = gap + row * (height + strip + gap), gap + column * (tile_width + gap)
-        canvas[top : top + strip, left : left + tile_width] = label(name, tile_width)
-        canvas[top + strip : top + strip + height, left : left + tile_width] = fit(picture, height, tile_width)
+        tile = np.concatenate([label(name, tile_width), fit(picture, height, tile_width)])
+        canvas[gap + row * down :, gap + column * across :][: strip + height, :tile_width] = tile
     return canvas
 
 
@@ -55,18 +53,15 @@ def depth_panel(
 
     The prediction is scaled to the truth by the ratio of medians before the comparison, as in evaluation, and both are
     painted with the truth's colors.
-
     """
-    height, width = image.shape[:2]
     tiles = {"input": image}
-    shown = resize(np.asarray(disparity, dtype=np.float32), height, width)
+    shown = resize(np.asarray(disparity, dtype=np.float32), *image.shape[:2])
     name = f"disparity{' ' + note if note else ''}"
     if truth is None or not (truth > 0).any():
         tiles[name] = colorize(shown, colormap=colormap)
         return panel(tiles, columns, tile_width)
     known = truth > 0
-    true_disparity = np.zeros(truth.shape, np.float32)
-    true_disparity[known] = 1 / truth[known]
+    true_disparity = np.where(known, 1 / np.where(known, truth, 1), 0).astype(np.float32)
     predicted = resize(shown, *truth.shape)
     predicted = predicted * (np.median(1 / predicted[known]) / np.median(truth[known]))
     limits = value_range(true_disparity[known])

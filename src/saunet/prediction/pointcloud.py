@@ -1,19 +1,24 @@
-"""Depth as colored points in space: from depth itself (never a picture of it) and the camera's true intrinsics."""
+"""Depth as colored points in space, from the camera's true intrinsics: as PLY, and as a page to walk around in."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Sequence
+import base64
+import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from saunet.errors import ConfigError, in_range, positive
-from saunet.io.atomic import write_bytes
+from saunet.errors import ConfigError, DataError, in_range, positive
+from saunet.io.atomic import Session, replacing, write_bytes
+from saunet.io.images import encode_jpeg, resize
 from saunet.prediction.prediction import Prediction
+
+_PAGE = Path(__file__).with_name("viewer.html")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,21 +28,11 @@ class PointCloud:
     points: Float32[np.ndarray, "n 3"]
     colors: UInt8[np.ndarray, "n 3"]
     unit: str
-    """What one unit of ``points`` is; written into the files."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """A pinhole camera's intrinsics and the image size that they belong to.
-
-    Args:
-        K: 3 x 3, in pixels (integer coordinates are pixel centers).
-        height: Height of the images that K belongs to.
-        width: Width of the images that K belongs to.
-
-    Raises:
-        ConfigError: if K cannot be a camera's.
-    """
+    """A pinhole camera's intrinsics, in pixels whose centers have integer coordinates, and the image size for them."""
 
     K: Float[np.ndarray, "3 3"]
     height: int
@@ -56,8 +51,9 @@ class Camera:
     def from_numbers(cls, numbers: Sequence[float | int], height: int, width: int) -> Camera:
         """Read ``fx, fy, cx, cy``, the nine numbers of K by rows, or one: the horizontal field of view in degrees."""
         values = [float(number) for number in numbers]
-        if len(values) == 1:
-            return cls.from_field_of_view(values[0], height, width)
+        if len(values) == 1:  # square pixels and a centered axis: a guess, for want of calibration
+            focal = width / (2 * np.tan(np.radians(in_range("field of view", values[0], 1.0, 179.0)) / 2))
+            values = [focal, focal, (width - 1) / 2, (height - 1) / 2]
         if len(values) == 4:
             fx, fy, cx, cy = values
             values = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
@@ -68,21 +64,12 @@ class Camera:
             )
         return cls(np.array(values).reshape(3, 3), height, width)
 
-    @classmethod
-    def from_field_of_view(cls, degrees: float, height: int, width: int) -> Camera:
-        """Assume square pixels, a centered axis and this horizontal field of view: a guess, for want of calibration."""
-        in_range("field of view", degrees, 1.0, 179.0)
-        focal = width / (2 * np.tan(np.radians(degrees) / 2))
-        return cls.from_numbers((focal, focal, (width - 1) / 2, (height - 1) / 2), height, width)
-
     def resized(self, height: int, width: int) -> Camera:
-        """Return the camera of the same picture at another size."""
-        y, x = height / self.height, width / self.width
+        """Return the camera of the same picture at another size, as `saunet.scale_intrinsics` does with torch."""
         K = self.K.astype(np.float64)
-        K[0, :2] *= x
-        K[1, :2] *= y
-        K[0, 2] = (self.K[0, 2] + 0.5) * x - 0.5  # as geometry.camera.scale_intrinsics, which needs torch
-        K[1, 2] = (self.K[1, 2] + 0.5) * y - 0.5
+        for row, zoom in ((0, width / self.width), (1, height / self.height)):
+            K[row, :2] *= zoom
+            K[row, 2] = (self.K[row, 2] + 0.5) * zoom - 0.5
         return Camera(K, height, width)
 
 
@@ -127,13 +114,91 @@ def write_ply(path: str | Path, cloud: PointCloud) -> None:
     )
     vertices = np.empty(len(cloud.points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
     vertices["xyz"], vertices["rgb"] = cloud.points, cloud.colors
-    buffer = io.BytesIO()
-    buffer.write(header.encode("ascii", "replace"))
-    buffer.write(vertices.tobytes())
-    write_bytes(path, buffer.getvalue())
+    write_bytes(path, header.encode("ascii", "replace") + vertices.tobytes())
 
 
-def jumps(disparity: Float32[np.ndarray, "h w"], share: float) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels around which disparity, and so depth, changes by more than ``share``."""
+def jumps(disparity: Float32[np.ndarray, "h w"], fraction: float) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels around which disparity, and so depth, changes by more than ``fraction``."""
     square = np.ones((3, 3), np.uint8)
-    return np.asarray(cv2.dilate(disparity, square) > (1 + share) * cv2.erode(disparity, square))
+    return np.asarray(cv2.dilate(disparity, square) > (1 + fraction) * cv2.erode(disparity, square))
+
+
+class ViewerWriter(Session):
+    """Writes predictions as one self-contained HTML page, to orbit the points and scrub through the clip.
+
+    Use it as a context manager: frames are written as they come, each adds about 0.1 MB at the default width, and the
+    page gets its name only when it is complete; leaving it by an error discards it.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        camera: Camera | Sequence[float | int],
+        *,
+        width: int = 320,
+        fps: float | int = 10.0,
+        max_depth: float | int | None = None,
+        edge: float = 0.15,
+        title: str = "saunet depth",
+    ) -> None:
+        self.path, self.count = Path(path), 0
+        if self.path.suffix.lower() not in (".html", ".htm"):
+            raise ConfigError(f"the page {path} must end in .html")
+        positive("width", width)
+        self._camera, self._width, self._rows = camera, width, 0
+        self._fps, self._title, self._edge = float(positive("fps", fps)), title, edge
+        self._max_depth = None if max_depth is None else positive("max_depth", max_depth)
+
+    def session(self) -> Iterator[None]:
+        self._before, rest = _PAGE.read_text(encoding="utf-8").split("@CLIP@")
+        self._between, after = rest.split("@FRAMES@")
+        with replacing(self.path) as temporary, temporary.open("w", encoding="utf-8") as self._page:
+            yield
+            if self.count == 0:
+                raise DataError(f"no frame was given, so {self.path} was not written")
+            self._page.write(after)
+
+    def add(self, prediction: Prediction) -> None:
+        if self.count == 0:
+            self._rows = max(1, round(self._width * prediction.depth.shape[0] / prediction.depth.shape[1]))
+            self._page.write(self._before + _json(self._head(prediction)) + self._between)
+        self._page.write(f'<script class="frame" type="application/json">{_json(self._frame(prediction))}</script>\n')
+        self.count += 1
+
+    def _head(self, prediction: Prediction) -> dict[str, Any]:
+        camera = self._camera
+        if not isinstance(camera, Camera):
+            camera = Camera.from_numbers(camera, *prediction.depth.shape)
+        K = camera.resized(self._rows, self._width).K
+        return {
+            "title": self._title,
+            "unit": prediction.unit,
+            "fps": self._fps,
+            "width": self._width,
+            "height": self._rows,
+            "intrinsics": [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
+            "pivot": float(np.percentile(prediction.depth, 30)),
+        }
+
+    def _frame(self, prediction: Prediction) -> dict[str, Any]:
+        disparity = np.asarray(resize(prediction.disparity, self._rows, self._width), dtype=np.float32)
+        keep = disparity > 0
+        if self._max_depth is not None:
+            keep &= disparity >= 1 / self._max_depth
+        if self._edge:
+            keep &= ~jumps(disparity, self._edge)
+        low, high = float(disparity.min()), float(disparity.max())
+        # levels 1 (low) to 65535 (high); 0 is left for points that are not shown
+        levels = 1 + np.round(np.clip((disparity - low) / (high - low if high > low else 1.0), 0, 1) * 65534)
+        jpeg = encode_jpeg(resize(prediction.image, self._rows, self._width), quality=85)
+        return {
+            "image": base64.b64encode(jpeg).decode(),
+            "disparity": base64.b64encode(np.where(keep, levels, 0).astype("<u2").tobytes()).decode(),
+            "low": low,
+            "high": high,
+        }
+
+
+def _json(value: dict[str, Any]) -> str:
+    """Return JSON that is safe inside a script element."""
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")

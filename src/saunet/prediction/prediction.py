@@ -13,13 +13,13 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
-from numpy.typing import NDArray
 
-from saunet.errors import CheckpointError, DataError, divisible, positive
+from saunet.errors import CheckpointError, ConfigError, DataError, divisible, positive
 from saunet.io.atomic import write_bytes
 from saunet.io.colormaps import colorize
 from saunet.io.images import as_rgb_bytes, network_input, read_image, write_image
 from saunet.runs.record import Scale
+from saunet.weights.locate import locate
 
 ImageLike = Any
 """A path, an h x w x 3 RGB array (bytes; gray, RGBA and 16-bit work too), or a 3 x h x w tensor (bytes or [0, 1])."""
@@ -91,14 +91,12 @@ class ImagePredictor(abc.ABC):
         scale: Factor to meters; None leaves depth relative.
         keep_aspect: Feed each image at its own aspect ratio, with about height x width pixels, not exactly that size.
         size_divisor: What the network's input sides must be multiples of.
-
-    Attributes:
-        undistort: Applied to every image first; predictions are of the image that it returns.
-        undistorted_by: Which camera that is for; None without.
     """
 
     undistort: Callable[[UInt8[np.ndarray, "_ _ 3"]], UInt8[np.ndarray, "_ _ 3"]] | None = None
+    """Applied to every image first; predictions are of the image that it returns."""
     undistorted_by: str | None = None
+    """Which camera that is for; None without."""
 
     def __init__(
         self, height: int, width: int, scale: Scale | None = None, keep_aspect: bool = False, size_divisor: int = 1
@@ -137,11 +135,7 @@ class ImagePredictor(abc.ABC):
         return self.predict_batch([image], [name] if name is not None else None)[0]
 
     def predict_batch(self, images: Sequence[ImageLike], names: Sequence[str] | None = None) -> list[Prediction]:
-        """Predict several images in as few runs of the network as their sizes allow; see `predict`.
-
-        Returns:
-            One prediction an image, in order, each at its image's own size.
-        """
+        """Predict images, each at its own size, in as few runs of the network as these allow; see `predict`."""
         arrays = [as_image(image) for image in images]
         if self.undistort is not None:
             arrays = [self.undistort(array) for array in arrays]
@@ -160,13 +154,10 @@ class ImagePredictor(abc.ABC):
         """Return the (height, width) at which an image of this size is fed to the network."""
         if not self.keep_aspect:
             return self.height, self.width
-        zoom = math.sqrt(self.height * self.width / (height * width))
-        step = self.size_divisor
+        zoom, step = math.sqrt(self.height * self.width / (height * width)), self.size_divisor
         longest = 4 * max(self.height, self.width)  # a 1 x 1000 image must not become a kilometer of pixels
-        return (
-            min(longest, max(step, step * round(height * zoom / step))),
-            min(longest, max(step, step * round(width * zoom / step))),
-        )
+        rows, columns = (min(longest, max(step, step * round(side * zoom / step))) for side in (height, width))
+        return rows, columns
 
     def _restore(
         self, disparity: Float32[np.ndarray, "_ _"], image: UInt8[np.ndarray, "h w 3"], name: str
@@ -186,18 +177,15 @@ def as_image(image: ImageLike) -> UInt8[np.ndarray, "h w 3"]:
     """Return RGB bytes from a path, an array or a tensor."""
     if isinstance(image, str | Path):
         return read_image(image)
-    if hasattr(image, "detach"):
-        return _from_tensor(image.detach().cpu().numpy())
     if isinstance(image, np.ndarray):
         if image.ndim == 3 and image.shape[0] == 3 and image.shape[2] not in (1, 3, 4):
             raise DataError(
                 f"the image array has shape {image.shape}; arrays are h x w x 3, use image.transpose(1, 2, 0)"
             )
         return as_rgb_bytes(image, "the image array")
-    raise DataError(f"an image is a path, an array or a tensor, got {type(image).__name__}")
-
-
-def _from_tensor(values: NDArray[Any]) -> UInt8[np.ndarray, "h w 3"]:
+    if not hasattr(image, "detach"):
+        raise DataError(f"an image is a path, an array or a tensor, got {type(image).__name__}")
+    values = image.detach().cpu().numpy()
     if values.ndim != 3 or values.shape[0] != 3:
         raise DataError(f"the image tensor has shape {tuple(values.shape)}; tensors are 3 x h x w, one image a tensor")
     if values.dtype.kind == "f":
@@ -207,3 +195,23 @@ def _from_tensor(values: NDArray[Any]) -> UInt8[np.ndarray, "h w 3"]:
             )
         values = np.round(values * 255).astype(np.uint8)
     return as_rgb_bytes(values.transpose(1, 2, 0), "the image tensor")
+
+
+def load(source: str | Path, *, device: str = "cpu", flip: bool = False, keep_aspect: bool = False) -> ImagePredictor:
+    """Load a trained model, however it is stored; see `saunet.load`. ONNX is run without even importing torch."""
+    path = locate(source)
+    if path.is_dir() and (path / "model.onnx").is_file() and not (path / "model.safetensors").is_file():
+        path = path / "model.onnx"
+    if path.suffix.lower() == ".onnx":
+        from saunet.exporting.onnx import OnnxPredictor
+
+        if keep_aspect:
+            raise ConfigError(
+                f"{path} is ONNX and takes one size of images; leave keep_aspect out or load a checkpoint"
+            )
+        return OnnxPredictor(path, device=device, flip=flip)
+    if path.suffix.lower() == ".pt2":
+        raise CheckpointError(f"{path} runs with torch alone; load the folder, its model.onnx or model.safetensors")
+    from saunet.prediction.predictor import Predictor
+
+    return Predictor.from_checkpoint(path, device, flip, keep_aspect)

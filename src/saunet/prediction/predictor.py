@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from pathlib import Path
 
@@ -48,7 +49,6 @@ class Predictor(ImagePredictor):
         self.device = usable_device(device)
         self.network = depth_net.to(self.device).eval()
         self.flip = flip
-        self._fingerprint: str | None = None
 
     @classmethod
     def from_checkpoint(
@@ -80,15 +80,13 @@ class Predictor(ImagePredictor):
                 disparity = flip_blend(disparity, self.network(batch.flip(-1)).disparity[0].float())
             return np.asarray(disparity[:, 0].cpu().numpy())
 
-    @property
+    @functools.cached_property
     def fingerprint(self) -> str:
         """A short hash of the weights and of the settings that change results."""
-        if self._fingerprint is None:
-            digest = hashlib.sha256()
-            for name, value in sorted(self.network.state_dict().items()):
-                digest.update(name.encode())
-                digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
-            factor = self.scale.factor if self.scale else None
-            digest.update(repr((self.height, self.width, self.flip, self.keep_aspect, factor)).encode())
-            self._fingerprint = digest.hexdigest()[:16]
-        return self._fingerprint
+        digest = hashlib.sha256()
+        for name, value in sorted(self.network.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+        factor = self.scale.factor if self.scale else None
+        digest.update(repr((self.height, self.width, self.flip, self.keep_aspect, factor)).encode())
+        return digest.hexdigest()[:16]

@@ -13,6 +13,7 @@ from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import ImagePredictor
 from saunet.prediction.sources import Input, Recording, camera_number
 from saunet.scale.options import ScaleOptions
+from saunet.weights.locate import shipped
 
 if TYPE_CHECKING:
     from saunet.types import TrainBatch
@@ -30,7 +31,9 @@ def apply_scale(
     if options.measures:
         import torch
 
-        from saunet.weights.locate import shipped
+        from saunet.runs.checkpoint import store_scale
+        from saunet.scale.estimate import estimate_scale
+        from saunet.weights.files import read_model
 
         if options.store and str(checkpoint) in shipped():
             raise ConfigError(
@@ -38,20 +41,21 @@ def apply_scale(
                 "as it is; leave scale.store out"
             )
 
-        from saunet.scale.estimate import estimate_scale
-
         def depth(image: Any) -> Any:
             return 1 / torch.from_numpy(predictor.disparity(image.numpy()))[:, None]
 
-        pose, offsets = _pose(checkpoint) if options.method == "speed" else (None, ())
+        pose, offsets = None, tuple[int, ...]()
+        if options.method == "speed":
+            model = read_model(checkpoint)
+            pose = model.networks()[1]
+            if pose is not None:
+                pose, offsets = pose.eval(), model.record.offsets
         with _batches(options, predictor, source, camera, offsets) as batches:
             estimate = estimate_scale(options.method, batches, depth, pose, options.camera_height)
         print(estimate)
         write_json(folder / "scale.json", estimate.as_json())
         predictor.scale = estimate.scale()
         if options.store:
-            from saunet.runs.checkpoint import store_scale
-
             store_scale(checkpoint, predictor.scale)
             print(f"stored in {checkpoint}")
     predictor.scale = options.chosen(predictor.scale)
@@ -63,56 +67,41 @@ def _batches(
 ) -> Iterator[Iterator[TrainBatch]]:
     from saunet.scale.recorded import clip_batches, read_speeds
 
-    method = options.method
+    method, more = options.method, dict[str, Any]()
     if camera_number(source) is not None:
         raise ConfigError(
             f"scale.method={method} measures over a whole recording and a live camera cannot be looked at beforehand; "
             "measure with scale.store=true on recorded frames, then leave scale.method out"
         )
-    if method != "speed" and camera is None:
-        raise _lacks(method, "camera", "fx,fy,cx,cy in pixels of the images")
+    if method != "speed":
+        K = _needed(method, "camera", camera, "fx,fy,cx,cy in pixels of the images")
+        more["intrinsics"] = lambda height, width: K.resized(height, width).K
     with contextlib.ExitStack() as stack:
-
-        def opened(what: Input) -> Recording:
-            recording = Recording(what)
-            stack.callback(recording.close)
-            return recording
-
-        recording, times = opened(source), list[float | None]()
+        recording, times = stack.enter_context(contextlib.closing(Recording(source))), list[float | None]()
 
         def pictures() -> Iterator[Any]:
             for frame in recording:
                 times.append(frame.time)
                 yield frame.read()
 
-        more: dict[str, Any] = {}
         if method == "speed":
-            if options.speeds is None:
-                raise _lacks(method, "scale.speeds", "a CSV file with the columns frame,speed")
-            table = read_speeds(options.speeds)
+            table = read_speeds(
+                _needed(method, "scale.speeds", options.speeds, "a CSV file with the columns frame,speed")
+            )
             table.check_drives([])
             clock = times if recording.timed and options.fps is None else None
             fps = options.fps or recording.fps
             more["distance"] = lambda first, second: table.distance("", first, second, fps, clock)
-        elif camera is not None:
-            more["intrinsics"] = lambda height, width: camera.resized(height, width).K
         if method == "stereo":
-            if options.partner is None:
-                raise _lacks(method, "scale.partner", "the other camera's images")
-            if options.baseline is None:
-                raise _lacks(method, "scale.baseline", "meters to the right camera")
-            more |= {"partner": (frame.read() for frame in opened(options.partner)), "baseline": options.baseline}
+            partner = _needed(method, "scale.partner", options.partner, "the other camera's images")
+            baseline = _needed(method, "scale.baseline", options.baseline, "meters to the right camera")
+            other = stack.enter_context(contextlib.closing(Recording(partner)))
+            more |= {"partner": (frame.read() for frame in other), "baseline": baseline}
         size = (predictor.height, predictor.width)
         yield clip_batches(pictures(), *size, offsets=offsets, most=options.frames, count=recording.declared, **more)
 
 
-def _pose(checkpoint: str | Path) -> tuple[Any, Sequence[int]]:
-    from saunet.weights.files import read_model
-
-    model = read_model(checkpoint)
-    pose = model.networks()[1]
-    return (None, ()) if pose is None else (pose.eval(), model.record.offsets)
-
-
-def _lacks(method: str, key: str, what: str) -> ConfigError:
-    return ConfigError(f"scale.method={method} needs {key}: {what}")
+def _needed(method: str, key: str, value: Any, what: str) -> Any:
+    if value is None:
+        raise ConfigError(f"scale.method={method} needs {key}: {what}")
+    return value

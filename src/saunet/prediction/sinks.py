@@ -1,35 +1,113 @@
-"""What predictions go into, one frame at a time: files a frame, a video, a page, a trajectory."""
+"""What predictions go into: files an image, a video, a page, a trajectory, and the one pass that fills all of them."""
 
 from __future__ import annotations
 
 import abc
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+import itertools
+import json
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from saunet.errors import one_of
-from saunet.io.colormaps import colorize
+from saunet.errors import ConfigError, DataError, one_of
+from saunet.io.atomic import Session, write_json
+from saunet.io.colormaps import RunningRange, colorize, depth_to_png16
+from saunet.io.images import write_image
+from saunet.io.plain import read_json
+from saunet.io.progress import bar
 from saunet.io.video import VideoWriter
-from saunet.prediction.files import ENDINGS, Manifest, Style, unfinished, write_output
 from saunet.prediction.panel import fit, label
-from saunet.prediction.pointcloud import Camera
-from saunet.prediction.prediction import Prediction
+from saunet.prediction.pointcloud import Camera, ViewerWriter, point_cloud, write_ply
+from saunet.prediction.prediction import ImagePredictor, Prediction
 from saunet.prediction.sources import Frame
-from saunet.prediction.viewer import ViewerWriter
 
 if TYPE_CHECKING:
     from saunet.prediction.odometer import Odometer
 
+ENDINGS = {"color": "_disparity.png", "png16": "_depth.png", "npy": "_depth.npy", "ply": "_points.ply"}
+OUTPUTS: tuple[str, ...] = tuple(ENDINGS)
+"""What can be written for each image: disparity in colors, depth as 16-bit PNG (x 256) or float32 array, points."""
 LAYOUTS: tuple[str, ...] = ("auto", "stacked", "beside")
 """Depth below the image, beside it, or whichever comes nearer to a screen's shape."""
+MANIFEST = "predictions.json"
+"""Written into the output folder: which model and settings its files come from."""
 
 
-class Sink(abc.ABC):
+@dataclass(frozen=True, slots=True)
+class Style:
+    """How results are drawn and written."""
+
+    colormap: str = "magma"
+    limits: tuple[float, float] | None = None
+    camera: Camera | None = None
+    max_depth: float | int | None = None
+
+
+class Manifest:
+    """What an output folder says its files come from."""
+
+    def __init__(self, folder: Path, predictor: ImagePredictor, style: Style, overwrite: bool) -> None:
+        self.path = folder / MANIFEST
+        self.settings: dict[str, object] = {
+            "model": predictor.fingerprint,
+            "unit": predictor.unit,
+            "undistorted": predictor.undistorted_by,
+            **dataclasses.asdict(dataclasses.replace(style, camera=None)),
+            "camera": style.camera.K.tolist() if style.camera else None,
+        }
+        self.clips: dict[str, Any] = {}
+        """How results of whole recordings were made, by the names of their files."""
+        self.written = False
+        if overwrite or not self.path.exists():
+            return
+        try:
+            previous = read_json(self.path)
+        except (OSError, ValueError) as reason:
+            raise DataError(
+                f"{self.path} cannot be read ({reason}); delete it, or choose another output folder"
+            ) from reason
+        current = json.loads(json.dumps(self.settings))
+        changed = [key for key in current if not isinstance(previous, dict) or previous.get(key) != current[key]]
+        if changed:
+            raise ConfigError(
+                f"{folder} holds predictions made with another {', '.join(changed)}; "
+                "choose another output folder, or set overwrite=true"
+            )
+        clips = previous.get("clips")
+        self.written, self.clips = True, clips if isinstance(clips, dict) else {}
+
+    def write(self, clips: Mapping[str, Any] | None = None) -> None:
+        """Write it, with further results of whole recordings."""
+        self.clips.update(clips or {})
+        write_json(self.path, {**self.settings, **({"clips": self.clips} if self.clips else {})})
+        self.written = True
+
+
+def write_output(output: str, stem: Path, result: Prediction, style: Style) -> Path:
+    """Write one of `OUTPUTS` of a prediction, whole or not at all, and return its path."""
+    path = stem.with_name(f"{stem.name}{ENDINGS[output]}")
+    if output == "color":
+        write_image(path, result.color(style.limits, style.colormap))
+    elif output == "png16":
+        write_image(path, depth_to_png16(result.depth))
+    elif output == "npy":
+        result.save(path)
+    else:
+        assert style.camera is not None  # the options have asked for it
+        write_ply(path, point_cloud(result, style.camera, max_depth=style.max_depth))
+    return path
+
+
+class Sink(Session, abc.ABC):
     """Takes predictions in order; leaving it by an error discards what is not complete."""
 
     paths: tuple[Path, ...]
@@ -38,15 +116,6 @@ class Sink(abc.ABC):
     @abc.abstractmethod
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
         """Take one more frame, and the color limits of the clip so far."""
-
-    def __enter__(self) -> Sink:
-        return self
-
-    @abc.abstractmethod
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Complete or discard."""
 
 
 class ImageFilesSink(Sink):
@@ -57,19 +126,18 @@ class ImageFilesSink(Sink):
         self._style, self._manifest, self._overwrite = style, manifest, overwrite
 
     def wanted(self, frame: Frame) -> Sequence[str]:
-        """Return the outputs of a frame that have to be written."""
-        return self.outputs if self._overwrite else unfinished(frame, self.paths[0], self.outputs)
+        """Return the outputs that are not there yet, or older than their image; files appear only when complete."""
+        if self._overwrite:
+            return self.outputs
+        changed = frame.image.stat().st_mtime if frame.image.exists() else 0.0
+        paths = {output: self.paths[0] / f"{frame.stem}{ENDINGS[output]}" for output in self.outputs}
+        return [output for output, path in paths.items() if not path.is_file() or path.stat().st_mtime < changed]
 
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
-        """Write what is not finished."""
         for output in self.wanted(frame):
             self.written.append(write_output(output, self.paths[0] / frame.stem, result, self._style))
-            self._manifest.claim()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Every file is complete already, and stays."""
+            if not self._manifest.written:  # only now: a run that writes nothing leaves nothing
+                self._manifest.write()
 
 
 class FrameFilesSink(Sink):
@@ -81,22 +149,16 @@ class FrameFilesSink(Sink):
     def __init__(self, folder: Path, outputs: Sequence[str], style: Style) -> None:
         self._outputs, self._style, self.paths = tuple(outputs), style, (folder,)
 
-    def __enter__(self) -> FrameFilesSink:
+    def session(self) -> Iterator[None]:
         for path in self.paths[0].glob("[0-9][0-9][0-9][0-9][0-9][0-9]_*"):
             if path.name[6:] in ENDINGS.values():
                 path.unlink()
-        return self
+        yield
 
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
-        """Write the frame's files."""
         style = dataclasses.replace(self._style, limits=limits)
         for output in self._outputs:
             write_output(output, self.paths[0] / Path(frame.stem).name, result, style)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Every file is complete already, and stays."""
 
 
 class VideoSink(Sink):
@@ -106,20 +168,14 @@ class VideoSink(Sink):
         self._layout, self._colormap, self._timed = one_of("layout", layout, LAYOUTS), colormap, timed
         self._writer, self.paths = VideoWriter(path, fps, codec), (path,)
 
-    def __enter__(self) -> VideoSink:
-        self._writer.__enter__()
-        return self
+    def session(self) -> Iterator[None]:
+        with self._writer:
+            yield
 
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
-        """Append a frame."""
         name = f"disparity ({'1/meter' if result.metric else 'relative'})"
         painted = colorize(result.disparity, limits, self._colormap)
         self._writer.write(compose(result.image, painted, self._layout, name), frame.time if self._timed else None)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._writer.__exit__(kind, error, trace)
 
 
 class ViewerSink(Sink):
@@ -129,18 +185,12 @@ class ViewerSink(Sink):
         self._writer = ViewerWriter(path, camera, fps=fps, max_depth=max_depth, title=title)
         self.paths = (path,)
 
-    def __enter__(self) -> ViewerSink:
-        self._writer.__enter__()
-        return self
+    def session(self) -> Iterator[None]:
+        with self._writer:
+            yield
 
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
-        """Append a frame."""
         self._writer.add(result)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._writer.__exit__(kind, error, trace)
 
 
 class TrajectorySink(Sink):
@@ -151,34 +201,102 @@ class TrajectorySink(Sink):
         self.paths = (path, path.with_suffix(".txt"), *((path.with_suffix(".tum"),) if timed else ()))
 
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
-        """Follow the camera to the next frame."""
         self._odometer.add(result.image)
         if frame.time is not None:
             self._times.append(frame.time)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            from saunet.io.trajectories import write_tum
-            from saunet.prediction.trajectory import write_trajectory
+    def session(self) -> Iterator[None]:
+        from saunet.io.trajectories import write_tum
+        from saunet.prediction.odometer import write_trajectory
 
-            poses = self._odometer.trajectory()
-            write_trajectory(self.paths[0], poses, self._odometer.scale is not None)
-            for path in self.paths[2:]:
-                write_tum(path, poses, np.array(self._times))
+        yield
+        poses = self._odometer.trajectory()
+        write_trajectory(self.paths[0], poses, self._odometer.scale is not None)
+        for path in self.paths[2:]:
+            write_tum(path, poses, np.array(self._times))
 
 
 def compose(
-    image: UInt8[np.ndarray, "h w 3"],
-    painted: UInt8[np.ndarray, "_ _ 3"],
-    layout: str = "auto",
-    name: str | None = None,
+    image: UInt8[np.ndarray, "h w 3"], painted: UInt8[np.ndarray, "_ _ 3"], layout: str = "auto", name: str = ""
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return one frame of a side-by-side video."""
+    """Return one frame of a side-by-side video, with names above the halves if one is given."""
     height, width = image.shape[:2]
     halves = [image, fit(painted, height, width)]
-    if name is not None:
+    if name:
         halves = [np.concatenate([label(t, width), h]) for t, h in zip(("input", name), halves, strict=True)]
     stacked = layout == "stacked" or (layout == "auto" and width * 3 > height * 4)
     return np.concatenate(halves, axis=0 if stacked else 1)
+
+
+def fill(
+    predictor: ImagePredictor,
+    frames: Iterable[Frame],
+    sinks: Sequence[Sink],
+    range_smoothing: float | int,
+    batch_size: int,
+    total: int | None,
+    *,
+    live: bool = False,
+    failures: list[str] | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> int:
+    """Predict every frame into every sink, with a few pictures in memory; return how many.
+
+    A picture that cannot be read becomes one sentence in ``failures`` if that is given, and is an error else; ``check``
+    has the last word before sinks are completed. Ctrl-C completes what a ``live`` recording has so far.
+    """
+    count, left, limits = 0, iter(frames), RunningRange(range_smoothing)
+    with contextlib.ExitStack() as stack:
+        stopped = stack.enter_context(_interrupt_noted(live))
+        for sink in sinks:
+            stack.enter_context(sink)
+        shown = stack.enter_context(bar())
+        task = shown.add_task("predicting", total=total)
+        try:
+            while not stopped() and (batch := list(itertools.islice(left, batch_size))):
+                pictures, kept = [], []
+                for frame in batch:
+                    try:
+                        pictures.append(frame.read())
+                        kept.append(frame)
+                    except DataError as error:
+                        if failures is None:
+                            raise
+                        failures.append(str(error))
+                for frame, result in zip(kept, predictor.predict_batch(pictures), strict=True):
+                    now = limits.update(result.disparity)
+                    for sink in sinks:
+                        sink.add(frame, result, now)
+                    count += 1
+                shown.advance(task, len(batch))
+            if stopped() and count == 0:
+                raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            if not live or stopped() or count == 0:
+                raise
+        check()
+    return count
+
+
+@contextlib.contextmanager
+def _interrupt_noted(wanted: bool) -> Iterator[Callable[[], bool]]:
+    """Note the first Ctrl-C of the block instead of raising; a second one raises as ever.
+
+    Raised in the middle of writing a frame, it would leave nobody knowing whether the frame is in the file. Where
+    Ctrl-C is ignored or another program handles it, and outside of the main thread, everything stays as it is.
+    """
+    noted, usual = threading.Event(), signal.default_int_handler
+    main = threading.current_thread() is threading.main_thread()
+    if not wanted or not main or signal.getsignal(signal.SIGINT) is not usual:
+        yield noted.is_set
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, usual)
+        noted.set()
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield noted.is_set
+    finally:
+        signal.signal(signal.SIGINT, usual)

@@ -6,9 +6,8 @@ import glob
 import itertools
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,39 +15,32 @@ import numpy as np
 from jaxtyping import UInt8
 
 from saunet.errors import ConfigError, DataError
-from saunet.io.images import IMAGE_SUFFIXES, image_size, natural_order, read_image
+from saunet.io.images import IMAGE_SUFFIXES, image_size, natural_order
 from saunet.io.video import VIDEO_SUFFIXES, CameraReader, VideoReader
-from saunet.prediction.prediction import as_image
+from saunet.prediction.prediction import ImageLike, as_image
 
 IMAGE_FPS = 10.0
 """Frames per second of images, KITTI's rate; files do not say."""
 STREAM_FPS = 25.0
 """Frames per second of a bare video stream that does not contain its rate."""
 
-Picture = UInt8[np.ndarray, "_ _ 3"]
 Input = str | Path | int | Sequence[str | Path] | Iterable[Any]
 """A video file, images (files, folders, patterns), a camera's number, or RGB arrays."""
 
 
-@dataclass(frozen=True, slots=True)
-class Source:
-    """One image file to predict, and the name of its results relative to the output folder, without ending."""
-
-    path: Path
-    stem: str
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One picture to predict."""
 
-    read: Callable[[], Picture]
+    image: ImageLike
+    """Its file, if it has one, which is read when it is needed."""
     stem: str
     """What its results are called, relative to the output folder."""
     time: float | None = None
     """Seconds since the first; None if unknown."""
-    path: Path | None = None
-    """Its file, if it is one."""
+
+    def read(self) -> UInt8[np.ndarray, "_ _ 3"]:
+        return as_image(self.image)
 
 
 class Recording:
@@ -61,20 +53,19 @@ class Recording:
         declared: How many pictures there are, as far as known.
         fps: Frames per second: as given, as recorded, or assumed.
         timed: Whether frames have times.
-
     """
 
     def __init__(self, source: Input, output_dir: str | Path | None = None, fps: float | int | None = None) -> None:
-        self.images: list[Source] | None = None
+        self.images: list[Frame] | None = None
         self._reader: VideoReader | CameraReader | None = None
         self._arrays: Iterable[Any] = ()
         self._size: tuple[int, int] | None = None
-        self.title, self.live, self.declared = title_of(source), camera_number(source) is not None, None
-        self.fps: float = float(fps or IMAGE_FPS)
         number = camera_number(source)
+        self.title, self.live, self.declared = title_of(source), number is not None, None
+        self.fps: float = float(fps or IMAGE_FPS)
         if number is not None:
             self._reader = CameraReader(number)
-        elif isinstance(source, str | Path) and is_video(source):
+        elif isinstance(source, str | Path) and _is_video(Path(source)):
             self._reader = VideoReader(source, fps)
         elif isinstance(source, str | Path) or (
             isinstance(source, Sequence) and all(isinstance(item, str | Path) for item in source)
@@ -93,45 +84,42 @@ class Recording:
 
     def __iter__(self) -> Iterator[Frame]:
         if self.images is not None:
-            for source in self.images:
-                yield Frame(partial(read_image, source.path), source.stem, None, source.path)
-            return
-        if self._reader is not None:
+            yield from self.images
+        elif self._reader is not None:
             for frame in self._reader.frames():
-                yield Frame(partial(_same, frame.image), f"{self.title}/{frame.number:06d}", frame.time)
-            return
-        for number, image in enumerate(self._arrays):
-            yield Frame(partial(_same, image), f"{self.title}/{number:06d}")
+                yield Frame(frame.image, f"{self.title}/{frame.number:06d}", frame.time)
+        else:
+            for number, image in enumerate(self._arrays):
+                yield Frame(image, f"{self.title}/{number:06d}")
 
     @property
     def first_size(self) -> tuple[int, int] | None:
         """(height, width) of the first picture that can be read; None if there is none."""
         if self._reader is not None:
             return self._reader.height, self._reader.width
-        problem: DataError | None = None
-        for source in self.images or ():
+        problems = list[DataError]()
+        for frame in self.images or ():
             try:
-                return image_size(source.path)
+                return image_size(frame.image)
             except DataError as error:
-                problem = problem or error
-        if problem is not None:
-            raise problem
+                problems.append(error)
+        if problems:
+            raise problems[0]
         return self._size
 
     @property
     def problems(self) -> list[str]:
         """What was wrong with a video that has been read to its end, a sentence each."""
-        reader, found = self._reader, []
-        if isinstance(reader, VideoReader):
-            if reader.missing:
-                found.append(f"{reader.name} ends {reader.missing} frames earlier than it declares: it is truncated")
-            if reader.damaged:
-                found.append(f"{reader.damaged} frames of {reader.name} are damaged and could not be decoded in full")
-            if reader.plain:
-                found.append(
-                    f"{reader.plain} of {reader.count} frames of {reader.name} have one single color; look at the video"
-                )
-        return found
+        reader = self._reader
+        if not isinstance(reader, VideoReader):
+            return []
+        name = reader.name
+        found = {
+            f"{name} ends {reader.missing} frames earlier than it declares: it is truncated": reader.missing,
+            f"{reader.damaged} frames of {name} are damaged and could not be decoded in full": reader.damaged,
+            f"{reader.plain} of {reader.count} frames of {name} have one single color; look at the video": reader.plain,
+        }
+        return [problem for problem, count in found.items() if count]
 
     @property
     def missing(self) -> int:
@@ -151,12 +139,8 @@ def camera_number(source: Input) -> int | None:
     return int(source) if isinstance(source, str) and source.isdecimal() and not Path(source).exists() else None
 
 
-def is_video(source: str | Path) -> bool:
-    """Return whether a path is taken for a video: anything that is not a folder, a pattern or an image file."""
-    path = Path(source)
-    if path.suffix.lower() in VIDEO_SUFFIXES:
-        return not path.is_dir()
-    return False
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
 
 
 def title_of(source: Input) -> str:
@@ -172,60 +156,51 @@ def title_of(source: Input) -> str:
     return path.resolve().name if path.is_dir() else path.stem or "frames"
 
 
-def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Path | None = None) -> list[Source]:
-    """Return the images that ``inputs`` name, each input's in natural order, without what lies in ``output_dir``."""
+def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Path | None = None) -> list[Frame]:
+    """Return the images that ``inputs`` name, ``frame_2`` before ``frame_10``, without what lies in ``output_dir``.
+
+    Results must not lie among the originals: the next run would read them as images.
+    """
     several = [inputs] if isinstance(inputs, str | Path) else list(inputs)
     if not several:
         raise DataError("no input given; give an image, a folder, or a pattern such as 'frames/*.png'")
     own = None if output_dir is None else Path(output_dir).resolve()
+    if own is not None and own.exists() and not own.is_dir():
+        raise ConfigError(f"the output folder {output_dir} is a file; choose another name")
     found: dict[Path, Path] = {}  # image -> its path relative to the input that named it
     for item in several:
         base, paths = _expand(item)
-        below = own is not None and base.resolve() in own.parents  # an earlier run's results are no inputs
-        kept = [path for path in paths if not (below and own in path.resolve().parents)]
-        if not kept:
-            raise _nothing(item)
-        if base.resolve() == own:  # the next run would predict this one's results
-            raise holds_originals(Path(str(output_dir)), kept[0])
-        for path in kept:
+        if own is not None and base.resolve() in own.parents:  # an earlier run's results are no inputs
+            paths = [path for path in paths if own not in path.resolve().parents]
+        if not paths:
+            raise DataError(f"no images in {item}; looked for files ending in {' '.join(sorted(IMAGE_SUFFIXES))}")
+        if base.resolve() == own:
+            raise _holds_originals(output_dir, paths[0])
+        for path in paths:
             found.setdefault(path, path.relative_to(base))
     stems = Counter(str(relative.with_suffix("")) for relative in found.values())
-    sources = []
-    taken: dict[str, Path] = {}
+    frames: dict[str, Frame] = {}
     for path, relative in found.items():
         stem = str(relative.with_suffix(""))
         if stems[stem] > 1:  # a.png beside a.jpg
             stem += f"_{path.suffix[1:].lower()}"
-        if stem in taken:
+        if stem in frames:
             raise ConfigError(
-                f"{taken[stem]} and {path} would both be written as '{stem}'; predict them into different folders"
+                f"{frames[stem].image} and {path} would both be written as '{stem}'; "
+                "predict them into different folders"
             )
-        taken[stem] = path
-        sources.append(Source(path, stem))
-    return sources
+        frames[stem] = Frame(path, stem)
+    if own is not None:
+        targets = {own, *((own / stem).resolve().parent for stem in frames)}
+        for path in found:
+            if path.resolve().parent in targets:
+                raise _holds_originals(output_dir, path)
+    return list(frames.values())
 
 
-def holds_originals(folder: Path, original: Path) -> ConfigError:
-    """Return the error for an output folder in which results would lie among the originals."""
-    return ConfigError(
-        f"the output folder {folder} holds the originals ({original}); choose another, such as {folder / 'depth'}"
-    )
-
-
-def image_paths(item: str | Path) -> list[Path]:
-    """Return the images that a file, folder or pattern names, in natural order: ``frame_2`` before ``frame_10``."""
-    paths = _expand(item)[1]
-    if not paths:
-        raise _nothing(item)
-    return paths
-
-
-def _same(image: Picture) -> Picture:
-    return image
-
-
-def _nothing(item: str | Path) -> DataError:
-    return DataError(f"no images in {item}; looked for files ending in {' '.join(sorted(IMAGE_SUFFIXES))}")
+def _holds_originals(folder: str | Path | None, original: Path) -> ConfigError:
+    other = Path(str(folder), "depth")
+    return ConfigError(f"the output folder {folder} holds the originals ({original}); choose another, such as {other}")
 
 
 def _expand(item: str | Path) -> tuple[Path, list[Path]]:
@@ -236,8 +211,8 @@ def _expand(item: str | Path) -> tuple[Path, list[Path]]:
     if path.is_file():
         return path.parent, [path]
     if glob.has_magic(str(item)):
-        fixed = _before_magic(path.parts)
-        return Path(*fixed), _images(Path(match) for match in glob.glob(str(item), recursive=True))
+        fixed = itertools.takewhile(lambda part: not glob.has_magic(part), path.parts[:-1])
+        return Path(*fixed), _images(map(Path, glob.glob(str(item), recursive=True)))
     raise DataError(f"no file or folder at {item}; check the path")
 
 
@@ -259,12 +234,3 @@ def _below(folder: Path) -> Iterator[Path]:
 
 def _images(paths: Iterable[Path]) -> list[Path]:
     return sorted((p for p in paths if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()), key=natural_order)
-
-
-def _before_magic(parts: Sequence[str]) -> list[str]:
-    fixed: list[str] = []
-    for part in parts[:-1]:
-        if glob.has_magic(part):
-            break
-        fixed.append(part)
-    return fixed

@@ -5,40 +5,29 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from saunet.errors import ConfigError, DataError, one_of, positive, usable_device
 from saunet.io.atomic import remove_partial_files
 from saunet.io.colormaps import COLORMAPS, RunningRange
 from saunet.io.video import CODECS
-from saunet.prediction import pipeline
-from saunet.prediction.files import OUTPUTS, Manifest, Style, check_folder_of
-from saunet.prediction.load import load
+from saunet.prediction import sinks
 from saunet.prediction.pointcloud import Camera
-from saunet.prediction.prediction import ImagePredictor
+from saunet.prediction.prediction import ImagePredictor, load
 from saunet.prediction.scaling import apply_scale
-from saunet.prediction.sinks import (
-    LAYOUTS,
-    FrameFilesSink,
-    ImageFilesSink,
-    Sink,
-    TrajectorySink,
-    VideoSink,
-    ViewerSink,
-)
-from saunet.prediction.sources import Frame, Input, Recording, Source
+from saunet.prediction.sinks import LAYOUTS, OUTPUTS, Sink, Style
+from saunet.prediction.sources import Frame, Input, Recording
 from saunet.scale.options import ScaleOptions
+from saunet.weights.locate import locate
 
 if TYPE_CHECKING:
     from saunet.prediction.odometer import Odometer
 
 CLIP_OUTPUTS: tuple[str, ...] = ("mp4", "html", "trajectory")
-"""What can be written for a recording as a whole, besides `saunet.prediction.files.OUTPUTS` for each of its frames."""
-
-_NAMES = {"mp4": "_disparity.mp4", "html": "_points.html", "trajectory": "_trajectory.png"}
+"""What can be written for a recording as a whole, besides `OUTPUTS` for each of its frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,169 +190,120 @@ def predict(
         default = ("mp4",) if recording.images is None else ("color", "png16")
         outputs = tuple(dict.fromkeys(options.outputs or default))
         if predictor is None:
-            device = _device(options.device)
+            device = str(usable_device(options.device))
             predictor = load(options.checkpoint, device=device, flip=options.flip, keep_aspect=options.keep_aspect)
         camera = _camera(options, recording, predictor)
         apply_scale(options.scale, predictor, options.input, camera, folder, options.checkpoint)
         print(f"depth is {predictor.unit}")
         remove_partial_files(folder)
         if "trajectory" in outputs and odometer is None:
-            odometer = _odometer(options, predictor)
+            from saunet.prediction.odometer import Odometer
+
+            path, device = locate(options.checkpoint), str(usable_device(options.device))
+            odometer = Odometer.from_model(path, predictor.scale, device, options.batch_size)
         style = Style(options.colormap, None, camera, options.max_depth)
-        if recording.images is None:
-            return _predict_clip(options, outputs, predictor, recording, style, odometer)
-        return _predict_images(options, outputs, predictor, recording, style, odometer)
-
-
-def _predict_clip(
-    options: PredictOptions,
-    outputs: Sequence[str],
-    predictor: ImagePredictor,
-    recording: Recording,
-    style: Style,
-    odometer: Odometer | None,
-) -> PredictResult:
-    """Predict a video, a camera or arrays in one pass; results are new or not written."""
-    sinks = _clip_sinks(options, outputs, recording, style, odometer)
-    files = [output for output in outputs if output in OUTPUTS]
-    if files:
-        sinks.append(FrameFilesSink(Path(options.output) / recording.title, files, style))
-    _refuse_existing(sinks, options.overwrite)
-    counts = pipeline.run(
-        predictor,
-        _first(recording, options.max_frames),
-        sinks,
-        RunningRange(options.range_smoothing),
-        batch_size=options.batch_size,
-        total=options.max_frames or recording.declared,
-        tolerant=False,
-        live=recording.live,
-    )
-    return PredictResult(
-        output=Path(options.output),
-        unit=predictor.unit,
-        frames=counts.frames,
-        clips=tuple(path for sink in sinks for path in sink.paths),
-        missing=recording.missing,
-        failures=tuple(recording.problems),
-    )
+        clips = _clip_sinks(options, outputs, recording, style, odometer)
+        files = tuple(output for output in outputs if output in OUTPUTS)
+        if recording.images is not None:
+            return _predict_images(options, predictor, recording, files, clips, style)
+        if files:
+            clips.append(sinks.FrameFilesSink(folder / recording.title, files, style))
+        for sink in clips:
+            _refuse_existing(sink, options.overwrite)
+        frames = itertools.islice(recording, options.max_frames)
+        total = options.max_frames or recording.declared
+        smoothing, batch = options.range_smoothing, options.batch_size
+        count = sinks.fill(predictor, frames, clips, smoothing, batch, total, live=recording.live)
+        return PredictResult(
+            output=folder,
+            unit=predictor.unit,
+            frames=count,
+            clips=tuple(path for sink in clips for path in sink.paths),
+            missing=recording.missing,
+            failures=tuple(recording.problems),
+        )
 
 
 def _predict_images(
     options: PredictOptions,
-    outputs: Sequence[str],
     predictor: ImagePredictor,
     recording: Recording,
+    outputs: Sequence[str],
+    clips: Sequence[Sink],
     style: Style,
-    odometer: Odometer | None,
 ) -> PredictResult:
     """Predict images into files of their own, and into results of the whole; what is finished and newer is skipped."""
-    folder, frames = Path(options.output), list(_first(recording, options.max_frames))
-    sources = (recording.images or [])[: options.max_frames]
-    check_folder_of(folder, sources)
-    manifest = Manifest(folder, predictor, style, options.overwrite)
-    clips = _clip_sinks(options, outputs, recording, style, odometer)
-    look = {
-        "fps": recording.fps,
-        "layout": options.layout,
-        "range_smoothing": float(options.range_smoothing),
-        "codec": options.codec,
-    }
-    known = {} if options.overwrite else manifest.clips
-    ours = [sink for sink in clips if _made_like(known.get(sink.paths[0].name), look)]
-    _refuse_existing([sink for sink in clips if sink not in ours], options.overwrite)
-    finished = [sink for sink in ours if _finished(sink, known[sink.paths[0].name], sources)]
-    todo = [sink for sink in clips if sink not in finished]
-
-    files = ImageFilesSink(
-        folder, [output for output in outputs if output in OUTPUTS], style, manifest, options.overwrite
-    )
+    folder, again = Path(options.output), options.overwrite
+    frames = (recording.images or [])[: options.max_frames]
+    smoothing, batch = float(options.range_smoothing), options.batch_size
+    look = {"fps": recording.fps, "layout": options.layout, "range_smoothing": smoothing, "codec": options.codec}
+    manifest = sinks.Manifest(folder, predictor, style, again)
+    todo, finished = list[Sink](), list[Sink]()
+    for sink in clips:
+        made = manifest.clips.get(sink.paths[0].name)  # with overwrite, nothing counts as made
+        made = made if isinstance(made, dict) else {}
+        ours = look.items() <= made.items()
+        if not ours:
+            _refuse_existing(sink, again)
+        whole = ours and made.get("images") == len(frames) and _newer(sink, frames)
+        (finished if whole else todo).append(sink)
+    files = sinks.ImageFilesSink(folder, outputs, style, manifest, again)
     unfinished = [frame for frame in frames if files.wanted(frame)]
+    failures = list[str]()
 
-    def check(counts: pipeline.Counts) -> None:
-        if counts.failures and len(counts.failures) == len(frames):
-            rest = len(counts.failures) - 1
-            raise DataError(counts.failures[0] + (f" (and {rest} more images cannot be read)" if rest else ""))
-        if counts.failures and todo:
+    def check() -> None:
+        if failures and len(failures) == len(frames):
+            rest = len(failures) - 1
+            raise DataError(failures[0] + (f" (and {rest} more images cannot be read)" if rest else ""))
+        if failures and todo:
             names = ", ".join(path.name for sink in todo for path in sink.paths)
-            raise DataError(f"{counts.failures[0]}; {names} would lack it, so nothing but single images was written")
+            raise DataError(f"{failures[0]}; {names} would lack it, so nothing but single images was written")
 
-    counts = pipeline.Counts()
-    if unfinished or todo:
-        wanted = frames if todo else unfinished
-        counts = pipeline.run(
-            predictor,
-            wanted,
-            [files, *todo],
-            RunningRange(options.range_smoothing),
-            batch_size=options.batch_size,
-            total=len(wanted),
-            tolerant=bool(files.outputs),
-            live=False,
-            check=check,
-        )
+    count, wanted, into = 0, frames if todo else unfinished, [files, *todo]
+    if wanted:
+        tolerated = failures if outputs else None
+        count = sinks.fill(predictor, wanted, into, smoothing, batch, len(wanted), failures=tolerated, check=check)
     if todo:
         manifest.write({sink.paths[0].name: {"images": len(frames), **look} for sink in todo})
     return PredictResult(
         output=folder,
         unit=predictor.unit,
-        frames=counts.frames,
+        frames=count,
         written=tuple(files.written),
-        skipped=len(frames) - len(unfinished) if files.outputs else None,
+        skipped=len(frames) - len(unfinished) if outputs else None,
         clips=tuple(path for sink in todo for path in sink.paths),
         finished=tuple(path for sink in finished for path in sink.paths),
-        failures=tuple(counts.failures),
+        failures=tuple(failures),
     )
 
 
 def _clip_sinks(
-    options: PredictOptions,
-    outputs: Sequence[str],
-    recording: Recording,
-    style: Style,
-    odometer: Odometer | None,
+    options: PredictOptions, outputs: Sequence[str], recording: Recording, style: Style, odometer: Odometer | None
 ) -> list[Sink]:
     """Return what takes the outputs that are made of a recording as a whole."""
-    folder, sinks = Path(options.output), list[Sink]()
-    paths = {output: folder / f"{recording.title}{_NAMES[output]}" for output in CLIP_OUTPUTS}
+    stem, fps, found = f"{Path(options.output) / recording.title}_", recording.fps, list[Sink]()
     if "mp4" in outputs:
-        timed = recording.timed and options.fps is None
-        sinks.append(VideoSink(paths["mp4"], recording.fps, options.layout, style.colormap, options.codec, timed))
+        path, timed = Path(f"{stem}disparity.mp4"), recording.timed and options.fps is None
+        found.append(sinks.VideoSink(path, fps, options.layout, style.colormap, options.codec, timed))
     if "html" in outputs and style.camera is not None:
-        sinks.append(ViewerSink(paths["html"], style.camera, recording.fps, options.max_depth, recording.title))
+        path = Path(f"{stem}points.html")
+        found.append(sinks.ViewerSink(path, style.camera, fps, options.max_depth, recording.title))
     if "trajectory" in outputs and odometer is not None:
-        sinks.append(TrajectorySink(paths["trajectory"], odometer, recording.timed))
-    return sinks
+        found.append(sinks.TrajectorySink(Path(f"{stem}trajectory.png"), odometer, recording.timed))
+    return found
 
 
-def _first(recording: Recording, count: int | None) -> Iterator[Frame]:
-    return itertools.islice(recording, count)
+def _newer(sink: Sink, frames: Sequence[Frame]) -> bool:
+    """Return whether all files of a sink are there, and none older than an image that it is made of."""
+    newest = max(frame.image.stat().st_mtime for frame in frames)
+    return all(path.is_file() and path.stat().st_mtime >= newest for path in sink.paths)
 
 
-def _refuse_existing(sinks: Sequence[Sink], overwrite: bool) -> None:
-    """Check that no sink would replace a file, or fill a folder that holds some, unless it is told to."""
-    for path in (path for sink in sinks for path in sink.paths):
+def _refuse_existing(sink: Sink, overwrite: bool) -> None:
+    """Check that a sink would not replace a file, or fill a folder that holds some, unless it is told to."""
+    for path in sink.paths:
         if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
             raise ConfigError(f"{path} exists; choose another output folder, or set overwrite=true")
-
-
-def _made_like(made: Any, look: dict[str, Any]) -> bool:
-    return isinstance(made, dict) and all(made.get(key) == value for key, value in look.items())
-
-
-def _finished(sink: Sink, made: dict[str, Any], sources: Sequence[Source]) -> bool:
-    if made.get("images") != len(sources) or not all(path.is_file() for path in sink.paths):
-        return False
-    newest = max(source.path.stat().st_mtime for source in sources)
-    return all(path.stat().st_mtime >= newest for path in sink.paths)
-
-
-def _device(name: str) -> str:
-    import torch
-
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    return str(usable_device(name))
 
 
 def _camera(options: PredictOptions, recording: Recording, predictor: ImagePredictor) -> Camera | None:
@@ -371,40 +311,32 @@ def _camera(options: PredictOptions, recording: Recording, predictor: ImagePredi
     given = options.camera if options.undistort is None else options.undistort
     if given is None or isinstance(given, Camera):
         return given
-    if isinstance(given, str | Path) and not _numbers(given):
-        from saunet.data.video.camera import Undistorter, read_camera
-
-        file = read_camera(given)
-        if options.undistort is not None:
-            predictor.undistort = undistorter = Undistorter(file)
-            predictor.undistorted_by = f"camera {hashlib.sha256(file.path.read_bytes()).hexdigest()[:16]}"
-            size = file.image_size or recording.first_size
-            if size is None:
-                return None
-            lens = undistorter.lens(*size)
-            return Camera(lens.K, lens.height, lens.width)
-        if not file.is_straight:
-            raise ConfigError(
-                f"camera={given} describes a lens with distortion, and points need straight images; "
-                f"set undistort={given} in its place"
-            )
+    numbers = _numbers(str(given)) if isinstance(given, str | Path) else given
+    if numbers is not None:
         size = recording.first_size
-        return None if size is None else Camera(file.intrinsics(*size, "the images"), *size)
+        return None if size is None else Camera.from_numbers(numbers, *size)
+    from saunet.data.video.camera import Undistorter, read_camera
+
+    file = read_camera(str(given))
+    if options.undistort is not None:
+        predictor.undistort = undistorter = Undistorter(file)
+        predictor.undistorted_by = f"camera {hashlib.sha256(file.path.read_bytes()).hexdigest()[:16]}"
+        size = file.image_size or recording.first_size
+        if size is None:
+            return None
+        lens = undistorter.lens(*size)
+        return Camera(lens.K, lens.height, lens.width)
+    if not file.is_straight:
+        raise ConfigError(
+            f"camera={given} describes a lens with distortion, and points need straight images; "
+            f"set undistort={given} in its place"
+        )
     size = recording.first_size
-    return None if size is None else Camera.from_numbers([float(each) for each in _numbers(given)], *size)
+    return None if size is None else Camera(file.intrinsics(*size, "the images"), *size)
 
 
-def _numbers(given: Any) -> list[Any]:
-    """Return the numbers that are given, also as text: ``80,80,44.5,29.5``; none for a file."""
-    if not isinstance(given, str | Path):
-        return list(given)
-    words = str(given).split(",")
-    return words if all(word.strip().replace(".", "", 1).replace("-", "", 1).isdigit() for word in words) else []
-
-
-def _odometer(options: PredictOptions, predictor: ImagePredictor) -> Odometer:
-    from saunet.prediction.odometer import Odometer
-    from saunet.weights.locate import locate
-
-    path = locate(options.checkpoint)
-    return Odometer.from_model(path, predictor.scale, _device(options.device), options.batch_size)
+def _numbers(text: str) -> list[float] | None:
+    """Return the numbers in a text such as ``80,80,44.5,29.5``; None for the name of a file."""
+    words = text.split(",")
+    plain = all(word.strip().replace(".", "", 1).replace("-", "", 1).isdigit() for word in words)
+    return [float(word) for word in words] if plain else None

@@ -14,7 +14,7 @@ from saunet.errors import ConfigError, SaunetError
 from saunet.io.colormaps import colorize
 from saunet.io.images import as_rgb_bytes, read_image, resize
 from saunet.prediction.predictor import Predictor
-from saunet.prediction.sources import image_paths
+from saunet.prediction.sources import find_sources
 from saunet.reporting.page import Picture, Scene, Tile
 from saunet.runs.checkpoint import read_checkpoint
 from saunet.runs.folder import Run
@@ -53,7 +53,7 @@ def read_views(scenes: Mapping[str, str | Sequence[str]], limit: int) -> list[Vi
         inputs = [given] if isinstance(given, str) else list(given or ())
         if not inputs:
             raise ConfigError(f"scenes.{condition} is empty; name an image, a folder or a pattern")
-        paths = [path for item in inputs for path in image_paths(item)]
+        paths = [frame.image for item in inputs for frame in find_sources(item)]
         if limit < len(paths):
             paths = [paths[int(place)] for place in np.linspace(0, len(paths) - 1, limit + 2).round()[1:-1]]
         views += [View(path, read_image(path), "/".join(path.parts[-4:]), condition) for path in paths]
