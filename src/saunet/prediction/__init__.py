@@ -13,6 +13,5 @@ if TYPE_CHECKING:
 
 __all__ = ["PredictOptions", "PredictResult", "Prediction", "Predictor", "predict"]
 __getattr__ = lazily(
-    __name__,
-    {"prediction": "Prediction", "predictor": "Predictor", "tool": "PredictOptions PredictResult predict"},
+    __name__, {"prediction": "Prediction", "predictor": "Predictor", "tool": "PredictOptions PredictResult predict"}
 )
