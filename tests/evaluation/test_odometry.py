@@ -28,7 +28,7 @@ from saunet.evaluation.paths import (
     write_errors,
     write_path,
 )
-from saunet.io.trajectories import read_kitti, read_tum
+from saunet.io.trajectories import read_kitti
 from saunet.registry import Spec
 
 
@@ -122,9 +122,9 @@ def test_files_are_read_back(tmp_path):
     write_path(path, tmp_path)
     for kind, poses in (("predicted", path.predicted), ("aligned", path.aligned), ("true", path.true)):
         np.testing.assert_allclose(read_kitti(tmp_path / f"{kind}_kitti.txt"), poses, atol=1e-12)
-        again, times = read_tum(tmp_path / f"{kind}_tum.txt")
-        np.testing.assert_allclose(again, poses, atol=1e-12)
-        np.testing.assert_array_equal(times, path.times)
+        table = np.loadtxt(tmp_path / f"{kind}_tum.txt")
+        np.testing.assert_allclose(table[:, 1:4], poses[:, :3, 3], atol=1e-12)
+        np.testing.assert_array_equal(table[:, 0], path.times)
     write_path(Path3d("no truth", path.predicted, path.times), tmp_path / "alone")
     assert sorted(file.name for file in (tmp_path / "alone").iterdir()) == ["predicted_kitti.txt", "predicted_tum.txt"]
     write_path(Path3d("no times", path.predicted), tmp_path / "timeless")

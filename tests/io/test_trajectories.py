@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from saunet.errors import DataError
-from saunet.io.trajectories import read_kitti, read_tum, write_kitti, write_tum
+from saunet.io.trajectories import read_kitti, write_kitti, write_tum
 
 
 def poses(n=5):
@@ -29,9 +29,10 @@ def test_tum_round_trip(tmp_path):
     path = tmp_path / "path.tum"
     times = np.arange(5) * 0.1037
     write_tum(path, poses(), times)
-    read, read_times = read_tum(path)
-    np.testing.assert_allclose(read, poses(), atol=1e-12)
-    np.testing.assert_array_equal(read_times, times)
+    table = np.loadtxt(path)
+    np.testing.assert_allclose(table[:, 1:4], poses()[:, :3, 3], atol=1e-12)
+    np.testing.assert_allclose(Rotation.from_quat(table[:, 4:]).as_matrix(), poses()[:, :3, :3], atol=1e-12)
+    np.testing.assert_array_equal(table[:, 0], times)
 
 
 def test_tum_columns(tmp_path):
@@ -75,14 +76,8 @@ def test_other_bad_input(tmp_path):
     (tmp_path / "picture").write_bytes(b"\x89PNG\xff")
     with pytest.raises(DataError, match=r"cannot read .*picture as text"):
         read_kitti(tmp_path / "picture")
-    (tmp_path / "short").write_text("0 1 2 3 0 0 0 1\n1 2 3\n")
-    with pytest.raises(DataError, match=r"line 2: expected 8 finite numbers \(time x y z qx qy qz qw\), got '1 2 3'"):
-        read_tum(tmp_path / "short")
     with pytest.raises(DataError, match="5 poses come with 4 times"):
         write_tum(tmp_path / "t", poses(), np.arange(4.0))
-    (tmp_path / "zero").write_text("0 1 2 3 0 0 0 0\n")
-    with pytest.raises(DataError, match="quaternion of length 0"):
-        read_tum(tmp_path / "zero")
 
 
 def test_a_comment_is_no_frame_of_a_kitti_file(tmp_path):

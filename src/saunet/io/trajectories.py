@@ -1,4 +1,4 @@
-"""The one reader and writer of trajectories, in the two formats that other tools read: KITTI's pose files and TUM's."""
+"""Trajectories in the formats that other tools read: KITTI's pose files, which are read too, and TUM's."""
 
 from __future__ import annotations
 
@@ -28,47 +28,31 @@ def write_tum(path: Path, T_world_cam: Float64[ndarray, "n 4 4"], times: Float64
     _write(path, np.column_stack((times, T_world_cam[:, :3, 3], quaternions)))
 
 
-def read_kitti(path: Path) -> Float64[ndarray, "n 4 4"]:
-    """Read camera-to-world poses from a KITTI pose file."""
-    table = _read(path, 12, "a 3 x 4 pose, row by row")
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3] = table.reshape(-1, 3, 4)
-    return poses
-
-
-def read_tum(path: Path) -> tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, " n"]]:
-    """Read camera-to-world poses and their times from a TUM trajectory."""
-    table = _read(path, 8, "time x y z qx qy qz qw", comments=True)
-    if not np.linalg.norm(table[:, 4:], axis=1).all():
-        raise DataError(f"{path} holds a quaternion of length 0; each must be a rotation")
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
-    poses[:, :3, 3] = table[:, 1:4]
-    return poses, table[:, 0]
-
-
 def _write(path: Path, table: Float64[ndarray, "n k"]) -> None:
     lines = (" ".join(f"{value:.17g}" for value in row) for row in table)
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
-def _read(path: Path, columns: int, meaning: str, comments: bool = False) -> Float64[ndarray, "n k"]:
-    expected = f"{columns} finite numbers ({meaning})"
+def read_kitti(path: Path) -> Float64[ndarray, "n 4 4"]:
+    """Read camera-to-world poses from a KITTI pose file."""
+    expected = "12 finite numbers (a 3 x 4 pose, row by row)"
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"cannot read {path} as text ({error}); expected lines of {expected}") from error
     rows = []
     for number, line in enumerate(lines, start=1):
-        if not line.strip() or (comments and line.startswith("#")):
+        if not line.strip():
             continue
         try:
             row = [float(word) for word in line.split()]
         except ValueError:
             row = []
-        if len(row) != columns or not np.isfinite(row).all():
+        if len(row) != 12 or not np.isfinite(row).all():
             raise DataError(f"{path}, line {number}: expected {expected}, got '{line.strip()[:60]}'")
         rows.append(row)
     if not rows:
         raise DataError(f"{path} holds no pose; expected lines of {expected}; copy the file again")
-    return np.array(rows, dtype=np.float64)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = np.array(rows).reshape(-1, 3, 4)
+    return poses
