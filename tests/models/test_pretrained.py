@@ -337,12 +337,13 @@ class TestFiles:
         self, content: bytes | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         public = PUBLIC_WEIGHTS["efficientnet_lite0"]
+        assert public.package
         info = tmp_path / f"{public.package.replace('-', '_')}-0.1.0.dist-info"
         info.mkdir()
         (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {public.package}\nVersion: 0.1.0\n")
         if content is not None:
-            (tmp_path / public.path).parent.mkdir(parents=True)
-            (tmp_path / public.path).write_bytes(content)
+            (tmp_path / public.place).parent.mkdir(parents=True)
+            (tmp_path / public.place).write_bytes(content)
         monkeypatch.setattr(sys, "path", [str(tmp_path)])
         with pytest.raises(CheckpointError, match=r"(no file|has sha256) .* --force-reinstall"):
             locate("efficientnet_lite0")
