@@ -19,16 +19,12 @@ from saunet.types import FeatureSpec
 class AUNetDecoder(Decoder):
     """AU-Net (SAU-Net section III-C, eq. (5), fig. 3): project, add the upsampled deeper map, refine, enlarge.
 
-    Coarse to fine, the parts and where the paper has them:
-
     - *Projection*: a 1×1 convolution brings each feature f_k to a common width ("projected onto the same dimensional
       space"), so that features join by addition instead of concatenation.
     - *Bottleneck* (`AttentionBottleneck`), at the deepest level only: "the size of the feature map is reduced to half,
       crucial features are captured through the attention mechanism, and a 2× upsampling restores the size".
-    - *Sum*, eq. (5): x_s = Σ_{k≤s} (f_k)↑, kept as a running sum: each level adds the bilinearly doubled map of the
-      level below to its own projection.
-    - *Mapping* (`Mapping`): 3×3 and 1×1 convolution at every level. It is added to its input, so that the plain sum of
-      eq. (5) stays in what is passed up.
+    - *Sum*, eq. (5): x_s = Σ_{k≤s} (f_k)↑, kept as a running sum, bilinearly doubled from level to level.
+    - *Mapping* (`Mapping`), at every level: added to its input, so that the plain sum of eq. (5) stays in what goes up.
     - *Heads*: 3×3 convolution and sigmoid at 1/1, 1/2, 1/4, 1/8.
 
     Full resolution has three times the pixels of all other levels together and no feature of its own, so it is narrower
