@@ -45,7 +45,6 @@ class EvaluationData(Protocol):
     """What an evaluation needs of a data module."""
 
     ground_truth: str
-    protocol: str
     neighbors: Sequence[str]
 
     @property

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from saunet.errors import ConfigError, DataError
 from saunet.evaluation.result import ERROR_COLUMNS, ImageRow, read_rows
 from saunet.evaluation.statistics import compare as paired
-from saunet.reporting.groups import Groups
 from saunet.reporting.inputs import Evaluation, Inputs, read_evaluation
+from saunet.reporting.tables import Groups
 from saunet.runs.folder import SUBJECTS, Run
 from saunet.runs.sweep import differing, labels, values
 from saunet.tables import Column, Row, Table

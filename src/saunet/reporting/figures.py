@@ -8,9 +8,9 @@ from typing import Any
 
 from saunet.errors import DataError
 from saunet.published import published
-from saunet.reporting.groups import Groups, chosen, comparable
 from saunet.reporting.page import Missing
 from saunet.reporting.scenes import Seen
+from saunet.reporting.tables import Groups, chosen, comparable
 from saunet.runs.folder import Run, read_mapping
 from saunet.runs.sweep import RATIO, ratio
 from saunet.tables import Row, Table, columns

@@ -19,10 +19,10 @@ from saunet.io.atomic import check_folder
 from saunet.published import published
 from saunet.reporting import figures, tables
 from saunet.reporting.compare import compared
-from saunet.reporting.groups import Groups, comparable
 from saunet.reporting.inputs import Inputs, collect
 from saunet.reporting.page import Document, Figure, Gallery, Missing, Picture, Scene, Section, write
 from saunet.reporting.scenes import Seen, View, look, read_views, scene
+from saunet.reporting.tables import Groups, comparable
 from saunet.runs.folder import Run
 from saunet.runs.sweep import differing, labels, sweeps_ratio
 from saunet.tables import Table, show
@@ -241,9 +241,8 @@ def _runs(groups: Sequence[_Group], draw: bool, missing: list[Missing]) -> list[
             continue
         drawing = figures.draw_ratio(group.runs)
         if drawing is None:
-            missing.append(
-                Missing(f"Errors against α/β of {group.title}", "fewer than two jobs have scores that compare")
-            )
+            why = "fewer than two jobs have scores that compare"
+            missing.append(Missing(f"Errors against α/β of {group.title}", why))
             continue
         shared = list(comparable(group.runs).values())
         caption = f"Errors against the ratio of eq. (14). {Groups(shared)(shared[0])}."
