@@ -23,6 +23,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from saunet.cli import config
+from saunet.cli.app import table
+from saunet.cli.compose import Composed, options
 from saunet.data.loading.windows import DRAWS
 from saunet.registry import instantiate
 from saunet.training.speed import Speed
@@ -41,7 +43,7 @@ def build(overrides: list[str], batch: int) -> tuple[Any, Any]:
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     data = instantiate(plain["data"])
     torch.manual_seed(0)
-    return assemble(TrainOptions.from_plain(plain), data), data
+    return assemble(options(TrainOptions, Composed(plain, {}, (), ""), table()), data), data
 
 
 def random_frames(batch: int, offsets: int, device: str) -> dict[str, Any]:
@@ -77,7 +79,7 @@ class Timer:
 
 
 def step(model: Any, data: Any, frames: Any, optimizer: Any, timer: Any, precision: str) -> None:
-    """One training step, part by part, as `SelfSupervisedDepth.predict_and_compare` does it."""
+    """One training step, part by part, as `SelfSupervisedDepth.step` does it."""
     device = frames["frames"].device.type
     with timer("1 device transforms"):
         batch = data.on_after_batch_transfer(frames, 0)

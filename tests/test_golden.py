@@ -9,10 +9,11 @@ from __future__ import annotations
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from training_options import train_options
 
 from saunet.cli import config
 from saunet.registry import instantiate
-from saunet.training.tool import TrainOptions, assemble
+from saunet.training.tool import assemble
 
 GOLDEN: dict[str, list[float]] = {
     "saunet": [1.4267, 1.39975, 1.28687, 1.25977],  # per image since the masked mean does not pool the batch
@@ -29,7 +30,7 @@ def test_the_first_losses_of_a_seeded_training(objective: str) -> None:
         )
     torch.manual_seed(cfg.seed)
     data = instantiate(config.plain(cfg.data))
-    model = assemble(TrainOptions.from_plain({key: config.plain(cfg[key]) for key in cfg if key != "plugins"}), data)
+    model = assemble(train_options({key: config.plain(cfg[key]) for key in cfg if key != "plugins"}), data)
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
     data.setup("fit")
     losses = []

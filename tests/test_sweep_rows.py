@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 from hydra import compose
+from training_options import train_options
 
 from saunet.cli import app, words
 from saunet.cli.config import config_dir, plain
 from saunet.errors import ConfigError
 from saunet.tools.benchmark.tool import PAPER_METHODS
-from saunet.training.tool import TrainOptions
 
 pytestmark = pytest.mark.usefixtures("hydra")
 
@@ -26,7 +26,7 @@ SMOKE = ("trainer=smoke", "data=synthetic_tiny")
 
 def resolved(*overrides: str) -> dict[str, Any]:
     cfg = compose("train", overrides=["output_dir=/tmp/x", *overrides])
-    TrainOptions.from_plain({key: plain(cfg[key]) for key in cfg if key != "plugins"})
+    train_options({key: plain(cfg[key]) for key in cfg if key != "plugins"})
     return {key: plain(cfg[key]) for key in cfg}
 
 

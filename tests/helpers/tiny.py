@@ -33,27 +33,29 @@ from saunet.types import DepthPyramid
 
 
 class Wall(Drive):
-    """A camera that drives towards a textured wall."""
+    """A camera that drives towards a textured wall: depth is known in closed form; images of 48x32 times ``scale``."""
 
     name = ""
     indices = range(0)
 
-    def __init__(self, name: str, frames: int = 8, seed: int = 0) -> None:
-        self.name = name
+    def __init__(self, name: str, frames: int = 8, seed: int = 0, scale: int = 1) -> None:
+        self.name, self.scale = name, scale
         self.indices = range(frames)
-        noise = np.random.default_rng(seed).integers(0, 255, (20, 30, 3), dtype=np.uint8)
-        self._texture = cv2.resize(noise, (240, 160), interpolation=cv2.INTER_CUBIC)
+        noise = np.random.default_rng(seed).integers(0, 255, (20 * scale, 30 * scale, 3), dtype=np.uint8)
+        self._texture = cv2.resize(noise, (240 * scale, 160 * scale), interpolation=cv2.INTER_CUBIC)
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        margin = 2 * index
-        cut = self._texture[margin : 160 - margin, margin * 3 // 2 : 240 - margin * 3 // 2]
-        return np.asarray(cv2.resize(cut, (48, 32), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        margin, (height, width) = 2 * self.scale * index, self._texture.shape[:2]
+        cut = self._texture[margin : height - margin, margin * 3 // 2 : width - margin * 3 // 2]
+        size = (48 * self.scale, 32 * self.scale)
+        return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
-        return np.array([[30.0, 0, 23.5], [0, 30.0, 15.5], [0, 0, 1]])
+        focal, x, y = 30.0 * self.scale, 24.0 * self.scale - 0.5, 16.0 * self.scale - 0.5
+        return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
 
     def depth(self, index: int) -> NDArray[np.float32]:
-        return np.full((32, 48), 20.0 - index, np.float32)
+        return np.full((32 * self.scale, 48 * self.scale), 20.0 - index, np.float32)
 
     def pose(self, index: int) -> None:
         return None
@@ -64,10 +66,11 @@ class TinyWalls(DepthDataModule):
 
     ground_truth = "exact"
     protocol = "synthetic"
+    scale = 1
 
     def select(self, split: str) -> Sequence[Selection]:
         names = {"train": [1, 2]}.get(split, [3])
-        return [Selection(Wall(f"{split} {seed}", seed=seed), range(8)) for seed in names]
+        return [Selection(Wall(f"{split} {seed}", seed=seed, scale=self.scale), range(8)) for seed in names]
 
 
 class TinyDepth(nn.Module):

@@ -80,13 +80,15 @@ def test_a_new_run_in_the_folder_begins_a_new_record(tmp_path: Path) -> None:
 
 def test_a_run_that_vanished_is_marked_failed_once(tmp_path: Path) -> None:
     RunRecord(tmp_path, "trial").start()
-    assert mark_lost(tmp_path)
+    mark_lost(tmp_path)
     assert content(tmp_path)["status"] == "failed"
     assert "killed" in content(tmp_path)["error"]
-    assert not mark_lost(tmp_path)
+    mark_lost(tmp_path, "once more")
+    assert "killed" in content(tmp_path)["error"]
     (tmp_path / "run.json").write_text("half a rec")
     assert read(tmp_path) == {}
-    assert not mark_lost(tmp_path / "nowhere")
+    mark_lost(tmp_path / "nowhere")
+    assert not (tmp_path / "nowhere").exists()
 
 
 def test_a_folder_that_cannot_be_written_to_is_one_sentence(tmp_path: Path) -> None:

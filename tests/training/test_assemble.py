@@ -7,18 +7,19 @@ from typing import Any
 
 import pytest
 import torch
+from training_options import train_options
 
 from saunet.data.loading.module import DepthDataModule
 from saunet.errors import CheckpointError, ConfigError
 from saunet.models.encoders.resnet import ResNet
-from saunet.training.tool import TrainOptions, assemble
+from saunet.training.tool import assemble
 
 
 def test_training_starts_from_the_named_weights(config: dict[str, Any], walls: DepthDataModule, tmp_path: Path) -> None:
     public = ResNet((2, 2, 2, 2))
     torch.save(public.state_dict(), tmp_path / "w.pth")
     config["model"]["encoder"]["weights"] = str(tmp_path / "w.pth")
-    model = assemble(TrainOptions.from_plain(config), walls)
+    model = assemble(train_options(config), walls)
     torch.testing.assert_close(model.depth.encoder.layer3[1].conv2.weight, public.layer3[1].conv2.weight)
     assert model.record["model"]["encoder"]["weights"] == str(tmp_path / "w.pth")  # what it started from stays known
 
@@ -36,15 +37,13 @@ def test_training_starts_from_the_named_weights(config: dict[str, Any], walls: D
 def test_a_monitor_that_nothing_measures_is_refused(
     config: dict[str, Any], walls: DepthDataModule, change: dict[str, Any], words: str
 ) -> None:
-    assemble(TrainOptions.from_plain({**config, "monitor": "val/photometric"}), walls)
+    assemble(train_options({**config, "monitor": "val/photometric"}), walls)
     with pytest.raises(ConfigError, match=words):
-        assemble(TrainOptions.from_plain({**config, **change}), walls)
+        assemble(train_options({**config, **change}), walls)
 
 
 def test_weights_that_cannot_be_had_stop_it(config: dict[str, Any], walls: DepthDataModule) -> None:
     config["model"]["encoder"]["weights"] = "missing/w.pth"
     with pytest.raises(CheckpointError, match=r"weights is 'missing/w\.pth', but there is no such file"):
-        assemble(TrainOptions.from_plain(config), walls)
-    assemble(
-        TrainOptions.from_plain(config), walls, pretrained=False
-    )  # a resumed training does not need the file any more
+        assemble(train_options(config), walls)
+    assemble(train_options(config), walls, pretrained=False)  # a resumed training does not need the file any more

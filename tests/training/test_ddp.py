@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 import torch
+from training_options import train_options
 
 from saunet.errors import ConfigError
-from saunet.training.tool import TrainOptions
 
 pytestmark = pytest.mark.ddp
 
@@ -67,7 +67,7 @@ def test_two_processes_validate_exactly_like_one(tmp_path: Path) -> None:
 def test_spawned_processes_are_refused_with_the_reason(config: dict[str, Any]) -> None:
     for strategy in ("ddp_spawn", {"_target_": "lightning.pytorch.strategies.DDPStrategy", "start_method": "spawn"}):
         with pytest.raises(ConfigError, match=r"trainer\.strategy is .*a signal would end"):
-            TrainOptions.from_plain({**config, "trainer": {"strategy": strategy}})
+            train_options({**config, "trainer": {"strategy": strategy}})
 
 
 def test_a_sweep_over_processes_is_refused_with_the_ways_out(tmp_path: Path) -> None:

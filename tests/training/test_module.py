@@ -15,6 +15,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor, nn
+from training_options import train_options
 
 import saunet
 from saunet.data.loading.module import DepthDataModule
@@ -24,7 +25,7 @@ from saunet.io.images import read_image
 from saunet.runs.checkpoint import read_checkpoint
 from saunet.training.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
 from saunet.training.module import SelfSupervisedDepth
-from saunet.training.tool import TrainOptions, assemble
+from saunet.training.tool import assemble
 from saunet.types import EvalBatch
 
 
@@ -35,7 +36,7 @@ def batch(walls: DepthDataModule) -> EvalBatch:
 
 
 def test_a_step_trains_every_parameter(model: SelfSupervisedDepth, batch: EvalBatch) -> None:
-    _, views, terms = model.step(batch)
+    _, _, views, terms = model.step(batch)
     terms.total.backward()
     assert len(views) == 4
     assert all(view.image.shape == batch["loss_sources"].shape for view in views)
@@ -93,7 +94,7 @@ def test_a_resumed_training_equals_the_uninterrupted_one_bit_for_bit(
     config: dict[str, Any], walls: DepthDataModule, make_trainer: Callable[..., Trainer], tmp_path: Path
 ) -> None:
     torch.manual_seed(0)
-    model = assemble(TrainOptions.from_plain(config), walls)
+    model = assemble(train_options(config), walls)
     twin = copy.deepcopy(model)
     straight = make_trainer(max_epochs=3)
     straight.fit(model, walls)
@@ -101,7 +102,7 @@ def test_a_resumed_training_equals_the_uninterrupted_one_bit_for_bit(
     stop = [ModelCheckpoint(tmp_path, save_last=True), StopAfterTwoEpochs()]
     make_trainer(max_epochs=3, callbacks=stop, enable_checkpointing=True).fit(twin, copy.deepcopy(walls))
     torch.manual_seed(99)  # what happened in between must not matter
-    resumed = assemble(TrainOptions.from_plain(config), walls)
+    resumed = assemble(train_options(config), walls)
     make_trainer(max_epochs=3).fit(resumed, copy.deepcopy(walls), ckpt_path=tmp_path / "last.ckpt", weights_only=True)
     expected, got = _weights(model), _weights(resumed)
     assert expected.keys() == got.keys()
@@ -118,9 +119,7 @@ def test_last_is_the_last_and_best_is_the_best(
     def fit(folder: Path, epochs: int, resume: Path | None = None) -> None:
         callbacks = [Worsening(), LastCheckpoint(str(folder)), BestCheckpoint(str(folder), "score")]
         trainer = make_trainer(max_epochs=epochs, limit_train_batches=1, limit_val_batches=1, callbacks=callbacks)
-        trainer.fit(
-            assemble(TrainOptions.from_plain(config), walls), copy.deepcopy(walls), ckpt_path=resume, weights_only=True
-        )
+        trainer.fit(assemble(train_options(config), walls), copy.deepcopy(walls), ckpt_path=resume, weights_only=True)
 
     make_trainer = partial(make_trainer, enable_checkpointing=True)
     fit(tmp_path / "a", 3)
@@ -136,7 +135,7 @@ def test_best_falls_back_to_the_loss_where_nothing_has_ground_truth(
 ) -> None:
     best = BestCheckpoint(str(tmp_path), "val/nothing")
     trainer = make_trainer(max_epochs=1, limit_train_batches=1, callbacks=[best], enable_checkpointing=True)
-    trainer.fit(assemble(TrainOptions.from_plain(config), walls), walls)
+    trainer.fit(assemble(train_options(config), walls), walls)
     assert best.monitor == "val/loss"
     assert (tmp_path / "best.ckpt").is_file()
 
@@ -169,7 +168,7 @@ def test_where_more_is_better_the_highest_is_kept(
 
     best = Best(str(tmp_path), "val/a1")
     make_trainer = partial(make_trainer, enable_checkpointing=True, limit_train_batches=1, limit_val_batches=1)
-    make_trainer(max_epochs=3, callbacks=[best]).fit(assemble(TrainOptions.from_plain(config), walls), walls)
+    make_trainer(max_epochs=3, callbacks=[best]).fit(assemble(train_options(config), walls), walls)
     assert read_checkpoint(tmp_path / "best.ckpt").epoch == 1
     assert best.cost == pytest.approx(-0.9)
 
@@ -192,7 +191,7 @@ def test_without_validation_the_mean_loss_of_the_epoch_decides(
         max_epochs=2, limit_train_batches=2, limit_val_batches=0, callbacks=[Watch(), best], enable_checkpointing=True
     )
     with caplog.at_level("INFO"):
-        trainer.fit(assemble(TrainOptions.from_plain(config), walls), walls)
+        trainer.fit(assemble(train_options(config), walls), walls)
     assert best.cost == pytest.approx(min(sum(losses[:2]), sum(losses[2:])) / 2, rel=1e-4)
     said = [each.getMessage() for each in caplog.records if "best.ckpt" in each.getMessage()]
     assert said == ["val/a1 is not measured in this run; best.ckpt is chosen by the epoch's mean train/loss"]
@@ -212,11 +211,11 @@ def test_a_picture_is_written_after_every_epoch(
 def test_parts_that_do_not_fit_are_refused(config: dict[str, Any], walls: DepthDataModule) -> None:
     config["model"]["pose"]["offsets"] = [-2, 2]
     with pytest.raises(ConfigError, match=r"model.pose.offsets is \[-2, 2\] but the data give frames at \[-1, 1\]"):
-        assemble(TrainOptions.from_plain(config), walls)
+        assemble(train_options(config), walls)
     config["model"]["pose"]["offsets"] = [-1, 1]
     walls.height = 90
     with pytest.raises(ConfigError, match="nearest valid size is 96x96"):
-        assemble(TrainOptions.from_plain(config), walls)
+        assemble(train_options(config), walls)
 
 
 @pytest.mark.parametrize("parts", [2, 4])

@@ -14,15 +14,19 @@ import pytest
 import tiny
 import torch
 from lightning import Callback, LightningModule, Trainer
+from training_options import train_options
 
 from saunet.errors import CheckpointError, ConfigError
+from saunet.exporting.box import pack
 from saunet.registry import poses
+from saunet.runs.checkpoint import atomic_save, read_checkpoint
 from saunet.runs.folder import Stopped
 from saunet.training.callbacks import LastCheckpoint
 from saunet.training.optim import Recipe
 from saunet.training.resume import changes, check_resume, resume_path, warm_start
 from saunet.training.stopping import GracefulStop
-from saunet.training.tool import TrainOptions, assemble
+from saunet.training.tool import assemble
+from saunet.weights import locate
 
 EPOCHS = 3
 BATCHES = 18  # twelve windows in batches of two, three epochs; two batches a step
@@ -131,15 +135,15 @@ def test_what_lacks_the_state_of_a_training_is_not_resumed(
     spoil: Any, words: str, config: dict[str, Any], walls: Any, tmp_path: Path
 ) -> None:
     few = {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 0}
-    model = assemble(TrainOptions.from_plain(config), walls)
+    model = assemble(train_options(config), walls)
     tiny.tiny_trainer(tmp_path, **few, callbacks=[LastCheckpoint(str(tmp_path))]).fit(model, walls)
     last = tmp_path / "last.ckpt"
-    assert check_resume(model, str(last), walls) == 1
+    assert check_resume(model, read_checkpoint(last), walls) == 1
     stored = torch.load(last, weights_only=True)
     spoil(stored)
     torch.save(stored, last)
     with pytest.raises(CheckpointError, match=rf"{words}.*init_from="):
-        check_resume(model, str(last), walls)
+        check_resume(model, read_checkpoint(last), walls)
 
 
 def test_a_second_interrupt_ends_at_once(tmp_path: Path) -> None:
@@ -185,13 +189,11 @@ def test_where_a_run_resumes_from(tmp_path: Path) -> None:
 
 
 def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Path, config: Any, walls: Any) -> None:
-    from saunet.runs.checkpoint import atomic_save
-
     with torch.no_grad():
         next(model.depth.parameters()).fill_(0.5)
     weights = {key: value for key, value in model.state_dict().items() if not key.startswith("pose.layers.0.")}
     atomic_save({"saunet": model.record, "state_dict": weights}, tmp_path / "a.ckpt")
-    other = assemble(TrainOptions.from_plain(config), walls)
+    other = assemble(train_options(config), walls)
     said = warm_start(other, tmp_path / "a.ckpt")
     count = len(other.depth.state_dict())
     assert f"all {count} tensors of the depth network" in said
@@ -206,16 +208,11 @@ def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Pa
 def test_a_warm_start_from_a_shipped_model(
     model: Any, tmp_path: Path, config: Any, walls: Any, node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from saunet.exporting.box import pack
-    from saunet.runs.checkpoint import atomic_save
-    from saunet.training.tool import TrainOptions, assemble
-    from saunet.weights import locate
-
     monkeypatch.setattr(locate, "BOX", tmp_path)
     atomic_save({"saunet": model.record, "state_dict": model.state_dict()}, tmp_path / "a.ckpt")
     pack(tmp_path / "a.ckpt", tmp_path / "street")
     model_config = config["model"]
-    other = assemble(TrainOptions.from_plain({**config, "model": {**model_config, "max_depth": 50.0}}), walls)
+    other = assemble(train_options({**config, "model": {**model_config, "max_depth": 50.0}}), walls)
     said = warm_start(other, "street")
     assert "starting from street: all " in said
     assert f"all {len(other.pose.state_dict())} tensors of the pose network" in said
@@ -225,7 +222,7 @@ def test_a_warm_start_from_a_shipped_model(
             assert own.dtype == torch.float32
             torch.testing.assert_close(own, theirs, rtol=1e-3, atol=1e-6)
     pose = node("pose", "efficientnet_lite0")
-    options = TrainOptions.from_plain({**config, "model": {**model_config, "pose": pose}})
+    options = train_options({**config, "model": {**model_config, "pose": pose}})
     said = warm_start(assemble(options, walls), "street")
     assert f"0 of {len(poses.build('efficientnet_lite0').state_dict())} tensors of the pose network" in said
     assert "(left as they were: encoder.conv_stem.weight, not in it, and " in said
@@ -298,12 +295,12 @@ def test_a_changed_objective_is_not_kept_in_silence(
 ) -> None:
     few = {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 0}
     first = tiny.tiny_trainer(tmp_path, **few, callbacks=[LastCheckpoint(str(tmp_path))])
-    first.fit(assemble(TrainOptions.from_plain(config), walls), walls)
+    first.fit(assemble(train_options(config), walls), walls)
     config["objective"]["alpha"] = 3.0
     again = tiny.tiny_trainer(tmp_path, **few)
     with caplog.at_level("INFO"):
         again.fit(
-            assemble(TrainOptions.from_plain(config), walls),
+            assemble(train_options(config), walls),
             walls,
             ckpt_path=str(tmp_path / "last.ckpt"),
             weights_only=True,

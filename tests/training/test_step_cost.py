@@ -10,14 +10,14 @@ import pytest
 import tiny
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
+from training_options import train_options
 
 from saunet.data.loading.module import DepthDataModule
 from saunet.losses import functional, terms
 from saunet.registry import objectives
-from saunet.training.health import health
 from saunet.training.module import SelfSupervisedDepth
-from saunet.training.nonfinite import NonFinite
-from saunet.training.tool import TrainOptions, assemble
+from saunet.training.monitors import NonFinite, health
+from saunet.training.tool import assemble
 
 WAITS = {
     "aten._local_scalar_dense",  # .item(), bool(), float()
@@ -58,14 +58,14 @@ def test_the_counter_counts() -> None:
 
 @pytest.mark.parametrize("objective", ["saunet", "monodepth2"])
 def test_nothing_in_a_step_waits_for_the_device(objective: str, config: dict[str, Any], walls: DepthDataModule) -> None:
-    model = assemble(TrainOptions.from_plain(config), walls)
+    model = assemble(train_options(config), walls)
     model.objective = objectives.build(objective)
     walls.setup("fit")
     loaded = next(iter(walls.train_dataloader()))
     model.train()
     with Waits() as waits:
         batch: Any = walls.on_after_batch_transfer(loaded, 0)
-        pyramid, poses, _, terms = model.predict_and_compare(batch)
+        pyramid, poses, _, terms = model.step(batch)
         health(pyramid, poses, terms, 100.0)
         terms.total.backward()
     assert +waits.found == Counter()
@@ -99,7 +99,7 @@ def test_identity_losses_once_and_one_ssim_pass_a_scale(
     assert terms.photometric_error is functional.photometric_error  # which looks ssim_loss up when it is called
     walls.setup("fit")
     batch: Any = walls.on_after_batch_transfer(next(iter(walls.train_dataloader())), 0)
-    _, views, _ = model.step(batch)
+    _, _, views, _ = model.step(batch)
     both_sources = tuple(batch["loss_sources"].shape)
     assert len(views) == 4
     assert [shape for shape, _ in passes] == [both_sources] * 5  # four scales, and the unwarped sources once
@@ -115,7 +115,7 @@ def test_a_step_runs_under_cudas_sync_debug_mode(model: SelfSupervisedDepth, wal
     on_device = {key: value.cuda() if isinstance(value, torch.Tensor) else value for key, value in loaded.items()}
 
     def step() -> None:
-        pyramid, poses, _, terms = model.predict_and_compare(walls.on_after_batch_transfer(on_device, 0))  # type: ignore[arg-type]
+        pyramid, poses, _, terms = model.step(walls.on_after_batch_transfer(on_device, 0))  # type: ignore[arg-type]
         health(pyramid, poses, terms, 100.0)
         terms.total.backward()
 

@@ -46,7 +46,7 @@ def batch() -> dict[str, Any]:
 def check(depth: nn.Module, pose: nn.Module, objective: str) -> None:
     model = SelfSupervisedDepth(depth, pose, objectives.build(objective)).train()
     model.zero_grad(set_to_none=True)
-    pyramid, views, terms = model.step(batch())
+    pyramid, _, views, terms = model.step(batch())
     assert terms.total.isfinite()
     assert len(views) == len(pyramid.depth)
     terms.total.backward()

@@ -41,6 +41,7 @@ SUBJECTS = ("model", "predictions")
 """What an evaluation calls what it scores: a checkpoint's network, or another system's files."""
 SIGN_OF_LIFE = 600.0
 """Seconds: a run on another machine that wrote nothing for so long does not run any more."""
+_LOST = "killed, out of memory, or the machine went down"
 Describe = Callable[[Exception], "str | None"]
 """Says in one sentence what went wrong; None for a defect of the program."""
 
@@ -179,15 +180,11 @@ def read(folder: str | Path) -> dict[str, Any]:
     return read_mapping(Path(folder) / FILE)
 
 
-def mark_lost(
-    folder: str | Path, error: str = "ended without a word: killed, out of memory, or the machine went down"
-) -> bool:
-    """Mark a run as failed that still claims to run though nobody runs it; return whether it did."""
+def mark_lost(folder: str | Path, error: str = f"ended without a word: {_LOST}") -> None:
+    """Mark a run as failed that still claims to run though nobody runs it."""
     content = read(folder)
-    if content.get("status") != "running":
-        return False
-    write_json(Path(folder) / FILE, {**content, "status": "failed", "error": error, "ended": _now()}, ConfigError)
-    return True
+    if content.get("status") == "running":
+        write_json(Path(folder) / FILE, {**content, "status": "failed", "error": error, "ended": _now()}, ConfigError)
 
 
 def first_process() -> bool:
@@ -398,7 +395,7 @@ def _state(folder: Path, record: Mapping[str, Any]) -> tuple[Status, str | None]
         return "unknown", None
     if _alive(folder, record):
         return "running", None
-    return "unfinished", "it was never ended: killed, out of memory, or the machine went down"
+    return "unfinished", f"it was never ended: {_LOST}"
 
 
 def _alive(folder: Path, record: Mapping[str, Any]) -> bool:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
@@ -43,7 +43,6 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None) -> None:
-        """Write a checkpoint; if the system refuses, an older file of that name stays as it was."""
         if storage_options is not None:
             raise ConfigError(
                 f"storage_options is {storage_options!r}; checkpoints are stored without any, leave it out"
@@ -115,40 +114,22 @@ class BestCheckpoint(ModelCheckpoint):
 
         The recorded path is not followed: the folder may have been moved, and a foreign file may name any path.
         """
-        folder = Path(str(self.dirpath))
-        own = folder / "best.ckpt"
+        own = Path(str(self.dirpath)) / "best.ckpt"
         best = self._beside / own.name if self._beside else own
         if state_dict["best_model_path"] and best.is_file() and best.resolve() != own.resolve():
             with replacing(own, CheckpointError) as temporary:
                 shutil.copyfile(best, temporary)
         path, score = (str(own), state_dict["best_model_score"]) if own.is_file() else ("", None)
-        known = {path: score} if path and score is not None else {}
-        state_dict = {
-            **state_dict,
-            "dirpath": str(self.dirpath),
-            "best_model_path": path,
-            "best_model_score": score,
-            "kth_best_model_path": path if known else "",
-            "best_k_models": known,
-        }
-        super().load_state_dict(state_dict)
+        known = {} if score is None else {path: score}
+        own_state = {"dirpath": str(self.dirpath), "best_model_path": path, "best_model_score": score}
+        own_state |= {"best_k_models": known, "kth_best_model_path": path if known else ""}
+        super().load_state_dict({**state_dict, **own_state})
         self._scored_by = state_dict["monitor"]
 
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def _save_topk_checkpoint(self, trainer: Trainer, monitor_candidates: dict[str, Tensor]) -> None:
         """Choose what to monitor, then save."""
-        if not (trainer.sanity_checking or self._should_save_on_train_epoch_end(trainer)):
-            self._choose(trainer)
-        super().on_validation_end(trainer, pl_module)
-
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Choose what to monitor, then save."""
-        if self._should_save_on_train_epoch_end(trainer):
-            self._choose(trainer)
-        super().on_train_epoch_end(trainer, pl_module)
-
-    def _choose(self, trainer: Trainer) -> None:
         wanted = EPOCH_LOSS if self.wanted == "train/loss" else self.wanted
-        measured = [name for name in (wanted, "val/loss", EPOCH_LOSS) if name in trainer.callback_metrics]
+        measured = [name for name in (wanted, "val/loss", EPOCH_LOSS) if name in monitor_candidates]
         self.monitor = measured[0] if measured else wanted
         self.mode = _direction(self.monitor)
         if self.monitor != wanted and not self._said:
@@ -158,6 +139,7 @@ class BestCheckpoint(ModelCheckpoint):
         if self.monitor != self._scored_by:  # what is known of the best is of another kind
             self._scored_by = self.monitor
             self.best_k_models, self.kth_best_model_path, self.best_model_score = {}, "", None
+        super()._save_topk_checkpoint(trainer, monitor_candidates)
 
 
 def _direction(monitor: str) -> Literal["min", "max"]:
@@ -189,8 +171,8 @@ class PicturePanel(Callback):
         if batch is None or trainer.sanity_checking:
             return
         with torch.no_grad():
-            pyramid, views, terms = pl_module.step(batch)  # type: ignore[operator]
-        picture = training_panel(batch, pyramid, views, terms, rows=self.rows)
+            pyramid, _, views, terms = pl_module.step(batch)  # type: ignore[operator]
+        picture = _drawn(batch, pyramid, views, terms, self.rows)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_image(self.folder / f"epoch_{trainer.current_epoch:03d}.png", picture)
         for logger in trainer.loggers:
@@ -198,30 +180,29 @@ class PicturePanel(Callback):
                 logger.experiment.add_image("panel", picture, trainer.global_step, dataformats="HWC")
 
 
-def training_panel(
-    batch: TrainBatch, pyramid: DepthPyramid, views: Sequence[View], terms: LossTerms, rows: int = 2
+def _drawn(
+    batch: TrainBatch, pyramid: DepthPyramid, views: Sequence[View], terms: LossTerms, rows: int
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw the first samples of a batch, one per row; maps of the loss are gray, white is 1 or the largest value."""
+
+    def array(values: Tensor) -> Any:
+        return values.detach().float().cpu().numpy()
+
+    def rgb(image: Tensor) -> UInt8[np.ndarray, "h w 3"]:
+        return np.asarray((array(image).transpose(1, 2, 0).clip(0, 1) * 255).round(), dtype=np.uint8)
+
     tiles: dict[str, UInt8[np.ndarray, "_ _ 3"]] = {}
     count = min(rows, len(batch["name"]))
     for row in range(count):
         tag = f" {row + 1}" if count > 1 else ""
-        tiles[f"input{tag}"] = _rgb(batch["target"][row])
-        tiles[f"disparity{tag}"] = colorize(_array(pyramid.disparity[0][row, 0]))
-        tiles[f"warped neighbor{tag}"] = _rgb(views[0].image[row, 0])
+        tiles[f"input{tag}"] = rgb(batch["target"][row])
+        tiles[f"disparity{tag}"] = colorize(array(pyramid.disparity[0][row, 0]))
+        tiles[f"warped neighbor{tag}"] = rgb(views[0].image[row, 0])
         for name, values in terms.maps.items():
-            shown = _array(values[row, 0].float())
+            shown = array(values[row, 0])
             top = max(float(shown.max()), 1e-6) if name not in ("automask", "visible") else 1.0
             tiles[f"{name.replace('_', ' ')}{tag}"] = colorize(shown, (0.0, top), "gray")
     return panel(tiles, columns=len(tiles) // count, tile_width=320)
-
-
-def _array(values: Tensor) -> Any:
-    return values.detach().float().cpu().numpy()
-
-
-def _rgb(image: Float[Tensor, "3 h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    return np.asarray((_array(image).transpose(1, 2, 0).clip(0, 1) * 255).round(), dtype=np.uint8)
 
 
 class Progress(TQDMProgressBar):
@@ -238,14 +219,21 @@ class Progress(TQDMProgressBar):
         self._lines, self._began, self._said, self._first = False, 0.0, 0.0, 0
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Show the bar where somebody looks."""
         super().setup(trainer, pl_module, stage)
         self._lines = not watched(Console())  # standard output, where Lightning's bar is
         if self._lines:
             self.disable()
 
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say how many parameters are trained."""
+        counts = {
+            name: sum(parameter.numel() for parameter in module.parameters()) / 1e6
+            for name, module in pl_module.named_children()
+        }
+        parts = ", ".join(f"{name} {count:.1f} M" for name, count in counts.items() if count)
+        rank_zero_info(f"networks: {parts}; together {sum(counts.values()):.1f} M parameters")
+
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start the clock."""
         super().on_train_start(trainer, pl_module)
         self._began = self._said = time.monotonic()
         self._first = trainer.fit_loop.total_batch_idx + 1
@@ -253,13 +241,11 @@ class Progress(TQDMProgressBar):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Say where the training is, now and then, where there is no bar."""
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
         if self._lines and time.monotonic() - self._said >= EVERY:
             rank_zero_info(self._line(trainer))
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say what the epoch came to."""
         super().on_train_epoch_end(trainer, pl_module)
         rank_zero_info(self._line(trainer))
 
@@ -276,15 +262,6 @@ class Progress(TQDMProgressBar):
             left = timedelta(seconds=round(each * max(trainer.num_training_batches * epochs - done, 0)))
             parts.append(f"time left {left}")
         return ", ".join(parts)
-
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say how many parameters are trained."""
-        counts = {
-            name: sum(parameter.numel() for parameter in module.parameters()) / 1e6
-            for name, module in pl_module.named_children()
-        }
-        parts = ", ".join(f"{name} {count:.1f} M" for name, count in counts.items() if count)
-        rank_zero_info(f"networks: {parts}; together {sum(counts.values()):.1f} M parameters")
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """Return what the bar shows; the logger's version number is not a metric."""

@@ -1,12 +1,18 @@
-"""The training loop's body: four lines that read like the paper, and validation under a named protocol."""
+"""What is trained: a step that reads like the paper, validation under a named protocol, and how both are resumed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import warnings
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from lightning import Callback, LightningModule
+from lightning.pytorch.trainer.states import TrainerFn
+from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -15,9 +21,10 @@ from saunet.geometry import warp
 from saunet.geometry.depth import disparity_to_depth
 from saunet.losses.base import Objective
 from saunet.metrics.depth import DepthMetrics
-from saunet.training.base import TrainedModule
-from saunet.training.health import health
-from saunet.training.optim import Recipe
+from saunet.runs.folder import RunRecord
+from saunet.training.monitors import health
+from saunet.training.optim import MovingAverage, Recipe
+from saunet.training.resume import continuation
 from saunet.training.speed import Speed
 from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
 
@@ -25,7 +32,7 @@ EPOCH_LOSS = "train/loss_epoch"
 """Name of the mean of ``train/loss`` over an epoch and all processes, which is itself the last batch's."""
 
 
-class SelfSupervisedDepth(TrainedModule):
+class SelfSupervisedDepth(LightningModule):
     """Depth and pose networks trained together on video by view synthesis (SAU-Net section III).
 
     Args:
@@ -51,11 +58,21 @@ class SelfSupervisedDepth(TrainedModule):
         record: Mapping[str, Any] | None = None,
         speed: Speed | None = None,
     ) -> None:
-        super().__init__(recipe, speed, seed, record)
+        super().__init__()
         self.depth = depth
         self.pose = pose
         self.objective = objective
+        self.recipe = recipe if recipe is not None else Recipe()
         self.metrics = metrics if metrics is not None else DepthMetrics()
+        self.seed = seed
+        self.record = dict(record or {})
+        self.speed = speed if speed is not None else Speed()
+        self.objective_node: Mapping[str, Any] | None = None
+        """Config node of the objective, where it is known; kept in checkpoints."""
+        self.run_record: RunRecord | None = None
+        """The run's ``run.json``, where there is one."""
+        self.average = MovingAverage(self.recipe.ema) if self.recipe.ema > 0 else None
+        self._prepared = False
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> DepthPyramid:
         """Return the depth of images in [0, 1]."""
@@ -64,16 +81,16 @@ class SelfSupervisedDepth(TrainedModule):
 
     def training_step(self, batch: TrainBatch, batch_idx: int) -> Tensor:
         """Return the loss of one batch, a scalar, eq. (14)."""
-        pyramid, poses, _, terms = self.predict_and_compare(batch)
+        pyramid, poses, _, terms = self.step(batch)
         watched = health(pyramid, poses, terms, float(getattr(self.depth, "max_depth", torch.inf)))
         figures = {**terms.named("train"), **{f"health/{name}": value for name, value in watched.items()}}
-        figures = self._of_all_processes(figures)
-        self.log_dict(figures, prog_bar=False, batch_size=len(batch["name"]))
-        self.log("train/lr", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=len(batch["name"]))
-        self.log("loss", figures["train/loss"], prog_bar=True, logger=False, batch_size=len(batch["name"]))
+        figures, count = self._of_all_processes(figures), len(batch["name"])
+        self.log_dict(figures, prog_bar=False, batch_size=count)
+        self.log("train/lr", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=count)
+        self.log("loss", figures["train/loss"], prog_bar=True, logger=False, batch_size=count)
         # What best.ckpt is chosen by where nothing is validated: the last batch alone would be chance.
         mean: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True, "logger": False}
-        self.log(EPOCH_LOSS, terms.total.detach(), batch_size=len(batch["name"]), **mean)
+        self.log(EPOCH_LOSS, terms.total.detach(), batch_size=count, **mean)
         return terms.total
 
     def _of_all_processes(self, figures: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -88,48 +105,31 @@ class SelfSupervisedDepth(TrainedModule):
         means: Tensor = trainer.strategy.reduce(stacked, reduce_op="mean")
         return dict(zip(figures, means.unbind(), strict=True))
 
-    def step(self, batch: TrainBatch) -> tuple[DepthPyramid, tuple[View, ...], LossTerms]:
-        """Return depth, the sources warped into the target, and the loss of a batch."""
-        pyramid, _, views, terms = self.predict_and_compare(batch)
-        return pyramid, views, terms
-
-    def predict_and_compare(
-        self, batch: TrainBatch
-    ) -> tuple[DepthPyramid, Float[Tensor, "b s 4 4"], tuple[View, ...], LossTerms]:
+    def step(self, batch: TrainBatch) -> tuple[DepthPyramid, Float[Tensor, "b s 4 4"], tuple[View, ...], LossTerms]:
         """Predict depth and motion, synthesize the target from its neighbors, and compare."""
         pyramid: DepthPyramid = self.depth(batch["target"])  # Z_t
         poses = self.motion(batch)  # D_{t->t'}
         views = self.synthesize(batch, pyramid, poses)  # H_{t'->t}, eq. (7)
         if self.objective.needs_source_depth:
-            batch = {**batch, "source_depth": self._source_depth(batch)}
+            near: DepthPyramid = self.depth(batch["sources"].flatten(0, 1))
+            shape = (*batch["sources"].shape[:2], *near.depth[0].shape[1:])
+            batch = {**batch, "source_depth": near.depth[0].reshape(shape)}
         terms: LossTerms = self.objective(batch, pyramid, poses, views)  # alpha L1 + beta L2, eq. (14)
         return pyramid, poses, views, terms
 
     def motion(self, batch: TrainBatch) -> Float[Tensor, "b s 4 4"]:
         """Return T_src_tgt of each source: predicted for neighbors in time, known for a stereo partner, the last."""
-        target, sources = batch["target"], batch["sources"]
-        if "T_stereo_tgt" not in batch:
-            predicted: Tensor = self._pose(target, sources)
-            return predicted
-        known = batch["T_stereo_tgt"][:, None]
-        if sources.shape[1] == 1:
-            return known
-        return torch.cat([self._pose(target, sources[:, :-1]), known], 1)
-
-    def _pose(self, target: Tensor, sources: Tensor) -> Tensor:
+        sources = batch["sources"]
+        known = [batch["T_stereo_tgt"][:, None]] if "T_stereo_tgt" in batch else []
+        if known and sources.shape[1] == 1:
+            return known[0]
         if self.pose is None:
             raise ConfigError(
                 "the model has no pose network and the batch has neighbors in time; build one, or use data with a "
                 "stereo partner only"
             )
-        poses: Tensor = self.pose(target, sources)
-        return poses
-
-    def _source_depth(self, batch: TrainBatch) -> Float[Tensor, "b s 1 h w"]:
-        """Return the depth of the source images, for terms that compare it with the target's."""
-        sources = batch["sources"]
-        pyramid: DepthPyramid = self.depth(sources.flatten(0, 1))
-        return pyramid.depth[0].reshape(*sources.shape[:2], 1, *sources.shape[-2:])
+        predicted: Tensor = self.pose(batch["target"], sources[:, : sources.shape[1] - len(known)])
+        return torch.cat([predicted, *known], 1) if known else predicted
 
     @staticmethod
     def synthesize(batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"]) -> tuple[View, ...]:
@@ -151,7 +151,7 @@ class SelfSupervisedDepth(TrainedModule):
         """Score depth where there is ground truth, and the loss where the batch has neighbors."""
         count = len(batch["name"])
         if batch["sources"].shape[1] > 0:
-            pyramid, _, terms = self.step(batch)
+            pyramid, _, _, terms = self.step(batch)
             self.log_dict(terms.named("val"), sync_dist=True, batch_size=count)
         else:
             pyramid = self(batch["target"])
@@ -172,3 +172,86 @@ class SelfSupervisedDepth(TrainedModule):
             self.log_dict(named, sync_dist=True, reduce_fx="max")
             self.log("abs_rel", named["val/abs_rel"], prog_bar=True, logger=False, sync_dist=True, reduce_fx="max")
         self.metrics.reset()
+
+    def setup(self, stage: str) -> None:
+        """Freeze and switch on what the config asks for, once, in the process that trains."""
+        if self._prepared:
+            return
+        self._prepared = True
+        for part in self.recipe.frozen(self):
+            part.requires_grad_(False).eval()
+            warnings.filterwarnings("ignore", message=r"Found \d+ module\(s\) in eval mode")  # as it is meant to be
+        # A convolution of 1x1 has several right strides, and DDP copies a gradient that comes in another one.
+        warnings.filterwarnings("ignore", message=r"Grad strides do not match bucket view strides")
+        self.speed.apply(self)
+
+    def train(self, mode: bool = True) -> SelfSupervisedDepth:
+        """Change between training and evaluation; frozen parts stay in evaluation."""
+        super().train(mode)
+        for part in self.recipe.frozen(self) if mode and self._prepared else ():
+            part.eval()
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "average": None}  # which holds a copy of this module
+
+    def configure_callbacks(self) -> list[Callback]:
+        """Let Lightning keep the average, and put it in while validating."""
+        return [self.average] if self.average is not None else []
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        """Make the step's randomness a function of seed, step and process: a resumed run draws what it would have."""
+        micro = batch_idx % self.trainer.accumulate_grad_batches  # else accumulated batches would all draw the same
+        position = [self.seed, self.global_step, self.global_rank, micro]
+        torch.manual_seed(int(np.random.SeedSequence(position).generate_state(1)[0]))
+
+    def optimizer_step(
+        self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Callable[[], Any] | None = None
+    ) -> None:
+        """Take one step, then move the average."""
+        super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
+        if self.average is not None:
+            self.average.update(self)
+
+    def configure_optimizers(self) -> Any:
+        return self.recipe.configure(self.recipe.groups(self), self._total_steps())
+
+    def _total_steps(self) -> int:
+        """Return the optimizer steps of the whole training.
+
+        The trainer could count them too, but sets up its loader for that: before a resumed run knows where in an epoch
+        it was, so that it would begin the epoch again.
+        """
+        trainer = self.trainer
+        data = getattr(trainer, "datamodule", None)
+        if data is None or float(getattr(trainer, "overfit_batches", 0.0)) > 0 or trainer.max_epochs in (None, -1):
+            return int(trainer.estimated_stepping_batches)
+        batches, limit = len(data.train_dataloader()), trainer.limit_train_batches
+        batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
+        steps = math.ceil(batches / trainer.accumulate_grad_batches) * int(trainer.max_epochs or 0)
+        return min(steps, trainer.max_steps) if trainer.max_steps != -1 else steps
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Store the record from which the networks are rebuilt, and what a resumed training must share."""
+        checkpoint["saunet"] = self.record
+        checkpoint["saunet_training"] = self.training_state(getattr(self._trainer, "datamodule", None))
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Check that the training continues, and say what becomes of a changed recipe, network or objective."""
+        if self._trainer is None or self.trainer.state.fn != TrainerFn.FITTING:
+            return
+        for sentence in continuation(checkpoint, self, getattr(self.trainer, "datamodule", None)):
+            rank_zero_info(sentence)
+        if self.average is None and "current_model_state" in checkpoint:  # it is averaged no longer
+            checkpoint["state_dict"] = checkpoint["current_model_state"]
+
+    def training_state(self, data: Any) -> dict[str, Any]:
+        """Return what a checkpoint keeps of a training beside its networks; what is unknown is left out."""
+        settings: dict[str, Any] = {"seed": self.seed}
+        if self.objective_node:
+            settings["objective"] = dict(self.objective_node)
+        if getattr(data, "batch_size", None) is not None:
+            settings["batch_size"] = data.batch_size
+        if "train" in getattr(data, "datasets", {}):
+            settings["train_split"] = data.datasets["train"].fingerprint()
+        return {"recipe": self.recipe.to_plain(), "settings": settings}

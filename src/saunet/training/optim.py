@@ -8,15 +8,17 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import torch
-from torch import nn
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import WeightAveraging
+from torch import Tensor, nn
 from torch.nn import Parameter
 from torch.optim.lr_scheduler import LRScheduler
 
 from saunet.errors import ConfigError, in_range, one_of, positive, suggest
 
-SCHEDULES = ("step", "cosine", "one_cycle", "constant")
 OPTIMIZER_STATE = ("lr", "encoder_lr", "betas", "weight_decay", "fused")
-"""Settings that live on in a checkpoint's optimizer state: a resumed run goes on with the checkpoint's."""
+"""Settings that live on in a checkpoint's optimizer state: a resumed run keeps the checkpoint's."""
+OTHER_SETTINGS = "to train on with other settings, start from its weights with init_from= instead of resume="
 
 
 @dataclass(frozen=True)
@@ -39,9 +41,6 @@ class Recipe:
         ema: Decay of the moving average of the weights, such as 0.999; the average is what is validated and saved. 0
             keeps none.
         fused: One kernel for the whole optimizer step.
-
-    Raises:
-        ConfigError: for a value that makes no sense.
     """
 
     optimizer: Literal["adam", "adamw"] = "adam"
@@ -59,7 +58,7 @@ class Recipe:
 
     def __post_init__(self) -> None:
         one_of("optim.optimizer", self.optimizer, ("adam", "adamw"))
-        one_of("optim.schedule", self.schedule, SCHEDULES)
+        one_of("optim.schedule", self.schedule, ("step", "cosine", "one_cycle", "constant"))
         positive("optim.lr", self.lr)
         positive("optim.gamma", self.gamma)
         positive("optim.weight_decay", self.weight_decay, allow_zero=True)
@@ -85,27 +84,21 @@ class Recipe:
 
     def factor(self, progress: float) -> float:
         """Return the learning rate relative to ``lr`` when a fraction ``progress`` (0 to 1) of the training is done."""
-        if self.schedule == "one_cycle":
-            low, end = 1 / 25, 1 / 25e4
-            if progress < self.warmup:
-                return low + (1 - low) * (0.5 - 0.5 * math.cos(math.pi * progress / self.warmup))
-            done = (progress - self.warmup) / (1 - self.warmup)
-            return end + (1 - end) * (0.5 + 0.5 * math.cos(math.pi * min(done, 1.0)))
         if progress < self.warmup:
-            return progress / self.warmup
+            risen = progress / self.warmup
+            if self.schedule == "one_cycle":
+                return 1 / 25 + (1 - 1 / 25) * (0.5 - 0.5 * math.cos(math.pi * risen))
+            return risen
         if self.schedule == "step":
             return float(self.gamma ** sum(progress >= milestone for milestone in self.milestones))
-        if self.schedule == "cosine":
-            done = (progress - self.warmup) / (1 - self.warmup)
-            return 0.5 + 0.5 * math.cos(math.pi * min(done, 1.0))
-        return 1.0
+        if self.schedule == "constant":
+            return 1.0
+        done = min((progress - self.warmup) / (1 - self.warmup), 1.0)
+        falling, end = 0.5 + 0.5 * math.cos(math.pi * done), 1 / 25e4
+        return falling if self.schedule == "cosine" else end + (1 - end) * falling
 
     def frozen(self, model: nn.Module) -> list[nn.Module]:
-        """Return the parts of a model that are not trained.
-
-        Raises:
-            ConfigError: if a name in ``freeze`` is no part of the model.
-        """
+        """Return the parts of a model that are not trained, by the names in ``freeze``."""
         parts = dict(model.named_modules())
         for name in self.freeze:
             allowed = [part for part in parts if part.startswith(("depth", "pose"))]
@@ -116,37 +109,25 @@ class Recipe:
         return [parts[name] for name in self.freeze]
 
     def groups(self, model: nn.Module) -> list[dict[str, Any]]:
-        """Return the trainable parameters of a model, the depth encoder's apart where it has a rate of its own.
-
-        Raises:
-            ConfigError: if nothing is left to train.
-        """
-        trainable = [(name, parameter) for name, parameter in model.named_parameters() if parameter.requires_grad]
+        """Return the trainable parameters of a model, the depth encoder's apart where it has a rate of its own."""
+        trainable = {name: parameter for name, parameter in model.named_parameters() if parameter.requires_grad}
         if not trainable:
             raise ConfigError(f"optim.freeze is {list(self.freeze)}, which leaves nothing to train; leave a part out")
         if self.encoder_lr is None:
-            return [{"params": [parameter for _, parameter in trainable]}]
-        encoder = [parameter for name, parameter in trainable if name.startswith("depth.encoder.")]
-        rest = [parameter for name, parameter in trainable if not name.startswith("depth.encoder.")]
+            return [{"params": list(trainable.values())}]
+        encoder, rest = (
+            [parameter for name, parameter in trainable.items() if name.startswith("depth.encoder.") is inside]
+            for inside in (True, False)
+        )
         groups: list[dict[str, Any]] = [{"params": rest}, {"params": encoder, "lr": self.encoder_lr}]
         return [group for group in groups if group["params"]]
 
     def configure(self, parameters: Iterable[Parameter] | Sequence[dict[str, Any]], total_steps: int) -> dict[str, Any]:
-        """Return optimizer and per-step scheduler in the form that Lightning expects.
-
-        Args:
-            parameters: What is optimized, or groups of it.
-            total_steps: Optimizer steps in the whole training.
-        """
+        """Return optimizer and per-step scheduler for parameters, or groups of them, in Lightning's form."""
         groups: list[Any] = list(parameters)
         kind = torch.optim.AdamW if self.optimizer == "adamw" else torch.optim.Adam
-        optimizer = kind(
-            groups,
-            lr=self.lr,
-            betas=(self.betas[0], self.betas[1]),
-            weight_decay=self.weight_decay,
-            fused=self.fused or None,
-        )
+        betas = (self.betas[0], self.betas[1])
+        optimizer = kind(groups, self.lr, betas, weight_decay=self.weight_decay, fused=self.fused or None)
         scheduler = RecipeSchedule(optimizer, self, max(total_steps, 1))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
@@ -155,55 +136,31 @@ class Recipe:
         return {key: list(value) if isinstance(value, tuple | list) else value for key, value in asdict(self).items()}
 
     def resumed_from(self, before: Mapping[str, Any]) -> str | None:
-        """Say what becomes of settings that differ from those of the checkpoint that is resumed.
-
-        Args:
-            before: The settings in the checkpoint.
-
-        Returns:
-            One sentence; None if nothing differs.
-
-        Raises:
-            ConfigError: if the checkpoint cannot be continued with these settings.
-        """
+        """Say in a sentence what becomes of settings that differ from those of a resumed checkpoint, if any do."""
         now = self.to_plain()
         changed = [key for key in now if key in before and before[key] != now[key]]
-        if any(key in changed for key in ("optimizer", "freeze")) or (
-            (before.get("encoder_lr") is None) != (self.encoder_lr is None)
-        ):
-            key = next(key for key in ("optimizer", "freeze", "encoder_lr") if key in changed)
-            raise ConfigError(
-                f"optim.{key} is {now[key]} and the checkpoint was trained with {before[key]}, so its optimizer state "
-                "does not fit; keep the setting, or start a new training from its weights with init_from= instead of "
-                "resume="
-            )
+        for key in ("optimizer", "freeze", "encoder_lr"):
+            if key in changed and (key != "encoder_lr" or None in (before[key], now[key])):
+                raise ConfigError(
+                    f"optim.{key} is {now[key]} and the checkpoint was trained with {before[key]}, so its optimizer "
+                    "state does not fit; keep the setting, or start a new training from its weights with init_from= "
+                    "instead of resume="
+                )
         kept = [f"optim.{key} {before[key]} (not {now[key]})" for key in changed if key in OPTIMIZER_STATE]
         taken = [f"optim.{key} {now[key]} (it was {before[key]})" for key in changed if key not in OPTIMIZER_STATE]
-        if not changed:
-            return None
         parts = [f"keeps the checkpoint's {', '.join(kept)}"] * bool(kept)
         parts += [f"uses the new {', '.join(taken)}"] * bool(taken)
-        return (
-            f"the resumed run {' and '.join(parts)}; "
-            "to train on with other settings, start from its weights with init_from= instead of resume="
-        )
+        return f"the resumed run {' and '.join(parts)}; {OTHER_SETTINGS}" if parts else None
 
 
 class RecipeSchedule(LRScheduler):
-    """A recipe's learning rate, step by step; its saved state is plain numbers, so checkpoints stay safe to read.
-
-    Args:
-        optimizer: Whose rates it sets.
-        recipe: The rates.
-        total_steps: Steps in the whole training.
-    """
+    """A recipe's learning rate, step by step; its saved state is plain numbers, so checkpoints stay safe to read."""
 
     def __init__(self, optimizer: torch.optim.Optimizer, recipe: Recipe, total_steps: int) -> None:
         self.recipe, self.total_steps = recipe, total_steps
         super().__init__(optimizer)
 
     def get_lr(self) -> list[float]:  # type: ignore[override]
-        """Return the rate of each parameter group at the present step."""
         # The first step of a warm-up must not be lost to a rate of exactly zero.
         ahead = 1 if self.recipe.warmup else 0
         factor = self.recipe.factor(min((self.last_epoch + ahead) / self.total_steps, 1.0))
@@ -212,3 +169,48 @@ class RecipeSchedule(LRScheduler):
     def state_dict(self) -> dict[str, Any]:
         """Return the position in the schedule; what the schedule is comes from the config."""
         return {key: value for key, value in super().state_dict().items() if key not in ("recipe", "total_steps")}
+
+
+class MovingAverage(WeightAveraging):
+    """Exponential moving average of a model's parameters and buffers, which Lightning validates and saves.
+
+    The first steps weigh more than ``decay`` says, so that the fresh weights are soon forgotten: after n steps the
+    decay is at most (1 + n) / (10 + n). What is no floating-point number (a counter) is copied. A checkpoint holds the
+    average as ``state_dict`` and the weights that are trained as ``current_model_state``.
+    """
+
+    def __init__(self, decay: float) -> None:
+        super().__init__(multi_avg_fn=self._update)
+        self.decay = decay
+
+    @property
+    def values(self) -> dict[str, Tensor]:
+        """The average, by name."""
+        assert self._average_model is not None
+        return dict(self._average_model.module.state_dict())
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        self._device = trainer.strategy.root_device  # where the model will be, but is not yet
+        super().setup(trainer, pl_module, stage)
+        if self._average_model is not None:
+            # At 0, the first step would be copied instead of averaged; on the CPU, reading it waits for no device.
+            self._average_model.n_averaged = torch.ones((), dtype=torch.long)
+
+    def update(self, model: LightningModule) -> None:
+        """Move the average towards the weights, after a step."""
+        assert self._average_model is not None
+        self._average_model.update_parameters(model)
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        """Do nothing: callbacks that came before this one would have saved an average without the last step."""
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave the module its own weights; whoever wants the average loads a checkpoint."""
+
+    def _update(self, averages: Any, weights: Any, _: Any) -> None:
+        assert self._average_model is not None
+        steps = int(self._average_model.n_averaged) - 1
+        if averages[0].is_floating_point():  # all are of one type
+            torch._foreach_lerp_(averages, weights, 1 - min(self.decay, (1 + steps) / (10 + steps)))
+        else:
+            torch._foreach_copy_(averages, weights)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,31 +13,22 @@ from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, ConfigError
-from saunet.runs.checkpoint import Checkpoint, load_weights, read_checkpoint
-from saunet.training.optim import Recipe
+from saunet.runs.checkpoint import Checkpoint, load_weights
+from saunet.training.optim import OTHER_SETTINGS
 from saunet.weights.files import read_model
 
 if TYPE_CHECKING:
     from saunet.training.module import SelfSupervisedDepth
 
-BOUND = {
-    "seed": "seed",
-    "batch_size": "data.batch_size",
-    "train_split": "training frames (SHA-256 of their names)",
-}
+BOUND = {"seed": "seed", "batch_size": "data.batch_size", "train_split": "training frames (SHA-256 of their names)"}
 """What decides the order of the data, with its name in a message."""
 
 
 def resume_path(resume: str | None, output_dir: str | Path, init_from: str | None = None) -> str | None:
     """Return the checkpoint to resume from, or None.
 
-    Args:
-        resume: A path; ``auto`` for ``checkpoints/last.ckpt`` in the run's own folder, if there is one; or None.
-        output_dir: The run's folder.
-        init_from: What the config gives for a warm start, which cannot be combined with a path.
-
-    Raises:
-        ConfigError: if both are given.
+    ``auto`` is the ``last.ckpt`` of the run's own folder, if there is one. Only a path contradicts ``init_from``: a job
+    that began warm may be queued again.
     """
     if resume == "auto":
         last = Path(output_dir) / "checkpoints" / "last.ckpt"
@@ -51,11 +42,7 @@ def resume_path(resume: str | None, output_dir: str | Path, init_from: str | Non
 
 
 def check_unused(output_dir: str | Path) -> None:
-    """Check that a new training would not replace the checkpoints of an earlier one.
-
-    Raises:
-        ConfigError: if the folder holds any.
-    """
+    """Check that a new training would not replace the checkpoints of an earlier one."""
     found = sorted((Path(output_dir) / "checkpoints").glob("*.ckpt"))
     if found:
         raise ConfigError(
@@ -64,27 +51,19 @@ def check_unused(output_dir: str | Path) -> None:
         )
 
 
-def check_resume(model: SelfSupervisedDepth, path: str, data: Any) -> int:
-    """Check that a training can be resumed from a checkpoint, before the trainer finds out in its own words.
-
-    Returns:
-        The steps done by then.
-
-    Raises:
-        CheckpointError: if the file cannot be read, lacks what resuming needs, or belongs to other networks or data.
-    """
-    checkpoint = read_checkpoint(path)
+def check_resume(model: SelfSupervisedDepth, checkpoint: Checkpoint, data: Any) -> int:
+    """Check that a training can be resumed, before the trainer finds out in its own words; return the steps done."""
     missing = _missing(checkpoint)
     if missing:
         raise CheckpointError(
-            f"{path} has no {missing}, so the training cannot be resumed where it was; give the last.ckpt of a run, or "
-            f"start a new training from its weights with init_from={path}"
+            f"{checkpoint.path} has no {missing}, so the training cannot be resumed where it was; give the last.ckpt "
+            f"of a run, or start a new training from its weights with init_from={checkpoint.path}"
         )
     checkpoint.record.check_same_training(model.record)
     load_weights(model.depth, checkpoint.weights("depth"), "depth network")
     if model.pose is not None:
         load_weights(model.pose, checkpoint.weights("pose"), "pose network")
-    list(continuation(checkpoint.rest, model.recipe, model.record, model.training_state(data)["settings"]))
+    continuation(checkpoint.rest, model, data)
     return checkpoint.global_step or 0
 
 
@@ -100,35 +79,9 @@ def _missing(checkpoint: Checkpoint) -> str | None:
     return None if rest.get("lr_schedulers") else "state of the learning-rate schedule"
 
 
-def settings(seed: int, data: Any, objective: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return what a checkpoint keeps of a training beside its recipe and its networks; what is unknown is left out."""
-    kept: dict[str, Any] = {"seed": seed}
-    if objective:
-        kept["objective"] = dict(objective)
-    batch_size, datasets = getattr(data, "batch_size", None), getattr(data, "datasets", {})
-    if batch_size is not None:
-        kept["batch_size"] = batch_size
-    if "train" in datasets:
-        kept["train_split"] = datasets["train"].fingerprint()
-    return kept
-
-
-def continuation(
-    checkpoint: Mapping[str, Any], recipe: Recipe, record: Mapping[str, Any], now: Mapping[str, Any]
-) -> Iterator[str]:
-    """Check that a resumed training sees the same samples in the same order; yield what it changes, in sentences.
-
-    Args:
-        checkpoint: Of the training so far.
-        recipe: Of the resumed training.
-        record: Its model record.
-        now: Its `settings`.
-
-    Raises:
-        CheckpointError: if it sees other samples.
-        ConfigError: if its optimizer is another one.
-    """
-    training = checkpoint.get("saunet_training", {})
+def continuation(checkpoint: Mapping[str, Any], model: SelfSupervisedDepth, data: Any) -> list[str]:
+    """Check that a resumed training sees the same samples in the same order; say what it changes, in sentences."""
+    training, now = checkpoint.get("saunet_training", {}), model.training_state(data)["settings"]
     before = training.get("settings", {})
     for key, name in BOUND.items():
         if key in before and key in now and before[key] != now[key]:
@@ -139,21 +92,15 @@ def continuation(
                 "resume="
             )
     old = {"objective": before.get("objective", {}), "model": checkpoint.get("saunet", {}).get("model", {})}
-    new = {"objective": now.get("objective", {}), "model": record.get("model", {})}
-    for sentence in (recipe.resumed_from(training.get("recipe", {})), changes(old, new)):
-        if sentence:
-            yield sentence
+    new = {"objective": now.get("objective", {}), "model": model.record.get("model", {})}
+    said = (model.recipe.resumed_from(training.get("recipe", {})), changes(old, new))
+    return [sentence for sentence in said if sentence]
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
     """Say in one sentence which settings of networks and objective a resumed training changes; None for no change."""
     found = [each for name in now if name in before for each in _differences(before[name], now[name], name)]
-    if not found:
-        return None
-    return (
-        f"the resumed run uses the new {', '.join(found)}; "
-        "to train on with other settings, start from its weights with init_from= instead of resume="
-    )
+    return f"the resumed run uses the new {', '.join(found)}; {OTHER_SETTINGS}" if found else None
 
 
 def _differences(before: Any, now: Any, name: str) -> Iterator[str]:
@@ -167,21 +114,17 @@ def _differences(before: Any, now: Any, name: str) -> Iterator[str]:
         for key in now:
             if key in before and key != "weights":  # what the networks started from is behind them
                 yield from _differences(before[key], now[key], f"{name}.{key}")
-    elif _plain(before) != _plain(now):
-        yield f"{name} {now} (it was {before})"
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+    else:
+        was, is_ = (list(each) if isinstance(each, tuple) else each for each in (before, now))
+        if was != is_:
+            yield f"{name} {now} (it was {before})"
 
 
 @rank_zero_only
 def keep_rows(logger: Logger, steps: int) -> None:
     """Keep what a resumed run logged as CSV before; Lightning's logger would begin the file afresh.
 
-    Args:
-        logger: A logger of the resumed run; nothing is done for one that writes no CSV.
-        steps: The steps done by the checkpoint; later rows are dropped, as they will be logged again.
+    Rows after the ``steps`` done by the checkpoint are dropped, as they will be logged again.
     """
     if not isinstance(logger, CSVLogger):
         return
@@ -199,17 +142,10 @@ def keep_rows(logger: Logger, steps: int) -> None:
 
 
 def warm_start(model: SelfSupervisedDepth, source: str | Path) -> str:
-    """Give a new training the weights of a trained model, as many as fit by name and shape.
-
-    Args:
-        model: The training.
-        source: Any saunet model: a checkpoint, an exported folder, or the name of a shipped model such as ``street``.
+    """Give a new training the weights of any saunet model that `saunet.load` reads, as many as fit by name and shape.
 
     Returns:
         What was taken and what was not, in one sentence.
-
-    Raises:
-        CheckpointError: if the model cannot be read, or nothing of its depth network fits.
     """
     checkpoint = read_model(source)
     parts: list[tuple[str, nn.Module | None]] = [("depth", model.depth), ("pose", model.pose)]
@@ -236,16 +172,16 @@ def warm_start(model: SelfSupervisedDepth, source: str | Path) -> str:
     return f"starting from {source}: {'; '.join(taken)}"
 
 
-def _taken(name: str, own: Mapping[str, Tensor], given: Mapping[str, Tensor], fitting: Collection[str]) -> str:
+def _taken(name: str, own: Mapping[str, Tensor], given: Mapping[str, Tensor], fitting: Mapping[str, Tensor]) -> str:
     """Say how much of a network was taken, and of the rest the first tensor."""
     if len(fitting) == len(own) == len(given):
         return f"all {len(own)} tensors of the {name} network"
-    rest = [key for key in own if key not in fitting]
+
+    def first(names: list[str], why: str = "") -> str:
+        return f"{names[0]}{why}{f', and {len(names) - 1} more' if len(names) > 1 else ''}"
+
     text = f"{len(fitting)} of {len(own)} tensors of the {name} network"
+    rest, unused = ([key for key in some if key not in others] for some, others in ((own, fitting), (given, own)))
     if rest:
-        why = "another shape" if rest[0] in given else "not in it"
-        text += f" (left as they were: {rest[0]}, {why}{f', and {len(rest) - 1} more' if len(rest) > 1 else ''})"
-    unused = [key for key in given if key not in own]
-    if unused:
-        text += f" (unused: {unused[0]}{f', and {len(unused) - 1} more' if len(unused) > 1 else ''})"
-    return text
+        text += f" (left as they were: {first(rest, ', another shape' if rest[0] in given else ', not in it')})"
+    return f"{text} (unused: {first(unused)})" if unused else text

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,11 +33,7 @@ class Speed:
     checkpoint_activations: bool = False
 
     def apply(self, model: Any) -> None:
-        """Switch on what is wanted, in place; names of weights stay as they are.
-
-        Args:
-            model: A module with parts ``depth``, ``pose`` (or None), ``objective``, and the function ``synthesize``.
-        """
+        """Switch on what is wanted in a `SelfSupervisedDepth`, in place; names of weights stay as they are."""
         parts: list[nn.Module] = [part for part in (model.depth, model.pose) if isinstance(part, nn.Module)]
         if self.checkpoint_activations:
             for part in parts:
@@ -65,10 +61,9 @@ def _recomputed(block: nn.Module, forward: Any, *args: Any, **kwargs: Any) -> An
     if not torch.is_grad_enabled():
         return forward(*args, **kwargs)
 
-    def contexts() -> tuple[AbstractContextManager[Any], AbstractContextManager[Any]]:
-        return nullcontext(), _statistics_kept(block)
-
-    return checkpoint(forward, *args, use_reentrant=False, context_fn=contexts, **kwargs)
+    return checkpoint(
+        forward, *args, use_reentrant=False, context_fn=lambda: (nullcontext(), _statistics_kept(block)), **kwargs
+    )
 
 
 @contextmanager

@@ -87,19 +87,12 @@ class GracefulStop(Callback):
         if self._agreed:
             self._save(trainer)
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Stop before another step, when the last one is in the log."""
-        self._stop(trainer)
-
-    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Stop before another epoch."""
-        self._stop(trainer)
-
     def _save(self, trainer: Trainer) -> None:
         trainer.save_checkpoint(self.folder / LAST, weights_only=False)
         self._saved = True
 
-    def _stop(self, trainer: Trainer) -> None:
+    def _stop(self, trainer: Trainer, *_: Any, **__: Any) -> None:
+        """Stop before another step or epoch, when the last step is in the log."""
         if not self._saved:
             return
         self._restore()
@@ -109,13 +102,7 @@ class GracefulStop(Callback):
         # Where one process starts the others, it takes a bad end of theirs for a crash.
         raise Stopped(message, 128 + number if trainer.is_global_zero else 0)
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Listen no longer."""
-        self._restore()
-
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Listen no longer."""
-        self._restore()
+    on_train_batch_start = on_train_epoch_start = _stop
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         if self.received == signal.SIGINT == number:
@@ -128,10 +115,13 @@ class GracefulStop(Callback):
             for stream in (1, 2):
                 os.dup2(nowhere, stream)
 
-    def _restore(self) -> None:
+    def _restore(self, *_: Any, **__: Any) -> None:
+        """Listen no longer."""
         before, self._before = self._before, {}
         for number, handler in before.items():
             signal.signal(number, handler)
+
+    on_train_end = on_exception = _restore
 
 
 class ProcessWatch(Callback):
@@ -155,19 +145,16 @@ class ProcessWatch(Callback):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Begin to watch: the first process its children, the children their parent."""
         started: list[Popen[bytes]] = list(getattr(trainer.strategy.launcher, "procs", None) or [])
+        environment = getattr(trainer.strategy, "cluster_environment", None)
         if started:
             _silence_lightnings_watch()
             self._thread = threading.Thread(target=self._watch_children, args=(started,), daemon=True)
-        elif (
-            isinstance(getattr(trainer.strategy, "cluster_environment", None), LightningEnvironment)
-            and int(os.environ.get("LOCAL_RANK", "0")) > 0
-        ):
+        elif isinstance(environment, LightningEnvironment) and int(os.environ.get("LOCAL_RANK", "0")) > 0:
             self._thread = threading.Thread(target=self._watch_parent, args=(os.getppid(),), daemon=True)
         if self._thread is not None:
             self._thread.start()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Watch no longer."""
         self._own_end = True
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import protocol
 from saunet.registry import Spec
 from saunet.runs.checkpoint import build_networks, read_checkpoint
-from saunet.runs.folder import locked, recording
+from saunet.runs.folder import Describe, locked, recording
 from saunet.runs.record import ModelRecord, Scale
 from saunet.training.callbacks import AtomicCheckpointIO, BestCheckpoint
 from saunet.training.module import SelfSupervisedDepth
@@ -44,17 +44,18 @@ TRAINER: Mapping[str, Any] = {
     "use_distributed_sampler": False,  # our samplers are sharded already, and exact: no sample is repeated or dropped
 }
 """What the trainer is given unless the options say otherwise."""
-CALLBACKS = {
-    "progress": "callbacks.Progress",
-    "best": "callbacks.BestCheckpoint",
-    "last": "callbacks.LastCheckpoint",  # after `best`, so that it knows the best of the epoch that it closes
-    "stop": "stopping.GracefulStop",
-    "processes": "stopping.ProcessWatch",
-    "non_finite": "nonfinite.NonFinite",
-    "health": "health.HealthMonitor",
-    "loader": "loading.LoaderMonitor",
-    "pictures": "callbacks.PicturePanel",
+CALLBACKS: Mapping[str, tuple[str, dict[str, str]]] = {
+    "progress": ("callbacks.Progress", {}),
+    "best": ("callbacks.BestCheckpoint", {"folder": "checkpoints"}),
+    "last": ("callbacks.LastCheckpoint", {"folder": "checkpoints"}),  # knows the best of the epoch that it closes
+    "stop": ("stopping.GracefulStop", {"folder": "checkpoints"}),
+    "processes": ("stopping.ProcessWatch", {"folder": "", "checkpoints": "checkpoints"}),
+    "non_finite": ("monitors.NonFinite", {"folder": "nonfinite"}),
+    "health": ("monitors.HealthMonitor", {}),
+    "loader": ("monitors.LoaderMonitor", {}),
+    "pictures": ("callbacks.PicturePanel", {"folder": "pictures"}),
 }
+"""The usual callbacks by name, with the folders that they are given, below the run's own."""
 LOGGERS = {"csv": "CSVLogger", "tensorboard": "TensorBoardLogger"}
 _TRUSTED = ("lightning.", "torch.", "saunet.")
 """Packages that nested nodes of callbacks, loggers and the trainer may name."""
@@ -192,37 +193,12 @@ class TrainOptions:
                 "the training without saving it; use trainer=ddp, or start it with torchrun"
             )
 
-    @classmethod
-    def from_plain(cls, plain: Mapping[str, Any]) -> TrainOptions:
-        """Read options from plain containers: a composed configuration, or the ``config`` of a ``run.json``."""
-        model: dict[str, Any] = {
-            key: Spec(value) if isinstance(value, Mapping) else value for key, value in plain["model"].items()
-        }
-        optim, speed = (
-            {key: value for key, value in plain.get(part, {}).items() if not key.startswith("_")}
-            for part in ("optim", "speed")
-        )
-        parts = {
-            "model": ModelOptions(**model),
-            "data": Spec(plain["data"]),
-            "objective": Spec(plain["objective"]),
-            "optim": Recipe(**optim),
-            "speed": Speed(**speed),
-            "trainer": {key: value for key, value in plain.get("trainer", {}).items() if not key.startswith("_")},
-        }
-        return cls(**{**plain, **parts})
-
     def to_plain(self) -> dict[str, Any]:
         """Return the options as plain containers."""
-        model = {key: getattr(self.model, key) for key in ("encoder", "decoder", "pose", "min_depth", "max_depth")}
-        return {
-            **{key: getattr(self, key) for key in self.__dataclass_fields__},
-            "model": {key: dict(value.node) if isinstance(value, Spec) else value for key, value in model.items()},
-            "data": dict(self.data.node),
-            "objective": dict(self.objective.node),
-            "optim": self.optim.to_plain(),
-            "speed": asdict(self.speed),
-        }
+        plain: dict[str, Any] = {**vars(self), "optim": self.optim.to_plain(), "speed": asdict(self.speed)}
+        plain |= {"model": dict(vars(self.model)), "data": dict(self.data.node), "objective": dict(self.objective.node)}
+        plain["model"] |= {kind: dict(node.node) for kind, node in plain["model"].items() if isinstance(node, Spec)}
+        return plain
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,7 +219,7 @@ def train(
     *,
     choices: Mapping[str, str | None] | None = None,
     overrides: Sequence[str] = (),
-    describe: Callable[[Exception], str | None] = lambda error: None,
+    describe: Describe = lambda error: None,
 ) -> TrainResult:
     """Train a depth network on driving video; ``run.json`` in the run's folder says how that went.
 
@@ -267,8 +243,7 @@ def train(
     if not (options.resume or options.overwrite):
         check_unused(folder)
     resume = resume_path(options.resume, folder, options.init_from)
-    if resume:
-        read_checkpoint(resume)  # before the data are set up, which writes to the log
+    checkpoint = read_checkpoint(resume) if resume else None  # before the data are set up, which takes its time
     seed_everything(options.seed, workers=True, verbose=False)
     data = options.data.build()
     model = assemble(options, data, pretrained=resume is None and options.init_from is None)
@@ -276,7 +251,8 @@ def train(
     trainer = _trainer(options, loggers)
     data.setup("fit")
     data.train_dataloader()  # knows whether there are enough samples
-    steps = check_resume(model, resume, data) if resume else 0
+    steps = check_resume(model, checkpoint, data) if checkpoint else 0
+    del checkpoint  # as large as the model and its moments
     started = warm_start(model, options.init_from) if options.init_from and not resume else None
     known = {
         "config": options.to_plain(),
@@ -306,26 +282,15 @@ def train(
     if trainer.is_global_zero:
         print(f"results: {folder}")
     kept = [each for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint)]
-    return TrainResult(
-        folder=folder,
-        best=next((Path(each.best_model_path) for each in kept if each.best_model_path), None),
-        cost=next((each.cost for each in kept if each.cost is not None), None),
-        data=data,
-        model=model,
-    )
+    best = next((Path(each.best_model_path) for each in kept if each.best_model_path), None)
+    cost = next((each.cost for each in kept if each.cost is not None), None)
+    return TrainResult(folder=folder, best=best, cost=cost, data=data, model=model)
 
 
 def assemble(options: TrainOptions, data: DepthDataModule, pretrained: bool = True) -> SelfSupervisedDepth:
     """Build networks, objective, recipe and metrics: the one place where all parts meet.
 
-    Args:
-        options: The training.
-        data: What the model will be trained on; it names the validation protocol if the options do not.
-        pretrained: Whether to start from the public weights that the model names; a resumed training has its own.
-
-    Raises:
-        ConfigError: if a part cannot be built, or the parts do not fit together.
-        CheckpointError: if public weights cannot be fetched, read or fitted.
+    With ``pretrained`` they start from the public weights that the model names; a resumed training has its own.
     """
     pose = _pose(options.model.pose, data)
     objective = options.objective.build()
@@ -356,16 +321,8 @@ def assemble(options: TrainOptions, data: DepthDataModule, pretrained: bool = Tr
             f"protocol '{rules.name}' is defined on '{rules.ground_truth}' ground truth and the data give "
             f"'{data.ground_truth}'; leave protocol unset, or choose the matching ground truth"
         )
-    module = SelfSupervisedDepth(
-        depth=depth,
-        pose=pose_network,
-        objective=objective,
-        recipe=options.optim,
-        metrics=DepthMetrics(rules),
-        seed=options.seed,
-        record=record.to_plain(),
-        speed=options.speed,
-    )
+    recipe, metrics, seed, plain = options.optim, DepthMetrics(rules), options.seed, record.to_plain()
+    module = SelfSupervisedDepth(depth, pose_network, objective, recipe, metrics, seed, plain, options.speed)
     module.objective_node = options.objective.node
     return module
 
@@ -408,20 +365,13 @@ def _loggers(options: TrainOptions) -> list[Any]:
 def _callbacks(options: TrainOptions) -> list[Any]:
     nodes: Mapping[str, Any] | None = options.callbacks
     if nodes is None:
-        nodes = {name: {"_target_": f"saunet.training.{target}"} for name, target in CALLBACKS.items()}
-    folder = Path(options.output_dir)
-    places: dict[str, dict[str, Any]] = {
-        "best": {"folder": folder / "checkpoints", "monitor": options.monitor},
-        "last": {"folder": folder / "checkpoints"},
-        "stop": {"folder": folder / "checkpoints"},
-        "processes": {"folder": folder, "checkpoints": folder / "checkpoints"},
-        "non_finite": {"folder": folder / "nonfinite"},
-        "pictures": {"folder": folder / "pictures"},
-    }
+        nodes = {name: {"_target_": f"saunet.training.{target}"} for name, (target, _) in CALLBACKS.items()}
     built = []
     for name, node in nodes.items():
         if isinstance(node, Mapping):
-            node = {**{key: str(value) for key, value in places.get(name, {}).items()}, **node}
+            places = CALLBACKS[name][1] if name in CALLBACKS else {}
+            given = {key: str(Path(options.output_dir, place)) for key, place in places.items()}
+            node = {**given, **({"monitor": options.monitor} if name == "best" else {}), **node}
         built.append(_part(f"callbacks.{name}", node, Callback))
     return [each for each in built if each is not None]
 
@@ -438,11 +388,7 @@ def _trainer(options: TrainOptions, loggers: list[Any]) -> Trainer:
 
 
 def _part(key: str, node: Any, kind: type) -> Any:
-    """Build a callback, logger or part of the trainer from its node; what is no node is returned as it is.
-
-    Raises:
-        ConfigError: if it cannot be built, or is of another kind.
-    """
+    """Build a callback, logger or part of the trainer from its node; what is no node is returned as it is."""
     if isinstance(node, list | tuple):
         return [_part(key, each, object) for each in node]
     if node is None or not isinstance(node, Mapping):
