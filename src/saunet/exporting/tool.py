@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import platform
@@ -247,10 +248,8 @@ def named_state(parts: Mapping[str, torch.nn.Module]) -> dict[str, torch.Tensor]
 def _versions() -> dict[str, str]:
     found = {}
     for package in ("saunet", "torch", "onnx", "onnxruntime", "onnxscript", "safetensors"):
-        try:
+        with contextlib.suppress(PackageNotFoundError):
             found[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return found
 
 

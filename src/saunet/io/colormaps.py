@@ -8,16 +8,13 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 
 from saunet.errors import ConfigError, in_range, one_of
 
-COLORMAPS: tuple[str, ...] = ("magma", "inferno", "viridis", "turbo", "gray")
-"""Names of the color maps."""
-
 _MAPS = {
     "magma": cv2.COLORMAP_MAGMA,
     "inferno": cv2.COLORMAP_INFERNO,
     "viridis": cv2.COLORMAP_VIRIDIS,
     "turbo": cv2.COLORMAP_TURBO,
 }
-_DEPTH_STEPS_PER_METRE = 256
+COLORMAPS: tuple[str, ...] = (*_MAPS, "gray")
 
 
 def value_range(values: Float[np.ndarray, "..."], low: float = 0.5, high: float = 98.0) -> tuple[float, float]:
@@ -71,10 +68,7 @@ def colorize(
 
 
 def depth_to_png16(depth: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
-    """Return depth as 16-bit integers, meters x 256, KITTI's format: 0 means unknown, 65535 is 255.996 m or more.
-
-    A valid depth never becomes 0; values that are not finite or not positive do.
-    """
-    valid = np.isfinite(depth) & (depth > 0)
-    steps = np.round(np.where(valid, depth, 0).astype(np.float64) * _DEPTH_STEPS_PER_METRE)
+    """Return depth as KITTI's 16-bit integers, meters x 256: 65535 is 255.996 m or more, 0 unknown, as inf and NaN."""
+    valid = np.isfinite(depth) & (depth > 0)  # never becomes 0
+    steps = np.round(np.where(valid, depth, 0).astype(np.float64) * 256)
     return np.where(valid, np.clip(steps, 1, 65535), 0).astype(np.uint16)

@@ -58,45 +58,35 @@ class Recording:
     def __init__(self, source: Input, output_dir: str | Path | None = None, fps: float | int | None = None) -> None:
         self.images: list[Frame] | None = None
         self._reader: VideoReader | CameraReader | None = None
-        self._arrays: Iterable[Any] = ()
         self._size: tuple[int, int] | None = None
+        self._frames: Iterable[Frame]
         number = camera_number(source)
-        self.title, self.live, self.declared = title_of(source), number is not None, None
+        self.title, self.live, self.declared, self.timed = title_of(source), number is not None, None, False
         self.fps: float = float(fps or IMAGE_FPS)
-        if number is not None:
-            self._reader = CameraReader(number)
-        elif isinstance(source, str | Path) and _is_video(Path(source)):
-            self._reader = VideoReader(source, fps)
+        if number is not None or (isinstance(source, str | Path) and _is_video(Path(source))):
+            self._reader = reader = CameraReader(number) if number is not None else VideoReader(str(source), fps)
+            self._size, self.timed = (reader.height, reader.width), reader.timed
+            self.declared, self.fps = reader.declared, float(fps or reader.fps or STREAM_FPS)
+            self._frames = (Frame(each.image, f"{self.title}/{each.number:06d}", each.time) for each in reader.frames())
         elif isinstance(source, str | Path) or (
             isinstance(source, Sequence) and all(isinstance(item, str | Path) for item in source)
         ):
-            self.images = find_sources(source, output_dir)
+            self._frames = self.images = find_sources(source, output_dir)
             self.declared = len(self.images)
         else:
             assert not isinstance(source, int)
             arrays = iter(source)
             first = list(itertools.islice(arrays, 1))
             self._size = as_image(first[0]).shape[:2] if first else None
-            self._arrays = itertools.chain(first, arrays)
-        if self._reader is not None:
-            self.declared, self.fps = self._reader.declared, float(fps or self._reader.fps or STREAM_FPS)
-        self.timed = self._reader is not None and self._reader.timed
+            numbered = enumerate(itertools.chain(first, arrays))
+            self._frames = (Frame(image, f"{self.title}/{number:06d}") for number, image in numbered)
 
     def __iter__(self) -> Iterator[Frame]:
-        if self.images is not None:
-            yield from self.images
-        elif self._reader is not None:
-            for frame in self._reader.frames():
-                yield Frame(frame.image, f"{self.title}/{frame.number:06d}", frame.time)
-        else:
-            for number, image in enumerate(self._arrays):
-                yield Frame(image, f"{self.title}/{number:06d}")
+        return iter(self._frames)
 
     @property
     def first_size(self) -> tuple[int, int] | None:
         """(height, width) of the first picture that can be read; None if there is none."""
-        if self._reader is not None:
-            return self._reader.height, self._reader.width
         problems = list[DataError]()
         for frame in self.images or ():
             try:
