@@ -41,7 +41,7 @@ def test_no_scanner_calibration_is_no_error(tmp_path):
     ("old", "new", "message"),
     [
         ("50 0 30 3 0 50", "50 0 30 3 0", r"calib_cam_to_cam.txt, line 7 \(P_rect_02\): expected 12 numbers, got 11"),
-        ("50 0 30 3 0 50", "50 0 x 3 0 50", r"line 7 \(P_rect_02\): expected 12 numbers, got 'x' among them"),
+        ("50 0 30 3 0 50", "50 0 x 3 0 50", r"line 7 \(P_rect_02\): expected 12 finite numbers, got 'x' among them"),
         ("50 0 30 3 0 50", "50 0 nan 3 0 50", r"line 7 \(P_rect_02\): expected 12 finite numbers"),
         ("corner_dist:", "corner_dist", r"line 2: expected 'key: numbers', got 'corner_dist 9.95"),
         ("R_rect_00:", "R_rect_xx:", r"lacks R_rect_00"),

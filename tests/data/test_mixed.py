@@ -83,7 +83,7 @@ def test_what_does_not_go_together_is_refused(tmp_path):
     made = sources(tmp_path)
     with pytest.raises(ConfigError, match=r"data=mixed has no sources; add them with \+data@data.sources.NAME=kitti"):
         datamodules.build("mixed", **SIZE)
-    with pytest.raises(ConfigError, match=r"train names the source 'twon'; sources: town, campus"):
+    with pytest.raises(ConfigError, match=r"train is 'twon'; did you mean 'town'\? allowed: town, campus"):
         datamodules.build("mixed", sources=made, train=["twon"], **SIZE)
     with pytest.raises(ConfigError, match=r"data.sources.x is int; it must be a data module"):
         datamodules.build("mixed", sources={"x": 3}, **SIZE)

@@ -157,11 +157,7 @@ def test_malformed_files_are_named(root):
 
 def test_real_sequence(kitti_mini):
     data = module(
-        kitti_mini / "odometry",
-        train_sequences=["06"],
-        test_sequences=["06"],
-        camera="gray_left",
-        with_pose=True,
+        kitti_mini / "odometry", train_sequences=["06"], test_sequences=["06"], camera="gray_left", with_pose=True
     )
     data.setup()
     assert len(data.datasets["test"]) == 49

@@ -37,9 +37,9 @@ def test_defaults_are_the_demos() -> None:
 
 
 def test_splits_are_different_streets(module: SyntheticDataModule) -> None:
-    seeds = {split: {d.settings.seed for d in module.drives(split)} for split in ("train", "val", "test")}
+    seeds = {split: {d.seed for d in module.drives(split)} for split in ("train", "val", "test")}
     other = SyntheticDataModule(**{**TINY, "frames_per_drive": 1}, seed=1)
-    seeds["other train"] = {d.settings.seed for d in other.drives("train")}
+    seeds["other train"] = {d.seed for d in other.drives("train")}
     everything = [seed for chosen in seeds.values() for seed in chosen]
     assert len(everything) == len(set(everything)) == 6
     assert len(module.datasets["train"]) == 4  # two of four frames have both neighbors, in two drives

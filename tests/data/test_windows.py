@@ -5,16 +5,7 @@ import pytest
 import torch
 from drives import NumberDrive
 
-from saunet.data.loading.windows import (
-    DRAWS,
-    Item,
-    Selection,
-    WindowDataset,
-    collate,
-    find_windows,
-    reach,
-    sample_name,
-)
+from saunet.data.loading.windows import DRAWS, Item, Selection, WindowDataset, collate, find_windows, reach, sample_name
 from saunet.errors import ConfigError, DataError
 from saunet.fingerprint import fingerprint
 

@@ -11,7 +11,7 @@ from jaxtyping import TypeCheckError
 
 from saunet.errors import ConfigError, DataError
 from saunet.synthetic import SyntheticDrive, kitti_writer, write_odometry, write_raw
-from saunet.synthetic.oxts import DATAFORMAT, records
+from saunet.synthetic.kitti_writer import DATAFORMAT, records
 
 DATE = "2011_09_26"
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from saunet.synthetic.markings import _dashed
-from saunet.synthetic.materials import INDEX, MATERIALS
-from saunet.synthetic.noise import SIZE, colored_noise, coverage
-from saunet.synthetic.textures import grain, sample
+from saunet.synthetic.materials import INDEX, MATERIALS, SIZE, colored_noise, coverage, grain, sample
+from saunet.synthetic.shade import _dashed
 
 
 def _grid(count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -15,14 +15,12 @@ from saunet.io.images import image_size
 
 FOCAL = (0.15, 10.0)
 """Focal lengths in image widths (or heights) that a camera may have: a fisheye lens, a long telephoto lens."""
-CENTER = (0.15, 0.85)
-"""Fractions of the width between which the center lies, also where a side was cut off."""
+CENTER = (0.15, 0.85)  # fractions of the width between which the center lies, also where a side was cut off
 SHRUNK = 0.3
 """A center nearer than this to a corner, both ways, is that of K of another image size; crops move it one way."""
 ROTATION_ERROR = 1e-3
 """Largest difference of R R^T from 1; matrices printed with seven digits, as KITTI's, are within 2e-7."""
-LOOKED_AT = 5
-"""Frames whose size is looked at: a broken or odd one among them decides nothing."""
+LOOKED_AT = 5  # frames whose size is looked at: a broken or odd one among them decides nothing
 
 
 def check_intrinsics(
@@ -52,9 +50,8 @@ def check_intrinsics(
     if not (0 < down < 1 and CENTER[0] < right < CENTER[1]):
         raise DataError(f"{told}; the center must lie inside, not near the left or right edge: {fix}")
     if max(right, down) < SHRUNK or min(right, down) > 1 - SHRUNK:
-        raise DataError(
-            f"{told}; the center must lie inside, and near a corner it is that of images of another size: {fix}"
-        )
+        why = "near a corner it is that of images of another size"
+        raise DataError(f"{told}; the center must lie inside, and {why}: {fix}")
 
 
 def common_size(paths: Sequence[Path]) -> tuple[Path, tuple[int, int]]:

@@ -14,14 +14,12 @@ from saunet.data.drive import Drive, DriveProxy
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
 from saunet.data.loading.windows import Selection, measured_distance
-from saunet.errors import ConfigError
+from saunet.errors import ConfigError, one_of
 from saunet.registry import datamodules
 
-SHARED = ("height", "width", "offsets", "batch_size", "workers", "crop_margin", "seed")
+SHARED: tuple[str, ...] = ("height", "width", "offsets", "batch_size", "workers", "crop_margin", "seed")
 SHARED += ("target_depth", "with_pose", "stereo", "on_error")
 """Settings that belong to the mixture; its sources take them over."""
-AUGMENTATION = ("flip_prob", "color_jitter_prob")
-"""Settings that only the mixture's own augmentation reads."""
 
 
 @datamodules.register("mixed")
@@ -69,7 +67,10 @@ class MixedDataModule(DepthDataModule):
                     "its name must not contain '/'"
                 )
             self.sources[name] = self._fitted(name, source)
-        self._names = {"train": _known("train", train, self.sources), "test": _known("test", test, self.sources)}
+        self._names = {
+            key: tuple(one_of(key, name, self.sources) for name in names) or tuple(self.sources)
+            for key, names in (("train", train), ("test", test))
+        }
         with_speed = frozenset(name for name, source in self.sources.items() if source.odometer)
         self.odometer = partial(_distance, with_speed) if with_speed else None
         self.ground_truth, self.protocol = _truth([self.sources[name] for name in self._names["test"]])
@@ -89,7 +90,6 @@ class MixedDataModule(DepthDataModule):
         return tuple(dict.fromkeys((self.protocol, *without)))
 
     def prepare_data(self) -> None:
-        """Let every source prepare on one process."""
         for source in self.sources.values():
             source.prepare_data()
 
@@ -121,11 +121,10 @@ class MixedDataModule(DepthDataModule):
             )
         parameters = schema.parameters(type(source))
         presets = [entry.preset for entry in datamodules if entry.target is type(source)]
-        for key in (*SHARED, *AUGMENTATION):
+        for key in (*SHARED, "flip_prob", "color_jitter_prob"):
             defaults = [parameters[key].default] if key in parameters else []
             defaults += [preset[key] for preset in presets if key in preset]
-            holders = (source.augment, self.augment) if key in AUGMENTATION else (source, self)
-            given, ours = (getattr(holder, key) for holder in holders)
+            given, ours = getattr(source, key), getattr(self, key)
             defaults = [tuple(each) if isinstance(each, list) else each for each in defaults]
             if key in parameters and given not in (ours, *defaults):
                 has = key in schema.parameters(type(self))
@@ -151,13 +150,6 @@ class _Named(DriveProxy):
 def _distance(with_speed: frozenset[str], drive: Drive, first: int, second: int) -> float:
     """Return the meters traveled where the drive's source was asked for them, else NaN."""
     return measured_distance(drive, first, second) if drive.name.partition("/")[0] in with_speed else math.nan
-
-
-def _known(key: str, names: Sequence[str], sources: Mapping[str, Any]) -> tuple[str, ...]:
-    for name in names:
-        if name not in sources:
-            raise ConfigError(f"{key} names the source '{name}'; sources: {', '.join(sources)}")
-    return tuple(names) or tuple(sources)
 
 
 def _truth(sources: Sequence[DepthDataModule]) -> tuple[str, str]:

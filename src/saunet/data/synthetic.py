@@ -107,7 +107,6 @@ class SyntheticDataModule(DepthDataModule):
         return self._drives[name]
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return all frames of a split's drives."""
         return [Selection(drive, drive.indices) for drive in self.drives(split)]
 
 

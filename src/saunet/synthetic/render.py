@@ -8,12 +8,13 @@ what is left.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.synthetic.mesh import CORNERS, Polygons, Quadrics
+from saunet.synthetic.objects import CORNERS, Polygons, Quadrics
 from saunet.synthetic.world import KERB_HEIGHT, World
 
 F64 = NDArray[np.float64]
@@ -23,11 +24,8 @@ I32 = NDArray[np.int32]
 SAMPLES = np.array([[0.0, 0.0], [-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
 """Where a pixel is sampled, pixels from its center: the center, which alone gives the depth, and a rotated square."""
 
-NEAR = 0.3
-"""Nothing nearer is drawn, meters."""
-DRAW = 230.0
-"""Nothing farther is drawn but ground and sky, meters."""
-
+NEAR, DRAW = 0.3, 230.0
+"""Nothing nearer is drawn, and nothing farther but ground and sky; meters."""
 SKY, ROAD, KERB_FACE, KERB_TOP, PAVEMENT, GRASS = -1, -2, -3, -4, -5, -6
 """Identities of what is not a polygon (0 ... q - 1) or quadric (q ... q + k - 1)."""
 KERB_WIDTH = 0.18
@@ -40,21 +38,17 @@ _POLYGON_EDGES = np.array([(i, (i + 1) % CORNERS) for i in range(CORNERS)])
 class Camera:
     """A pinhole camera in the world."""
 
-    K: F64
-    """3 x 3, pixels; integer coordinates are pixel centers."""
-    T_world_cam: F64
-    """4 x 4, meters, x right, y down, z forward."""
+    K: F64  # 3 x 3, pixels; integer coordinates are pixel centers
+    T_world_cam: F64  # 4 x 4, meters, x right, y down, z forward
     height: int
     width: int
 
     @property
     def rotation(self) -> F64:
-        """World from camera, 3 x 3."""
         return self.T_world_cam[:3, :3]
 
     @property
     def position(self) -> F64:
-        """Position in the world, meters."""
         return self.T_world_cam[:3, 3]
 
 
@@ -62,16 +56,11 @@ class Camera:
 class Hits:
     """What the samples see; s samples a pixel, the first at its center."""
 
-    inverse_depth: F32
-    """s x h x w, 1/meter along the camera's axis, 0 for the sky."""
-    identity: I32
-    """s x h x w."""
-    x: F32
-    """s x 1 x w: rays are (x, y, 1)."""
-    y: F32
-    """s x h x 1."""
-    planes: F64
-    """q x 3: inverse depth of each polygon's plane is planes . (x, y, 1)."""
+    inverse_depth: F32  # s x h x w, 1/meter along the camera's axis, 0 for the sky
+    identity: I32  # s x h x w
+    x: F32  # s x 1 x w: rays are (x, y, 1)
+    y: F32  # s x h x 1
+    planes: F64  # q x 3: inverse depth of each polygon's plane is planes . (x, y, 1)
 
 
 def cast(world: World, polygons: Polygons, camera: Camera) -> Hits:
@@ -105,17 +94,24 @@ def _rectangles(camera: Camera, points: F64, edges: NDArray[np.int64]) -> tuple[
     depth = np.where(seen, candidates[..., 2], 1.0)
     u = camera.K[0, 0] * candidates[..., 0] / depth + camera.K[0, 2]
     v = camera.K[1, 1] * candidates[..., 1] / depth + camera.K[1, 2]
-    big = 1e9
-    low_u, high_u = np.where(seen, u, big).min(axis=1), np.where(seen, u, -big).max(axis=1)
-    low_v, high_v = np.where(seen, v, big).min(axis=1), np.where(seen, v, -big).max(axis=1)
-    tiny = (high_u - low_u < 0.1) | (high_v - low_v < 0.1)
-    reach = float(np.abs(SAMPLES).max())
-    left = np.clip(np.ceil(low_u - reach), 0, camera.width)
-    right = np.clip(np.floor(high_u + reach) + 1, 0, camera.width)
-    top = np.clip(np.ceil(low_v - reach), 0, camera.height)
-    bottom = np.clip(np.floor(high_v + reach) + 1, 0, camera.height)
-    right = np.where(tiny, left, right)
-    return np.stack([left, right, top, bottom], axis=1).astype(np.int32), np.where(seen, depth, big).min(axis=1)
+    big, reach = 1e9, float(np.abs(SAMPLES).max())
+    sides, tiny = [], np.zeros(len(points), bool)
+    for pixel, count in ((u, camera.width), (v, camera.height)):
+        low, high = np.where(seen, pixel, big).min(axis=1), np.where(seen, pixel, -big).max(axis=1)
+        tiny |= high - low < 0.1
+        sides += [np.clip(np.ceil(low - reach), 0, count), np.clip(np.floor(high + reach) + 1, 0, count)]
+    sides[1] = np.where(tiny, sides[0], sides[1])
+    return np.stack(sides, axis=1).astype(np.int32), np.where(seen, depth, big).min(axis=1)
+
+
+def _near_to_far(rectangles: I32, front: F64, nearest: F32) -> Iterator[tuple[int, slice, slice, F32]]:
+    """Yield what may be seen with its rows, columns and buffer, near to far, so that hidden things are found early."""
+    shown = np.flatnonzero((rectangles[:, 1] > rectangles[:, 0]) & (rectangles[:, 3] > rectangles[:, 2]))
+    for i in shown[np.argsort(front[shown], kind="stable")].tolist():
+        left, right, top, bottom = rectangles[i]
+        buffer = nearest[:, top:bottom, left:right]
+        if buffer.min() * front[i] < 1.0:
+            yield i, slice(top, bottom), slice(left, right), buffer
 
 
 def _cast_polygons(polygons: Polygons, camera: Camera, x: F32, y: F32, nearest: F32, identity: I32) -> F64:
@@ -129,25 +125,18 @@ def _cast_polygons(polygons: Polygons, camera: Camera, x: F32, y: F32, nearest: 
     visible = (distance > 1e-6 * scale) & (corners[..., 2].max(axis=1) > NEAR)
     chosen, corners, normal, distance = chosen[visible], corners[visible], normal[visible], distance[visible]
     rectangles, front = _rectangles(camera, corners, _POLYGON_EDGES)
-    on_screen = (rectangles[:, 1] > rectangles[:, 0]) & (rectangles[:, 3] > rectangles[:, 2])
-    order = np.flatnonzero(on_screen)
-    order = order[np.argsort(front[order], kind="stable")]  # near to far, so that hidden ones are found out early
     inside = np.cross(corners, np.roll(corners, -1, axis=1))  # x, y, 1 coefficients of each edge
     size = np.abs(inside).max(axis=2, keepdims=True)
     plane = normal / distance[:, None]
     planes[chosen] = plane
     tests = np.concatenate([inside / np.maximum(size, 1e-9), plane[:, None]], axis=1).astype(np.float32)
     real = size[..., 0] > 1e-9
-    for i in order:
-        left, right, top, bottom = rectangles[i]
-        buffer = nearest[:, top:bottom, left:right]
-        if buffer.min() * front[i] >= 1.0:
-            continue
-        rows = tests[i][np.append(real[i], True)][:, :, None, None, None]
-        value = rows[:, 0] * x[:, :, left:right] + (rows[:, 1] * y[:, top:bottom] + rows[:, 2])
+    for i, rows, columns, buffer in _near_to_far(rectangles, front, nearest):
+        test = tests[i][np.append(real[i], True)][:, :, None, None, None]
+        value = test[:, 0] * x[:, :, columns] + (test[:, 1] * y[:, rows] + test[:, 2])
         hit = (value[:-1] >= 0).all(axis=0) & (value[-1] > buffer)
         np.copyto(buffer, value[-1], where=hit)
-        np.copyto(identity[:, top:bottom, left:right], np.int32(chosen[i]), where=hit)
+        np.copyto(identity[:, rows, columns], np.int32(chosen[i]), where=hit)
     return planes
 
 
@@ -179,16 +168,11 @@ def _cast_quadrics(quadrics: Quadrics, first: int, camera: Camera, x: F32, y: F3
     lines = ((toward[:, None] @ shift)[:, 0] / outside_or_one[:, None]).astype(np.float32)
     falls = (camera.rotation[1] @ shift).astype(np.float32)  # world y per meter of depth along the ray
     centers = middle.astype(np.float32)
-    on_screen = np.flatnonzero(
-        (rectangles[:, 1] > rectangles[:, 0]) & (rectangles[:, 3] > rectangles[:, 2]) & (outside > 0)
-    )
-    for i in on_screen[np.argsort(front[on_screen], kind="stable")]:
-        left, right, top, bottom = rectangles[i]
-        buffer = nearest[:, top:bottom, left:right]
-        if buffer.min() * front[i] >= 1.0:
+    for i, rows, columns, buffer in _near_to_far(rectangles, front, nearest):
+        if outside[i] <= 0:
             continue
         k, conic, line = chosen[i], conics[i], lines[i]
-        xs, ys = x[:, :, left:right] - centers[i, 0], y[:, top:bottom] - centers[i, 1]
+        xs, ys = x[:, :, columns] - centers[i, 0], y[:, rows] - centers[i, 1]
         root = (2 * conic[0, 1] * xs) * ys
         root += (conic[0, 0] * xs + 2 * conic[0, 2]) * xs + conic[2, 2]
         root += (conic[1, 1] * ys + 2 * conic[1, 2]) * ys
@@ -206,7 +190,7 @@ def _cast_quadrics(quadrics: Quadrics, first: int, camera: Camera, x: F32, y: F3
             highest, lowest = (np.float32(v) for v in quadrics.extent[k] - camera.position[1])
             hit &= (below >= highest * inverse) & (below <= lowest * inverse)
         np.copyto(buffer, inverse, where=hit)
-        np.copyto(identity[:, top:bottom, left:right], np.int32(first + k), where=hit)
+        np.copyto(identity[:, rows, columns], np.int32(first + k), where=hit)
 
 
 def _cast_ground(world: World, camera: Camera, x: F32, y: F32, nearest: F32, identity: I32) -> None:
@@ -221,10 +205,10 @@ def _cast_ground(world: World, camera: Camera, x: F32, y: F32, nearest: F32, ide
     upper = upper[sample, row, column]
     lower = drop[sample, row, column] * np.float32(1 / height)
     rays = (x[sample, 0, column], y[sample, row, 0])
-    across_upper = _across(world, camera, rays, upper)
-    across_lower = _across(world, camera, rays, lower)
     half = np.float32(world.section.half_width)
-    edge, edge_lower = np.abs(across_upper), np.abs(across_lower)
+    edge, edge_lower = (
+        np.abs(world.road.locate(*ground_point(camera, *rays, inverse))[1]) for inverse in (upper, lower)
+    )
     on_road, on_top = edge_lower <= half, edge >= half
     share = np.clip((half - edge) / np.maximum(edge_lower - edge, 1e-6), 0, 1)  # of the way down the kerb's face
     face = 1 / (1 / upper + share * (1 / lower - 1 / upper))
@@ -237,11 +221,6 @@ def _cast_ground(world: World, camera: Camera, x: F32, y: F32, nearest: F32, ide
     sample, row, column = sample[wins], row[wins], column[wins]
     nearest[sample, row, column] = inverse[wins]
     identity[sample, row, column] = kind[wins]
-
-
-def _across(world: World, camera: Camera, rays: tuple[F32, F32], inverse: F32) -> F32:
-    x, z = ground_point(camera, rays[0], rays[1], inverse)
-    return world.road.locate(x, z)[1]
 
 
 def ground_point(camera: Camera, x: F32, y: F32, inverse_depth: F32) -> tuple[F32, F32]:

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.synthetic import textures
-from saunet.synthetic.markings import markings
+from saunet.synthetic import materials
 from saunet.synthetic.materials import INDEX
-from saunet.synthetic.mesh import Polygons, Quadrics
+from saunet.synthetic.objects import Polygons
 from saunet.synthetic.render import GRASS, KERB_FACE, KERB_TOP, PAVEMENT, ROAD, SKY, Camera, Hits, ground_point
 from saunet.synthetic.world import World
 
@@ -81,13 +80,9 @@ def _color(scene: Scene, sample: I64, row: I64, column: I64) -> F32:
         hits.identity[sample, row, column],
     )
     color = np.empty((sample.size, 3), np.float32)
-    thing = rays.identity
-    for where, paint in (
-        (thing == SKY, _sky),
-        (thing < SKY, _ground),
-        ((thing >= 0) & (thing < scene.polygons.count), _polygon),
-        (thing >= scene.polygons.count, _quadric),
-    ):
+    thing, count = rays.identity, scene.polygons.count
+    polygon, quadric = (thing >= 0) & (thing < count), thing >= count
+    for where, paint in ((thing == SKY, _sky), (thing < SKY, _ground), (polygon, _polygon), (quadric, _quadric)):
         index = np.flatnonzero(where)
         if index.size:
             part = Rays(rays.x[index], rays.y[index], rays.inverse_depth[index], thing[index])
@@ -108,15 +103,18 @@ def _brightness(world: World, normal: F64) -> F64:
 
 def _blend(luminance: F32, mask: F32, first: F32, second: F32) -> F32:
     """Color of a surface from its material's luminance and mask (n) and its two colors (n x 3 or 3)."""
-    mixed: F32 = luminance[:, None] * (first + mask[:, None] * (second - first))
-    return mixed
+    return np.asarray(luminance[:, None] * (first + mask[:, None] * (second - first)), np.float32)
+
+
+def _directions(turn: F32, rays: Rays) -> list[F32]:
+    return [turn[i, 0] * rays.x + turn[i, 1] * rays.y + turn[i, 2] for i in range(3)]
 
 
 def _sky(scene: Scene, rays: Rays) -> F32:
     """A gradient with clouds on a plane far above."""
     world, camera = scene.world, scene.camera
     turn = camera.rotation.astype(np.float32)
-    direction = [turn[i, 0] * rays.x + turn[i, 1] * rays.y + turn[i, 2] for i in range(3)]
+    direction = _directions(turn, rays)
     length = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
     rise = np.clip(-direction[1] / length, 0, 1)
     low, high, cloud = (np.asarray(c, np.float32) for c in (world.light.horizon, world.light.zenith, world.light.cloud))
@@ -124,11 +122,9 @@ def _sky(scene: Scene, rays: Rays) -> F32:
     reach = 0.35 / (rise + 0.12)
     pixel = reach / camera.K[0, 0]
     u, v = direction[0] / length * reach, direction[2] / length * reach
-    kind = np.full(u.size, INDEX["clouds"], np.float32)
-    pixel = pixel.astype(np.float32)
-    _, mask = textures.sample(kind, u, v, pixel, pixel * 4)
-    painted: F32 = base + (0.75 * mask * np.clip(rise * 6, 0, 1))[:, None] * (cloud - base)
-    return painted
+    kind, pixel = np.full(u.size, INDEX["clouds"], np.float32), pixel.astype(np.float32)
+    _, mask = materials.sample(kind, u, v, pixel, pixel * 4)
+    return np.asarray(base + (0.75 * mask * np.clip(rise * 6, 0, 1))[:, None] * (cloud - base), np.float32)
 
 
 def _ground(scene: Scene, rays: Rays) -> F32:
@@ -147,25 +143,21 @@ def _ground(scene: Scene, rays: Rays) -> F32:
     step_across = np.hypot(side * (turn[0, 0] * cosine - turn[2, 0] * sine), ahead * (view_x * cosine - view_z * sine))
     kinds = np.array(sorted(_GROUND))
     place = np.searchsorted(kinds, rays.identity)
-    names = [_GROUND[int(k)][0] for k in kinds]
+    names, periods, strengths = zip(*(_GROUND[int(kind)] for kind in kinds), strict=True)
     material = np.array([INDEX[n] for n in names], np.float32)[place]
-    period = np.array([_GROUND[int(k)][1] for k in kinds], np.float32)[place]
-    strength = np.array([_GROUND[int(k)][2] for k in kinds], np.float32)[place]
-    luminance, mask = textures.sample(
-        material, along / period, across / period, step_along / period, step_across / period
-    )
-    fine = textures.grain(
-        along / _GRAIN_PERIOD, across / _GRAIN_PERIOD, np.maximum(step_along, step_across) / _GRAIN_PERIOD
-    )
+    period, strength = (np.array(each, np.float32)[place] for each in (periods, strengths))
+    periods = (along / period, across / period, step_along / period, step_across / period)
+    luminance, mask = materials.sample(material, *periods)
+    step = np.maximum(step_along, step_across)
+    fine = materials.grain(along / _GRAIN_PERIOD, across / _GRAIN_PERIOD, step / _GRAIN_PERIOD)
     colors = np.array([world.ground[n] for n in names], np.float32)[place]
     color = _blend(luminance, mask, colors[:, 0], colors[:, 1])
-    paint = np.where(rays.identity == ROAD, markings(world, along, across, step_along, step_across), 0)
+    paint = np.where(rays.identity == ROAD, _markings(world, along, across, step_along, step_across), 0)
     worn = (0.8 + 0.12 * fine) * paint
     color += worn[:, None] * (np.float32(0.82) - color)
     level = float(_brightness(world, np.array([[0.0, -1.0, 0.0]]))[0])
     face = np.where(rays.identity == KERB_FACE, np.float32(0.7), np.float32(1))
-    lit: F32 = color * ((1 + strength * fine) * face * np.float32(level))[:, None]
-    return lit
+    return np.asarray(color * ((1 + strength * fine) * face * np.float32(level))[:, None], np.float32)
 
 
 def _polygon(scene: Scene, rays: Rays) -> F32:
@@ -187,18 +179,17 @@ def _polygon(scene: Scene, rays: Rays) -> F32:
         below = (row[first + 1] - value * row[1]) * depth / np.float32(camera.K[1, 1])
         coordinates.append(value)
         steps.append(np.hypot(right, below))
-    luminance, mask = textures.sample(row[9], coordinates[0], coordinates[1], steps[0], steps[1])
+    luminance, mask = materials.sample(row[9], coordinates[0], coordinates[1], steps[0], steps[1])
     to_grain_u, to_grain_v = row[17] / _GRAIN_PERIOD, row[18] / _GRAIN_PERIOD
     pixel = np.maximum(steps[0] * to_grain_u, steps[1] * to_grain_v)
-    fine = textures.grain(coordinates[0] * to_grain_u + row[19], coordinates[1] * to_grain_v + row[19] * 7, pixel)
+    fine = materials.grain(coordinates[0] * to_grain_u + row[19], coordinates[1] * to_grain_v + row[19] * 7, pixel)
     color = _blend(luminance, mask, row[10:13].T, row[13:16].T)
-    grained: F32 = color * (1 + row[16] * fine)[:, None]
-    return grained
+    return np.asarray(color * (1 + row[16] * fine)[:, None], np.float32)
 
 
 def _quadric(scene: Scene, rays: Rays) -> F32:
     world, camera = scene.world, scene.camera
-    quadrics: Quadrics = world.quadrics
+    quadrics = world.quadrics
     used, place = np.unique(rays.identity - scene.polygons.count, return_inverse=True)
     upright = np.where(quadrics.height[used] > 0, quadrics.height[used], np.inf)
     facts = [
@@ -210,7 +201,7 @@ def _quadric(scene: Scene, rays: Rays) -> F32:
     row = np.ascontiguousarray(np.concatenate(facts, axis=1).astype(np.float32).T)[:, place]
     turn = camera.rotation.astype(np.float32)
     depth = 1 / rays.inverse_depth
-    off_x, off_y, off_z = ((turn[i, 0] * rays.x + turn[i, 1] * rays.y + turn[i, 2]) * depth - row[i] for i in range(3))
+    off_x, off_y, off_z = (each * depth - row[i] for i, each in enumerate(_directions(turn, rays)))
     radius, tall = row[3], row[4]
     normal = np.stack([off_x / radius**2, off_y / tall**2, off_z / radius**2], axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -221,11 +212,40 @@ def _quadric(scene: Scene, rays: Rays) -> F32:
     stretched = np.asarray(pixel / np.maximum(facing, 0.25), np.float32)
     offset = row[15]
     u, v = around / period_u + offset, off_y / period_v + offset * 5
-    luminance, mask = textures.sample(row[5], u, v, stretched / period_u, stretched / period_v)
-    fine = textures.grain(
-        around / _GRAIN_PERIOD + offset, off_y / _GRAIN_PERIOD + offset * 3, stretched / _GRAIN_PERIOD
-    )
+    luminance, mask = materials.sample(row[5], u, v, stretched / period_u, stretched / period_v)
+    u, v = around / _GRAIN_PERIOD + offset, off_y / _GRAIN_PERIOD + offset * 3
+    fine = materials.grain(u, v, stretched / _GRAIN_PERIOD)
     light = _brightness(world, normal.astype(np.float64)).astype(np.float32)
     color = _blend(luminance, mask, row[6:9].T, row[9:12].T)
-    shaded: F32 = color * (light * (1 + row[12] * fine))[:, None]
-    return shaded
+    return np.asarray(color * (light * (1 + row[12] * fine))[:, None], np.float32)
+
+
+def _covered(position: F32, low: float, high: float, pixel: F32) -> F32:
+    """Fraction of a pixel that lies in an interval."""
+    start, end = np.maximum(position - pixel / 2, low), np.minimum(position + pixel / 2, high)
+    return np.asarray(np.clip((end - start) / pixel, 0, 1), np.float32)
+
+
+def _dashed(position: F32, dash: float, gap: float, pixel: F32) -> F32:
+    """Fraction of a pixel that lies on dashes which repeat for ever."""
+    period = dash + gap
+    ends = np.stack([position - pixel / 2, position + pixel / 2])
+    whole = np.floor(ends / period)
+    painted = whole * dash + np.minimum(ends - whole * period, dash)  # length of paint up to here
+    return np.asarray((painted[1] - painted[0]) / pixel, np.float32)
+
+
+def _markings(world: World, along: F32, across: F32, step_along: F32, step_across: F32) -> F32:
+    """How much of each pixel is paint: center line, edge lines and zebra crossings, exactly box-filtered."""
+    step_along, step_across = np.maximum(step_along, 1e-3), np.maximum(step_across, 1e-3)
+    section = world.section
+    dash, gap = world.dashes
+    paint = _covered(across, -0.07, 0.07, step_across) * _dashed(along, dash, gap, step_along)
+    line = section.half_width - (2.15 if section.parking else 0.3)
+    lines = _covered(np.abs(across), line - 0.06, line + 0.06, step_across)
+    paint = paint + (lines * _dashed(along, 1.0, 1.0, step_along) if section.parking else lines)
+    for start in world.crossings:
+        wide = _covered(np.abs(across), -1.0, section.half_width - 0.4, step_across)
+        stripes = wide * _dashed(across, 0.5, 0.5, step_across)
+        paint = paint + _covered(along, start, start + 3.2, step_along) * (stripes - paint)
+    return np.asarray(np.clip(paint, 0, 1), np.float32)

@@ -25,19 +25,17 @@ from saunet.io.images import read_bytes
 
 Array = NDArray[np.float64]
 
-_CAMERA_KEYS = {"R_rect_00": (3, 3)}
-_CAMERA_KEYS |= {f"{key}_rect_{n:02d}": shape for n in range(4) for key, shape in (("P", (3, 4)), ("S", (2,)))}
+_CAMERA_KEYS: dict[str, tuple[int, ...]] = {"R_rect_00": (3, 3)}
+_CAMERA_KEYS |= {f"P_rect_{camera:02d}": (3, 4) for camera in range(4)}
+_CAMERA_KEYS |= {f"S_rect_{camera:02d}": (2,) for camera in range(4)}
 _LIDAR_KEYS = {"R": (3, 3), "T": (3,)}
 
 
 def read_matrices(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
-    """Read the matrices of a file of ``key: numbers`` lines."""
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except FileNotFoundError as reason:
-        raise DataError(
-            f"no calibration at {path}; KITTI's calibration files belong into the folder of the date"
-        ) from reason
+        raise DataError(f"no calibration at {path}; KITTI's files belong into the folder of the date") from reason
     except OSError as reason:
         raise DataError(f"cannot read calibration {path}: {reason.strerror or reason}") from reason
     found: dict[str, Array] = {}
@@ -62,31 +60,30 @@ def _numbers(text: str, shape: tuple[int, ...], where: str) -> Array:
     words, count = text.split(), math.prod(shape)
     if len(words) != count:
         raise DataError(f"{where}: expected {count} numbers, got {len(words)}")
-    values = np.empty(count)
-    for place, word in enumerate(words):
-        try:
-            values[place] = float(word)
-        except ValueError:
-            raise DataError(f"{where}: expected {count} numbers, got '{word[:40]}' among them") from None
-    if not np.isfinite(values).all():
-        raise DataError(f"{where}: expected {count} finite numbers, got {text.strip()[:60]}")
-    return values.reshape(shape)
+    values = [_number(word) for word in words]
+    for word, value in zip(words, values, strict=True):
+        if not math.isfinite(value):
+            raise DataError(f"{where}: expected {count} finite numbers, got '{word[:40]}' among them")
+    return np.array(values).reshape(shape)
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class KittiCalibration:
     """Calibration of one day of KITTI raw recordings."""
 
-    path: Path
-    """The ``calib_cam_to_cam.txt`` it comes from."""
+    path: Path  # the ``calib_cam_to_cam.txt`` it comes from
     projections: Mapping[int, Array]
     """P_rect of each camera as printed, 3 x 4: rectified camera 0 to homogeneous pixels counted from one."""
-    sizes: Mapping[int, tuple[int, int]]
-    """(height, width) of the rectified images of each camera."""
-    rectification: Array
-    """R_rect_00, 3 x 3."""
-    T_cam_velo: Array | None
-    """Laser scanner to unrectified camera 0, 4 x 4; None without ``calib_velo_to_cam.txt``."""
+    sizes: Mapping[int, tuple[int, int]]  # (height, width) of the rectified images of each camera
+    rectification: Array  # R_rect_00, 3 x 3
+    T_cam_velo: Array | None  # laser scanner to unrectified camera 0, 4 x 4; None without ``calib_velo_to_cam.txt``
 
     def T_cam_cam(self, to: int, source: int) -> Array:  # noqa: N802 (frames in names)
         """Return the motion between rectified cameras, 4 x 4, meters: maps points of ``source`` to points of ``to``."""
@@ -103,7 +100,8 @@ class KittiCalibration:
             known = ", ".join(f"{each:02d}" for each in self.projections) or "none"
             raise DataError(f"{self.path} has no P_rect_{camera:02d}; cameras in it: {known}")
         K = self.projections[camera][:, :3]
-        check_intrinsics(K, *self.sizes.get(camera, (None, None)), f"{self.path}: P_rect_{camera:02d}")
+        height, width = self.sizes.get(camera, (None, None))
+        check_intrinsics(K, height, width, f"{self.path}: P_rect_{camera:02d}")
         return zero_based(K)
 
 
@@ -126,7 +124,6 @@ def scaled(K: Array, native: tuple[int, int], size: tuple[int, int], images: Pat
 
 
 def read_calibration(folder: Path) -> KittiCalibration:
-    """Read the calibration of a date."""
     path = folder / "calib_cam_to_cam.txt"
     found = read_matrices(path, _CAMERA_KEYS)
     projections = {camera: found[key] for camera in range(4) if (key := f"P_rect_{camera:02d}") in found}
@@ -204,11 +201,9 @@ def oxts_speed(path: Path) -> float:
     """Return the speed in m/s of a record of KITTI's inertial unit: the length of (vf, vl, vu)."""
     try:
         words = path.read_text(encoding="utf-8", errors="replace").split()
-        velocity = np.array([float(word) for word in words[8:11]])
     except OSError as reason:
         raise DataError(f"cannot read {path}: {reason.strerror or reason}") from reason
-    except ValueError:
-        velocity = np.empty(0)
+    velocity = np.array([_number(word) for word in words[8:11]])
     if velocity.size != 3 or not np.isfinite(velocity).all():
         raise DataError(f"{path}: expected the 30 numbers of an OXTS record; values 9 to 11 are the speeds vf, vl, vu")
     return float(np.linalg.norm(velocity))
@@ -238,14 +233,9 @@ def read_times(path: Path) -> Array:
     """Read the ``times.txt`` of a KITTI odometry sequence: seconds, one per frame; empty if there is none."""
     if not path.is_file():
         return np.empty(0)
-    times = []
-    for number, word in enumerate(path.read_text(encoding="utf-8", errors="replace").split(), 1):
-        try:
-            times.append(float(word))
-        except ValueError:
-            times.append(math.nan)
-        if not math.isfinite(times[-1]):
-            raise DataError(
-                f"{path}, line {number}: expected seconds, got the non-numeric value '{word[:40]}'; copy the file again"
-            )
-    return np.array(times)
+    words = path.read_text(encoding="utf-8", errors="replace").split()
+    times = np.array([_number(word) for word in words])
+    for line in np.flatnonzero(~np.isfinite(times)).tolist():
+        got = f"got the non-numeric value '{words[line][:40]}'"
+        raise DataError(f"{path}, line {line + 1}: expected seconds, {got}; copy the file again")
+    return times

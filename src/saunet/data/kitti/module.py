@@ -103,7 +103,6 @@ class KittiDataModule(DepthDataModule):
         self.odometer = measured_distance if with_speed else None
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return the frames of a split, grouped by drive and camera."""
         raw = self._raw = self._raw or KittiRaw(self.root)
         skip = self.on_error == "skip"
         between: Counter[tuple[str, str]] = Counter()
@@ -124,9 +123,7 @@ class KittiDataModule(DepthDataModule):
         cameras = {side: camera for camera, (_, side) in CAMERAS.items()}
         selections = [
             Selection(
-                raw.drive(drive, cameras[side], kind),
-                wanted,
-                {"between training and validation": between[drive, side]},
+                raw.drive(drive, cameras[side], kind), wanted, {"between training and validation": between[drive, side]}
             )
             for (drive, side), wanted in numbers.items()
         ]

@@ -171,7 +171,6 @@ class KittiOdometryDataModule(DepthDataModule):
         self.camera = one_of("camera", camera, CAMERAS)
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return the frames of a split, a sequence each."""
         root, training = find_root(self.root), split in ("train", "val")
         selections = []
         for name in self.train_sequences if training else self.test_sequences:

@@ -30,8 +30,7 @@ from saunet.io.images import read_depth, read_image
 
 DepthKind = Literal["camera_z", "lidar_x", "improved"]
 DEPTH_KINDS = ("camera_z", "lidar_x", "improved")
-CAMERAS = {"left": (2, "l"), "right": (3, "r")}
-"""Camera name -> its number on disk and its letter in names."""
+CAMERAS = {"left": (2, "l"), "right": (3, "r")}  # camera name -> its number on disk and its letter in names
 CAMERA_HEIGHT = 1.65  # meters from the road to the cameras
 FRAME_SECONDS = 0.1037  # mean over KITTI's drives, whose own stamps are 0.1031 to 0.1042 s apart
 PROJECTION = 1  # version of the LiDAR projection, in `KittiDrive.depth_key`; raise it when cached maps become wrong
@@ -94,7 +93,6 @@ class KittiDrive(Drive):
 
     @property
     def native_size(self) -> tuple[int, int]:
-        """(height, width) of the original images."""
         return self.calibration.sizes.get(self.number) or self.frame_size
 
     @functools.cached_property
@@ -102,9 +100,8 @@ class KittiDrive(Drive):
         return common_size([self.path(index) for index in self._indices])
 
     def has_depth(self, index: int) -> bool:
-        return self.depth_file(index).is_file() and (
-            self.depth_kind == "improved" or self.calibration.T_cam_velo is not None
-        )
+        usable = self.depth_kind == "improved" or self.calibration.T_cam_velo is not None
+        return usable and self.depth_file(index).is_file()
 
     def depth(self, index: int) -> NDArray[np.float32] | None:
         if not self.has_depth(index):
@@ -174,7 +171,6 @@ class KittiDrive(Drive):
         return self.calibration.T_cam_cam(self._stereo.number, self.number)
 
     def depth_file(self, index: int) -> Path:
-        """Return the file of a frame's ground truth, whether or not it exists."""
         if self.depth_kind == "improved":
             return self.folder / "proj_depth" / "groundtruth" / f"image_{self.number:02d}" / f"{index:010d}.png"
         return self.folder / "velodyne_points" / "data" / f"{index:010d}.bin"
@@ -186,9 +182,7 @@ class KittiRaw:
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root).expanduser()
         if not self.root.is_dir():
-            raise DataError(
-                f"no data root at {self.root.absolute()}; set data.root to the folder of the KITTI recordings"
-            )
+            raise DataError(f"no data root at {self.root.absolute()}; set data.root to the folder of KITTI recordings")
         self.drives = {f"{path.parent.name}/{path.name}": path for path in _find_drives(self.root)}
         if not self.drives:
             raise DataError(

@@ -32,10 +32,8 @@ class Row(NamedTuple):
     """One drive of the Eigen table."""
 
     drive: str
-    frames: int
-    """Number of frames in the drive."""
-    listed: list[int]
-    """Test frames of a test drive, static frames of a training drive."""
+    frames: int  # number of frames in the drive
+    listed: list[int]  # test frames of a test drive, static frames of a training drive
 
 
 @functools.cache
@@ -98,13 +96,14 @@ TEST: Mapping[str, Callable[[], list[Frame]]] = {"eigen_test": eigen_test, "eige
 
 
 def training_split(name: str, seed: int = 0) -> Parts:
-    """Return training and validation frames of a named split."""
     return TRAINING[one_of("split", name, TRAINING)](seed)
 
 
 def test_split(name: str) -> list[Frame]:
-    """Return the frames of a named test split."""
     return TEST[one_of("test_split", name, TEST)]()
+
+
+_LINE = "'<date>/<drive> <frame number> <l or r>'"
 
 
 def read_split(path: Path) -> list[Frame]:
@@ -119,10 +118,8 @@ def read_split(path: Path) -> list[Frame]:
             continue
         words = line.split()
         if len(words) != 3 or not words[1].isdecimal() or words[2] not in ("l", "r") or words[0].count("/") != 1:
-            raise DataError(
-                f"{path}, line {number}: expected '<date>/<drive> <frame number> <l or r>', got '{line.strip()[:80]}'"
-            )
+            raise DataError(f"{path}, line {number}: expected {_LINE}, got '{line.strip()[:80]}'")
         frames.append(Frame(words[0], int(words[1]), words[2]))
     if not frames:
-        raise DataError(f"{path} lists no frames; expected lines '<date>/<drive> <frame number> <l or r>'")
+        raise DataError(f"{path} lists no frames; expected lines {_LINE}")
     return frames

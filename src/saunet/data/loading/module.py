@@ -91,7 +91,8 @@ class DepthDataModule(LightningDataModule):
         self.crop_margin, self.on_error = options.crop_margin, options.on_error
         self.target_depth, self.with_pose, self.stereo = target_depth, with_pose, stereo
         self.manifest = read_manifest(options.manifest) if options.manifest else None
-        self.augment = Augment(self.height, self.width, options.flip_prob, options.color_jitter_prob)
+        self.flip_prob, self.color_jitter_prob = options.flip_prob, options.color_jitter_prob
+        self.augment = Augment(self.height, self.width, self.flip_prob, self.color_jitter_prob)
         self.prepare = Prepare(self.height, self.width)
         self.maps: dict[str, DepthMaps] = {}
         self.copies = ImageCache(cache) if cache else None

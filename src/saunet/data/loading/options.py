@@ -77,6 +77,5 @@ schema.unpacked(Loading, LoadOptions)
 
 
 def check_offsets(offsets: Sequence[int]) -> None:
-    """Check that the time offsets of the sources are distinct and none is the target itself."""
     if 0 in offsets or len(set(offsets)) != len(offsets):
         raise ConfigError(f"offsets are {list(offsets)}; they must be distinct and not 0, such as [-1, 1]")

@@ -19,8 +19,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 from saunet.data.loading.windows import Item
 from saunet.errors import ConfigError, SaunetError
 
-AHEAD = 4
-"""Batches that each loader process keeps ready: enough that one slow file, or a validation, is not felt."""
+AHEAD = 4  # batches that each loader process keeps ready: enough that one slow file, or a validation, is not felt
 
 
 class TrainBatches(DistributedSampler[Any]):
@@ -65,9 +64,8 @@ class EvalBatches(DistributedSampler[Any]):
         super().__init__(dataset, num_replicas=world_size, rank=rank, shuffle=False)
         count = len(dataset)  # type: ignore[arg-type]
         if count < world_size:
-            raise ConfigError(
-                f"{count} samples cannot be evaluated on {world_size} devices; use trainer.devices={count}"
-            )
+            fix = f"use trainer.devices={count}"
+            raise ConfigError(f"{count} samples cannot be evaluated on {world_size} devices; {fix}")
         self.indices = np.arange(rank, count, world_size)
         self.batches = min(math.ceil(math.ceil(count / world_size) / batch_size), count // world_size)
 
@@ -85,7 +83,6 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def share(batch_size: int, world_size: int) -> int:
-    """Return one device's part of the global batch."""
     if batch_size < 1 or batch_size % world_size:
         nearest = max(1, round(batch_size / world_size)) * world_size
         raise ConfigError(
@@ -114,7 +111,6 @@ def processes(wanted: int) -> dict[str, Any]:
 
 
 def _single_threaded(worker: int) -> None:
-    """Keep a loader process to one thread: the processes are the parallelism."""
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
 
@@ -157,5 +153,4 @@ class ResumableLoader(Loader):
         return {"batches": self._done % max(1, len(self))}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Start the next epoch after that many batches."""
         self.sampler.start = state["batches"]  # type: ignore[attr-defined]

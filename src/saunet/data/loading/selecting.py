@@ -22,26 +22,21 @@ from saunet.errors import ConfigError, DataError
 from saunet.io.atomic import write_json
 from saunet.io.plain import read_json
 
-FORMAT = 1
-"""Version of the layout of a manifest."""
+FORMAT = 1  # version of the layout of a manifest
 UNREADABLE = "unreadable"
 """The reason in a manifest that also forbids a frame as a neighbor; all others only forbid it as a target."""
-MIN_SPEED = 0.5
-"""Meters a second under which a car counts as standing."""
+MIN_SPEED = 0.5  # meters a second under which a car counts as standing
 FLOW_WIDTH = 320
 """Images are made this wide before flow is measured, so that thresholds mean the same for every camera."""
-MIN_FLOW = 0.5
-"""Pixels of median flow, at 320 pixels width, under which a frame counts as static."""
+MIN_FLOW = 0.5  # pixels of median flow, at 320 pixels width, under which a frame counts as static
 
 
 class Frame(NamedTuple):
     """One frame of one camera."""
 
-    drive: str
-    """``<date>/<drive>``."""
+    drive: str  # ``<date>/<drive>``
     number: int
-    side: str
-    """``l`` or ``r``."""
+    side: str  # ``l`` or ``r``
 
     def __str__(self) -> str:
         return f"{self.drive} {self.number:010d} {self.side}"
@@ -110,8 +105,7 @@ def hold_out(frames: Sequence[Frame], share: float, gap: int, seed: int) -> Part
 class Manifest:
     """Frames to leave out of training and validation: what ``saunet doctor`` writes and ``data.manifest=`` reads."""
 
-    leave_out: Mapping[str, Mapping[str, Sequence[int]]]
-    """Drive -> reason -> frame numbers."""
+    leave_out: Mapping[str, Mapping[str, Sequence[int]]]  # drive -> reason -> frame numbers
     numbering: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
     path: Path = Path("manifest.json")
@@ -155,7 +149,6 @@ class Manifest:
 
 
 def write_manifest(path: str | Path, manifest: Manifest) -> None:
-    """Write a manifest, whole or not at all."""
     leave_out = {
         drive: {reason: sorted(numbers) for reason, numbers in reasons.items()}
         for drive, reasons in manifest.leave_out.items()
@@ -165,7 +158,6 @@ def write_manifest(path: str | Path, manifest: Manifest) -> None:
 
 
 def read_manifest(path: str | Path) -> Manifest:
-    """Read a manifest."""
     path = Path(path).expanduser()
     try:
         plain = read_json(path)

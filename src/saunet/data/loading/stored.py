@@ -31,8 +31,7 @@ from saunet.io.plain import read_arrays, read_json
 
 MapKind = Literal["linear", "colorization", "teacher"]
 DENSE_KINDS = ("linear", "colorization")
-VERSION = 1
-"""Of the layout of depth maps and of copies; others are refused."""
+VERSION = 1  # of the layout of depth maps and of copies; others are refused
 MAPS, SETTINGS, FRAMES = "maps.json", "cache.json", "frames.json"
 
 
@@ -52,7 +51,6 @@ class DepthMaps:
         self._factors: dict[str, float] = {}
 
     def home(self, drive: Drive) -> Path:
-        """Return the folder of a recording's maps."""
         below, side = _place(drive.name)
         base = drive.folder if self.folder is None else self.folder / below
         if base is None:
@@ -60,11 +58,9 @@ class DepthMaps:
         return base / f"depth_{self.kind}" / side
 
     def path(self, drive: Drive, frame: int) -> Path:
-        """Return the file of a frame's map, whether or not it exists."""
         return self.home(drive) / f"{frame:010d}.png"
 
     def frames(self, drive: Drive) -> set[int]:
-        """Return the numbers of the frames that have a map."""
         return {int(path.stem) for path in self.home(drive).glob("*.png") if path.stem.isdecimal()}
 
     def read(self, drive: Drive, frame: int) -> NDArray[np.float32] | None:
@@ -113,7 +109,6 @@ class DepthMaps:
         return factor
 
     def check(self, wanted: Sequence[tuple[Drive, Sequence[int]]], command: str) -> None:
-        """Check that frames have maps."""
         lacking: list[Path] = []
         for drive, frames in wanted:
             there = self.frames(drive)
@@ -143,7 +138,6 @@ class CacheSettings:
         in_range("quality", self.quality, 1, 100)
 
     def plain(self) -> dict[str, Any]:
-        """Return them as they are written into ``cache.json``."""
         return {"version": VERSION, **asdict(self)}
 
 
@@ -167,15 +161,12 @@ class ImageCache:
             raise DataError(f"{path} is damaged; delete the cache and make it again") from reason
 
     def home(self, drive: Drive) -> Path:
-        """Return the folder of a recording's copies."""
         return self.folder.joinpath(*_place(drive.name))
 
     def path(self, drive: Drive, frame: int) -> Path:
-        """Return the file of a frame's copy, whether or not it exists."""
         return self.home(drive) / f"{frame:010d}.{self.settings.format}"
 
     def frames(self, drive: Drive) -> dict[str, Any]:
-        """Return what ``frames.json`` of a recording says; empty where it is not finished."""
         path = self.home(drive) / FRAMES
         if not path.is_file():
             return {}
@@ -203,7 +194,6 @@ class ImageCache:
             )
 
     def drive(self, drive: Drive, needed: Iterable[int] = ()) -> CachedDrive:
-        """Return a recording that reads the copies."""
         frames = self.frames(drive)
         if not frames:
             raise DataError(f"the cache at {self.folder} does not hold '{drive.name}'; complete it: {self._command()}")

@@ -24,10 +24,8 @@ from saunet.types import EvalBatch, FrameBatch, TrainBatch
 
 TARGETS: tuple[Literal["target_depth", "target_teacher"], ...] = ("target_depth", "target_teacher")
 """Depth maps at the size of the frames, which follow crops and flips."""
-JITTER = 0.2
-"""Factors of brightness, contrast and saturation are drawn from 1 ± this."""
-HUE = 0.1
-"""Part of the color circle by which hue turns at most."""
+JITTER = 0.2  # factors of brightness, contrast and saturation are drawn from 1 ± this
+HUE = 0.1  # part of the color circle by which hue turns at most
 
 
 def crop(
@@ -98,12 +96,9 @@ class Augment(nn.Module):
         K = crop_intrinsics(batch["K"], left.float(), top.float())
         K = torch.where(mirrored[:, None, None], flip_intrinsics(K, self.width), K)
         signed = 2 * draws[:, 4:8] - 1
-        seen = jitter_color(
-            frames,
-            draws[:, 3] < self.color_jitter_prob,
-            *(1 + JITTER * signed[:, :3]).unbind(1),
-            2 * torch.pi * HUE * signed[:, 3],
-        )
+        brightness, contrast, saturation = (1 + JITTER * signed[:, :3]).unbind(1)
+        jittered = draws[:, 3] < self.color_jitter_prob
+        seen = jitter_color(frames, jittered, brightness, contrast, saturation, 2 * torch.pi * HUE * signed[:, 3])
         out = _split(seen, frames, K, batch["name"])
         for key in TARGETS:
             if key in batch:

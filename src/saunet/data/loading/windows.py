@@ -30,22 +30,18 @@ from saunet.geometry.camera import scale_intrinsics
 from saunet.io.images import resize
 from saunet.types import FrameBatch
 
-DRAWS = 8
-"""Random numbers that come with each training sample; see `saunet.data.loading.transforms.Augment`."""
+DRAWS = 8  # random numbers that come with each training sample; see `saunet.data.loading.transforms.Augment`
 Odometer = Callable[[Drive, int, int], float]
 """Gives the meters traveled between two frames of a drive, NaN where unknown."""
-_SAME_K = 0.5
-"""Pixels by which the intrinsics of two cameras may differ and still be taken for one."""
-_PATIENCE = 100
-"""Samples in a row that may be broken before it is the data set that is, not a file."""
+_SAME_K = 0.5  # pixels by which the intrinsics of two cameras may differ and still be taken for one
+_PATIENCE = 100  # samples in a row that may be broken before it is the data set that is, not a file
 
 
 class Selection(NamedTuple):
     """The frames of one drive that a split asks for."""
 
     drive: Drive
-    frames: Sequence[int]
-    """Numbers of the target frames wanted."""
+    frames: Sequence[int]  # numbers of the target frames wanted
     left_out: Mapping[str, int] = {}
     """Frames already left out and why: ``{"static": 12}``."""
 
@@ -110,19 +106,9 @@ class WindowDataset(Dataset[dict[str, Any]]):
     the seed alone, so that they do not depend on workers or devices; a list of either is a list of samples, ready for
     `collate`.
 
-    Args:
-        drives: The recordings.
-        windows: (position in ``drives``, target frame number); see `find_windows`.
-        offsets: Time offsets of the source frames.
-        height: Height of the frames yielded, before any margin.
-        width: Width of the frames yielded, before any margin.
-        margin: Rows and columns that the frames are larger than that, room for a random crop.
-        with_depth: Yield ground truth at its native size where the drive has it.
-        with_target_depth: Yield depth at the size of the frames (zeros where the drive has none).
-        with_pose: Yield true motion; every drive must know it.
-        stereo: Yield the stereo view as the last source, and where it is.
-        odometer: Gives the distance traveled; None yields none.
-        maps: Depth maps made beforehand, by the key under which they are yielded at the size of the frames.
+    ``windows`` are those of `find_windows`. Frames have the size asked for and ``margin`` (rows, columns) more, room
+    for a random crop. Ground truth (``with_depth``) comes at its native size; target depth and ``maps``, by key, at the
+    size of the frames, 0 where unknown. The stereo view is the last source.
     """
 
     def __init__(
@@ -230,7 +216,6 @@ class SkippingWindows(WindowDataset):
         self._broken = torch.zeros(len(self.windows), dtype=torch.uint8).share_memory_()  # type: ignore[no-untyped-call]
 
     def skipped(self) -> list[str]:
-        """Return the names of the samples that could not be read so far."""
         return [self.name(int(index)) for index in self._broken.nonzero()[:, 0]]
 
     def _sample(self, index: int) -> dict[str, Any]:
@@ -246,9 +231,8 @@ class SkippingWindows(WindowDataset):
                 self._broken[place] = 1
                 warnings.warn(f"sample skipped: {error}", stacklevel=2)
         reason = f"; the last: {problem}" if problem else ""
-        raise DataError(
-            f"{min(_PATIENCE, len(self))} samples in a row cannot be read, so on_error=skip gives up{reason}"
-        )
+        most = min(_PATIENCE, len(self))
+        raise DataError(f"{most} samples in a row cannot be read, so on_error=skip gives up{reason}")
 
 
 def collate(samples: Sequence[Mapping[str, Any]] | Mapping[str, Any]) -> FrameBatch:

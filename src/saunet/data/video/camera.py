@@ -44,8 +44,7 @@ FIX = "is K in pixels of images of this size, or normalized (then set normalized
 _SAME_SHAPE = 0.02
 """Relative difference of the two aspect ratios up to which a frame is the calibrated image at another size."""
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
-_LARGEST = 1e300
-"""Beyond it a whole number is no float; NaN and infinity are not within it either."""
+_LARGEST = 1e300  # beyond it a whole number is no float; NaN and infinity are not within it either
 
 
 @dataclass(frozen=True)
@@ -55,20 +54,16 @@ class CameraFile:
     path: Path
     K: NDArray[np.float64]
     """3 x 3; in pixels of `image_size` (integer coordinates are pixel centers), or normalized where that is None."""
-    image_size: tuple[int, int] | None
-    """(height, width); None where K is normalized."""
+    image_size: tuple[int, int] | None  # (height, width); None where K is normalized
     distortion: tuple[float, ...] = ()
     model: str = "pinhole"
     fps: float | None = None
-    camera_height: float | None = None
-    """Meters above the road."""
+    camera_height: float | None = None  # meters above the road
     condition: str | None = None
     crop: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Shares of the image to cut off at the top, bottom, left and right."""
-    reprojection_error: float | None = None
-    """Root mean square in pixels, where the file comes from a calibration."""
-    fov: float | None = None
-    """Horizontal degrees of the straight picture; None for as many as it can have."""
+    reprojection_error: float | None = None  # root mean square in pixels, where the file comes from a calibration
+    fov: float | None = None  # horizontal degrees of the straight picture; None for as many as it can have
 
     @property
     def is_straight(self) -> bool:
@@ -99,9 +94,8 @@ def read_camera(path: str | Path) -> CameraFile:
     try:
         plain = find_camera(path, name)
     except FileNotFoundError as reason:
-        raise DataError(
-            f"no camera file at {path}; make one with saunet calibrate, or write one (see docs/your_camera.md)"
-        ) from reason
+        fix = "make one with saunet calibrate, or write one (see docs/your_camera.md)"
+        raise DataError(f"no camera file at {path}; {fix}") from reason
     except OSError as reason:
         raise DataError(f"cannot read {path}: {reason.strerror or reason}; check its rights") from reason
     if not isinstance(plain, dict):
@@ -135,9 +129,7 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
     size = None
     if not normalized:
         if "image_size" not in plain:
-            raise DataError(
-                f"{path} lacks image_size; expected 'image_size: [width, height]' of the images that K belongs to"
-            )
+            raise DataError(f"{path} lacks image_size; expected 'image_size: [width, height]' of the images of K")
         width, height = _numbers(path, "image_size", plain["image_size"], (2,))
         if min(width, height) < 2 or width % 1 or height % 1:
             raise DataError(f"{path}: image_size is {plain['image_size']}; expected whole numbers [width, height]")
@@ -175,7 +167,6 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
 
 
 def check_crop(crop: Sequence[float | int], what: str, error: type[SaunetError] = DataError) -> None:
-    """Check the shares to cut off at the top, bottom, left and right."""
     fits = len(crop) == 4 and all(0 <= share < 1 for share in crop)
     if not fits or crop[0] + crop[1] > 0.9 or crop[2] + crop[3] > 0.9:
         raise error(
@@ -212,7 +203,6 @@ def _numbers(path: Path, key: str, value: Any, counts: Sequence[int]) -> list[fl
 
 
 def write_camera(path: str | Path, camera: CameraFile, note: str = "") -> None:
-    """Write a ``camera.yaml`` that `read_camera` reads, whole or not at all."""
     K, size = camera.K, camera.image_size
     plain: dict[str, Any] = {"image_size": [size[1], size[0]]} if size else {"normalized": True}
     plain["K"] = [float(f"{number:.8g}") for number in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])]

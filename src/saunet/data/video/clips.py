@@ -1,7 +1,7 @@
-"""Clips of any camera on disk: which there are, and their frames in order; a video is decoded once into a cache.
+"""Clips of any camera on disk: which there are, their frames in order, and how much the picture moves between them.
 
 Reading a video out of order is slow (every frame needs those before it), so its frames are kept as JPEGs in a cache
-folder. The originals are only ever read.
+folder, as are measurements. The originals are only ever read.
 """
 
 from __future__ import annotations
@@ -12,23 +12,26 @@ import itertools
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from saunet.data.loading.selecting import FLOW_WIDTH, MIN_FLOW, median_flow
 from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera
 from saunet.errors import DataError
 from saunet.io.atomic import write_json
-from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order, resize
+from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order, read_image, resize
 from saunet.io.plain import read_json
 from saunet.io.video import VIDEO_SUFFIXES, VideoReader, nearest_steps
 
 _NO_CLIPS = frozenset({"@eaDir", "__MACOSX"})
 """Folders in which other systems keep thumbnails and attributes; names with a dot in front are skipped as well."""
-QUALITY = 95
-"""JPEG quality of cached frames."""
+QUALITY = 95  # JPEG quality of cached frames
+SAME_PICTURE = 0.01
+"""Mean difference over the picture's standard deviation under which two frames are the same picture twice."""
 
 
 class FramesCacheError(DataError):
@@ -39,10 +42,8 @@ class FramesCacheError(DataError):
 class Clip:
     """One recording on disk, before it was read."""
 
-    name: str
-    """Path below the root, unique."""
-    path: Path
-    """A folder of images, or a video file."""
+    name: str  # path below the root, unique
+    path: Path  # a folder of images, or a video file
     camera: CameraFile
 
 
@@ -51,14 +52,10 @@ class Recording:
     """The frames of a clip that are taken in the first place, in order of time."""
 
     paths: tuple[Path, ...]
-    numbers: tuple[int, ...]
-    """Number of each in the clip as recorded, from 0."""
-    fps: float | None
-    """Frames a second as recorded; None where nobody says."""
-    missing: int = 0
-    """Frames at the end that a video claims to hold and that cannot be decoded."""
-    passed_over: int = 0
-    """Frames between those taken, which the frame rate asked for does not need."""
+    numbers: tuple[int, ...]  # number of each in the clip as recorded, from 0
+    fps: float | None  # frames a second as recorded; None where nobody says
+    missing: int = 0  # frames at the end that a video claims to hold and that cannot be decoded
+    passed_over: int = 0  # frames between those taken, which the frame rate asked for does not need
     times: tuple[float, ...] | None = None
     """Seconds of each from any fixed origin, by the video or by stamps in the names; None if unknown."""
 
@@ -199,7 +196,10 @@ def _decode(
 
 def _key(path: Path, fps: float | None, max_width: int) -> str:
     state = path.stat()
-    text = f"{path.resolve()}|{state.st_size}|{state.st_mtime_ns}|{fps}|{max_width}|{QUALITY}|times"
+    return short_hash(f"{path.resolve()}|{state.st_size}|{state.st_mtime_ns}|{fps}|{max_width}|{QUALITY}|times")
+
+
+def short_hash(text: str) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
 
 
@@ -246,3 +246,107 @@ def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraF
         f"no {FILE_NAME} for {path}: put one beside it or at {base / FILE_NAME}, or set data.camera; "
         "saunet calibrate makes one (see docs/your_camera.md)"
     )
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What was measured of a sequence of frames; entry i compares frame i with the readable one before it."""
+
+    flow: NDArray[np.float64]
+    """Median optical flow in pixels of an image 320 pixels wide; NaN for the first frame and for unreadable ones."""
+    change: NDArray[np.float64]  # mean difference over the standard deviation of the picture; NaN likewise
+    unreadable: tuple[int, ...] = ()  # frames that cannot be decoded
+
+    def doubled(self) -> NDArray[np.bool_]:
+        """Say which frames are the same picture as the one before, one value a frame: the frame rate was raised."""
+        return np.nan_to_num(self.change, nan=1.0) < SAME_PICTURE
+
+    def static(self, min_flow: float = MIN_FLOW) -> NDArray[np.bool_]:
+        """Say which frames show no motion against the one before, one value a frame; the second judges the first."""
+        flow = self.flow.copy()
+        known = np.flatnonzero(np.isfinite(flow))
+        if known.size and known[0] > 0:
+            flow[: known[0]] = flow[known[0]]
+        return np.nan_to_num(flow, nan=np.inf) < min_flow
+
+
+def relative_change(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
+    """Return the mean difference of two images, h x w x 3, over the second's standard deviation."""
+    return float(np.abs(before.astype(np.float32) - after).mean() / max(1.0, float(after.std())))
+
+
+def shrink(image: NDArray[np.uint8], crop: Sequence[float | int] = (0, 0, 0, 0)) -> NDArray[np.uint8]:
+    """Return an image, h x w x 3, cut by shares of its top, bottom, left and right, and made 320 pixels wide."""
+    height, width = image.shape[:2]
+    top, bottom, left, right = crop
+    rows = slice(round(top * height), height - round(bottom * height))
+    cut = image[rows, round(left * width) : width - round(right * width)]
+    return np.asarray(resize(cut, max(32, round(cut.shape[0] * FLOW_WIDTH / cut.shape[1])), FLOW_WIDTH))
+
+
+def measure(
+    paths: Sequence[Path],
+    crop: Sequence[float | int],
+    *,
+    skip_unreadable: bool = False,
+    cache: Path | None = None,
+    advance: Callable[[], None] = lambda: None,
+) -> Motion:
+    """Measure the motion between consecutive images, each decoded once."""
+    file = cache / f"motion-{_motion_key(paths, crop)}.json" if cache else None
+    known = _read_motion(file, len(paths)) if file else None
+    if known is not None and (skip_unreadable or not known.unreadable):
+        return known
+    flow, change = np.full(len(paths), np.nan), np.full(len(paths), np.nan)
+    unreadable, before = [], None
+    for place, path in enumerate(paths):
+        try:
+            after = shrink(read_image(path), crop)
+        except DataError:
+            if not skip_unreadable:
+                raise
+            unreadable.append(place)
+        else:
+            if before is not None and before.shape == after.shape:
+                flow[place], change[place] = median_flow(before, after), relative_change(before, after)
+            before = after
+        advance()
+    if file:
+        rounded = {
+            key: [None if np.isnan(value) else round(value, 4) for value in values.tolist()]
+            for key, values in (("flow", flow), ("change", change))
+        }
+        write_json(file, {**rounded, "unreadable": unreadable}, FramesCacheError, indent=None)
+    return Motion(flow, change, tuple(unreadable))
+
+
+def even_steps(flow: NDArray[np.float64], parallax: float) -> NDArray[np.bool_]:
+    """Choose frames so that the picture moves by about ``parallax`` from each to the next; the first is one."""
+    chosen, gathered = np.zeros(len(flow), dtype=bool), 0.0
+    for place, step in enumerate(np.nan_to_num(flow)):
+        gathered += step
+        if place == 0 or gathered >= parallax:
+            chosen[place], gathered = True, 0.0
+    return chosen
+
+
+def _motion_key(paths: Sequence[Path], crop: Sequence[float | int]) -> str:
+    text = [str([round(float(share), 6) for share in crop])]
+    for path in paths:
+        try:
+            state = path.stat()
+            text.append(f"{path.absolute()}|{state.st_size}|{state.st_mtime_ns}")
+        except OSError:
+            text.append(f"{path.absolute()}|gone")
+    return short_hash("\n".join(text))
+
+
+def _read_motion(file: Path, count: int) -> Motion | None:
+    """Return a kept measurement; None where there is none that fits, and then it is made anew."""
+    try:
+        plain = read_json(file)
+        flow, change = (np.array(plain[key], dtype=np.float64) for key in ("flow", "change"))
+        unreadable = tuple(int(place) for place in plain["unreadable"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return Motion(flow, change, unreadable) if len(flow) == len(change) == count else None

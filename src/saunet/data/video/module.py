@@ -1,26 +1,173 @@
-"""Clips of any camera as a data module: frames or videos and one ``camera.yaml``."""
+"""Clips of any camera as recordings and as a data module: frames or videos and one ``camera.yaml``."""
 
 from __future__ import annotations
 
+import functools
+import itertools
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.progress import Progress
 from typing_extensions import Unpack
 
+from saunet.data.checks import common_size
+from saunet.data.drive import GAP, Drive
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
 from saunet.data.loading.selecting import Frame, hold_out
 from saunet.data.loading.windows import Selection, reach
-from saunet.data.video.camera import check_crop
-from saunet.data.video.clips import Clip, FramesCacheError, default_cache, find_clips, read_clip
-from saunet.data.video.drive import ClipDrive, measure
+from saunet.data.video.camera import Lens, check_crop
+from saunet.data.video.clips import (
+    Clip,
+    FramesCacheError,
+    Motion,
+    Recording,
+    default_cache,
+    even_steps,
+    find_clips,
+    measure,
+    read_clip,
+    short_hash,
+)
 from saunet.errors import ConfigError, DataError, in_range, one_of, positive
+from saunet.io.images import read_image
 from saunet.io.progress import bar
 from saunet.registry import datamodules
+
+LONGEST_STEP = 5.0
+"""Seconds between two frames beyond which they are no neighbors: too much has moved meanwhile."""
+
+
+class ClipDrive(Drive):
+    """A clip of any camera.
+
+    Frames are numbered anew from 0 in the order of time, without those that are `left_out`; a number is skipped where
+    frames on both sides are no neighbors (a broken image or a long stop between them).
+    """
+
+    def __init__(
+        self,
+        clip: Clip,
+        recording: Recording,
+        crop: Sequence[float | int] | None = None,
+        motion: Motion | None = None,
+        parallax: float = 0.0,
+        settings: str = "",
+        camera_height: float | None = None,
+    ) -> None:
+        self.clip, self.recording, self._crop = clip, recording, crop
+        self._settings, self._camera_height = settings, camera_height
+        self._places, self.left_out = _choose(recording, motion, parallax)
+        self._indices = sorted(self._places)
+        self._still = frozenset(np.flatnonzero(motion.static()).tolist()) if motion else frozenset()
+
+    @property
+    def name(self) -> str:
+        return self.clip.name
+
+    @property
+    def numbering(self) -> str:
+        return self._settings
+
+    @property
+    def indices(self) -> Sequence[int]:
+        return self._indices
+
+    @property
+    def camera_height(self) -> float | None:
+        known = self.clip.camera.camera_height
+        return self._camera_height if known is None else known
+
+    @property
+    def condition(self) -> str | None:
+        return self.clip.camera.condition
+
+    @property
+    def fps(self) -> float | None:
+        return self.recording.fps
+
+    def time(self, index: int) -> float | None:
+        if self.recording.times is not None:
+            return self.recording.times[self._places[index]]
+        return None if self.fps is None else self.recorded(index) / self.fps
+
+    @functools.cached_property
+    def gaps(self) -> frozenset[int]:
+        """Indices of frames after which the recording lacks frames; the steps between chosen frames are no measure."""
+        times, numbers = self.recording.times, self.recording.numbers
+        if times is None or len(times) < 3:
+            return frozenset()
+        steps = np.diff(times) / np.diff(numbers)
+        lost = np.concatenate([[0], np.cumsum(steps > GAP * np.median(steps))])
+        return frozenset(
+            before
+            for before, after in itertools.pairwise(self._indices)
+            if lost[self._places[before]] != lost[self._places[after]]
+        )
+
+    def static(self) -> frozenset[int]:
+        """Return the numbers of the frames in which the picture does not move."""
+        return frozenset(index for index, place in self._places.items() if place in self._still)
+
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        return self._lens.height, self._lens.width
+
+    @functools.cached_property
+    def origin(self) -> str:
+        camera, lens = self.clip.camera, self._lens
+        files = [(index, self.recorded(index), self.path(index).name) for index in self._indices]
+        text = repr((lens.K.tolist(), lens.recorded, self.frame_size, camera.model, camera.distortion, files))
+        return short_hash(text)
+
+    def path(self, index: int) -> Path:
+        return self.recording.paths[self._places[index]]
+
+    def recorded(self, index: int) -> int:
+        return self.recording.numbers[self._places[index]]
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        path = self.path(index)
+        return self._lens(read_image(path), str(path))
+
+    def intrinsics(self, index: int) -> NDArray[np.float64]:
+        return self._lens.K.copy()
+
+    @functools.cached_property
+    def _lens(self) -> Lens:
+        example, size = common_size([self.path(index) for index in self._indices])
+        return Lens(self.clip.camera, *size, self._crop, f"the frames of '{self.name}' ({example.name})")
+
+
+def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tuple[dict[int, int], dict[str, int]]:
+    """Return frame number -> place in the recording, and how many places got none, by reason."""
+    count = len(recording.paths)
+    left_out = {"not decodable": recording.missing, "passed over by fps": recording.passed_over}
+    if motion is None:
+        return {place: place for place in range(count)}, left_out
+    broken = np.isin(np.arange(count), motion.unreadable)
+    doubled = motion.doubled() & ~broken
+    usable = np.flatnonzero(~broken & ~doubled)
+    left_out |= {"unreadable": int(broken.sum()), "doubled": int(doubled.sum())}
+    if parallax > 0:
+        chosen = usable[even_steps(motion.flow[usable], parallax)]
+        left_out["closer than the parallax"] = len(usable) - len(chosen)
+        usable = chosen
+    places: dict[int, int] = {}
+    number, before = 0, None
+    for place in usable.tolist():
+        if before is not None:
+            seconds = (recording.numbers[place] - recording.numbers[before]) / (recording.fps or math.inf)
+            apart = broken[before:place].any() or (place - before > 1 and seconds > LONGEST_STEP)
+            number += 2 if apart else 1
+        places[number] = before = place
+    return places, left_out
 
 
 @datamodules.register("video")
@@ -102,7 +249,6 @@ class VideoDataModule(DepthDataModule):
         self.drives()
 
     def drives(self) -> list[ClipDrive]:
-        """Return all clips below the root, in order of their names."""
         if self._drives is None:
             clips = find_clips(self.root, self.camera)
             if self.conditions:
@@ -121,7 +267,6 @@ class VideoDataModule(DepthDataModule):
         return heights.pop() if len(heights) == 1 else None
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return the frames of a split, a clip each."""
         drives = {drive.name: drive for drive in self.drives()}
         if not any(drive.indices for drive in drives.values()):
             example = next(iter(drives), None) or self._broken[0]
