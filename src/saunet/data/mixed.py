@@ -34,7 +34,6 @@ class MixedDataModule(DepthDataModule):
         sources: Name -> data module; names start the names of samples.
         train: Names of the sources to train and validate on; all if empty.
         test: Names of the sources to test and predict; all if empty.
-        target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:

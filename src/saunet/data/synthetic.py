@@ -35,8 +35,6 @@ class SyntheticDataModule(DepthDataModule):
     """Procedurally generated streets with exact ground truth; train, val and test drives are different streets.
 
     Args:
-        target_depth: Training batches carry the depth of the target, for losses that use it.
-        with_pose: Batches carry the true motion.
         train_drives: Number of drives to train on.
         val_drives: Number of drives to validate on.
         test_drives: Number of drives to test on.

@@ -42,14 +42,10 @@ class KittiDataModule(DepthDataModule):
             under 0.5 m/s (without OXTS, by flow); or drop those whose median optical ``flow`` to the frame before is
             under half a pixel at 320 pixels width. Flow reads every frame once at set-up.
         depth: Ground truth: LiDAR depth as ``camera_z`` or ``lidar_x`` (evaluation only), or ``improved``.
-        target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
         dense: Dense depth maps as that target in place of the sparse scan: ``linear`` or ``colorization``, made
             beforehand by ``saunet prepare densify``; ``none`` uses the scan.
         teacher: Batches carry another model's depth, made beforehand by ``saunet prepare teacher``.
         maps: Folder of these maps; None: beside the recordings.
-        cache: Folder of smaller copies made by ``saunet prepare cache``; training and validation read images from it.
-        stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
-            ``offsets: []`` it is the only one.
         with_speed: Batches carry the way traveled, from OXTS, for the velocity term; unknown where a record lacks.
         **loading: Loader settings, as in `LoadOptions`.
 

@@ -136,10 +136,6 @@ class KittiOdometryDataModule(DepthDataModule):
         test_sequences: Sequences to test and predict.
         val_share: Share of each training sequence, its end, that validates.
         camera: ``color_left``, ``color_right``, ``gray_left`` or ``gray_right``.
-        with_pose: Batches carry the true motion.
-        stereo: Batches carry the other camera of the pair as one more source, placed by the calibration; with
-            ``offsets: []`` it is the only one.
-        cache: Folder of smaller copies made by ``saunet prepare cache``; training and validation read images from it.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:

@@ -42,9 +42,10 @@ class DepthDataModule(LightningDataModule):
     """Loaders of frame windows, and the transforms that run on the device.
 
     Args:
-        target_depth: Training batches carry the depth of the target, for losses that use it.
+        target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
         with_pose: Batches carry the true motion.
-        stereo: Training and validation batches carry the stereo view as one more source, which makes depth metric.
+        stereo: Training and validation batches carry the other camera of the pair as one more source, placed by the
+            calibration, which makes depth metric; with ``offsets: []`` it is the only one.
         cache: Folder of smaller copies made by ``saunet prepare cache``; training and validation read images from it.
         **loading: Fields of `LoadOptions`.
 

@@ -195,7 +195,6 @@ class VideoDataModule(DepthDataModule):
         camera_height: Meters from the road to the camera, for clips whose camera file does not say.
         frames_cache: Folder for decoded videos and measurements; by default in the user's cache folder.
         max_width: Frames of videos are kept at most this wide.
-        cache: Folder of smaller copies made by ``saunet prepare cache``; training and validation read images from it.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
