@@ -52,7 +52,7 @@ def project(model: str, coefficients: Sequence[float], rays: Float[np.ndarray, "
                 scale = 1 + q * (k[0] + q * (k[1] + q * (k[2] + q * k[3])))
                 return np.stack([u * scale, v * scale], -1)
             scale = 1 + q * (k[0] + q * (k[1] + q * (k[4] + q * k[5])))
-            return _tangential(u, v, scale, k[2], k[3]) + np.stack([k[6] * q, k[7] * q], -1)
+            return np.asarray(_tangential(u, v, scale, k[2], k[3]) + np.stack([k[6] * q, k[7] * q], -1))
         if model == "omni":
             depth = Z + k[0] * length
             # with xi > 1 rays behind the mirror's horizon come back over the picture
