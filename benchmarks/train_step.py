@@ -22,9 +22,8 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from saunet.cli import config
-from saunet.cli.app import table
-from saunet.cli.compose import Composed, options
+from saunet.cli.compose import Composed, options, register_configs
+from saunet.cli.table import config_dir, read
 from saunet.data.loading.windows import DRAWS
 from saunet.registry import instantiate
 from saunet.training.speed import Speed
@@ -35,15 +34,15 @@ SIZE = (192, 640)
 
 def build(overrides: list[str], batch: int) -> tuple[Any, Any]:
     """Return the training module and the data module of a composed config."""
-    config.register_configs()
-    with initialize_config_dir(str(config.config_dir()), version_base="1.3"):
+    register_configs()
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
         chosen = ["model=mono_r18", "objective=monodepth2", "data=synthetic", f"data.height={SIZE[0]}"]
         chosen += [f"data.width={SIZE[1]}", f"data.batch_size={batch}", "output_dir=unused", *overrides]
         cfg = compose("train", chosen)
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     data = instantiate(plain["data"])
     torch.manual_seed(0)
-    return assemble(options(TrainOptions, Composed(plain, {}, (), ""), table()), data), data
+    return assemble(options(TrainOptions, Composed(plain, {}, (), ""), read()), data), data
 
 
 def random_frames(batch: int, offsets: int, device: str) -> dict[str, Any]:

@@ -88,7 +88,8 @@ def hydra() -> Iterator[None]:
     """Let a test compose configurations, as the tools do."""
     from hydra import initialize_config_dir
 
-    from saunet.cli.config import config_dir, register_configs
+    from saunet.cli.compose import register_configs
+    from saunet.cli.table import config_dir
 
     register_configs()
     with initialize_config_dir(str(config_dir()), version_base="1.3"):

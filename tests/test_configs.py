@@ -9,14 +9,15 @@ from hydra import compose
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from plain import plain
 
-from saunet.cli.config import config_dir, plain
-from saunet.registry import REGISTRIES
+from saunet.cli.table import config_dir
+from saunet.registry import REGISTRIES, models
 
 pytestmark = pytest.mark.usefixtures("hydra")
 
 ROOTS = {"train", "evaluate", "odometry", "predict", "benchmark", "report", "calibrate", "doctor", "prepare"}
-GROUPS = ("model", "trainer", "callbacks", "logger")
+GROUPS = ("trainer", "callbacks", "logger")
 REGISTERED = [
     (registry.group, name)
     for registry in REGISTRIES.values()
@@ -50,6 +51,15 @@ def test_every_root_composes(root: str) -> None:
 @pytest.mark.parametrize(("group", "name"), [(group, name) for group in GROUPS for name in _yaml(group)])
 def test_every_yaml_composes(group: str, name: str) -> None:
     assert _compose(f"{group}={name}")
+
+
+@pytest.mark.parametrize("name", models.names())
+def test_every_registered_model_chooses_its_parts(name: str) -> None:
+    model = _compose(f"model={name}").model  # type: ignore[attr-defined]
+    built = models.build(name)
+    parts = {"encoder": built.depth.encoder, "decoder": built.depth.decoder, "pose": built.pose}
+    made = {kind: f"{type(part).__module__}.{type(part).__qualname__}" for kind, part in parts.items()}
+    assert made == {kind: model[kind]._target_ for kind in parts}
 
 
 @pytest.mark.parametrize("name", _yaml("experiment"))

@@ -9,9 +9,11 @@ from __future__ import annotations
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from plain import plain
 from training_options import train_options
 
-from saunet.cli import config
+from saunet.cli.compose import register_configs
+from saunet.cli.table import config_dir
 from saunet.registry import instantiate
 from saunet.training.tool import assemble
 
@@ -23,14 +25,14 @@ GOLDEN: dict[str, list[float]] = {
 
 @pytest.mark.parametrize("objective", sorted(GOLDEN))
 def test_the_first_losses_of_a_seeded_training(objective: str) -> None:
-    config.register_configs()
-    with initialize_config_dir(str(config.config_dir()), version_base="1.3"):
+    register_configs()
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
         cfg = compose(
             "train", ["experiment=smoke", f"objective={objective}", "output_dir=unused", "data.color_jitter_prob=0"]
         )
     torch.manual_seed(cfg.seed)
-    data = instantiate(config.plain(cfg.data))
-    model = assemble(train_options({key: config.plain(cfg[key]) for key in cfg if key != "plugins"}), data)
+    data = instantiate(plain(cfg.data))
+    model = assemble(train_options({key: plain(cfg[key]) for key in cfg if key != "plugins"}), data)
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
     data.setup("fit")
     losses = []

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 import saunet
@@ -45,7 +46,7 @@ def test_partial_waits_for_the_rest(widgets: Registry) -> None:
 
 def test_names_and_summary(widgets: Registry) -> None:
     assert widgets.names() == ["plain", "wide"]
-    assert widgets.entry("wide").summary == "A thing with sizes."
+    assert widgets.node("wide").summary == "A thing with sizes."
 
 
 def test_registering_twice_is_an_error(widgets: Registry) -> None:
@@ -110,8 +111,24 @@ def test_every_component_has_a_summary_and_a_pickling_class(kind: str) -> None:
     entries = list(REGISTRIES[kind])
     assert entries, f"no {kind} is registered"
     for entry in entries:
-        assert entry.summary.endswith("."), f"{kind} {entry.name}: first docstring line must be a sentence"
+        assert REGISTRIES[kind].node(entry.name).summary.endswith("."), (
+            f"{kind} {entry.name}: first docstring line must be a sentence"
+        )
         assert pickle.loads(pickle.dumps(entry.target)) is entry.target
+
+
+def test_a_whole_model_is_built_by_name() -> None:
+    model = saunet.build("model", "sau_net_tiny").eval()
+    assert "sau_net_tiny" in saunet.available("model")
+    with torch.no_grad():
+        depth = model(torch.rand(1, 3, 32, 64)).depth
+    assert [tuple(each.shape[-2:]) for each in depth] == [(32, 64), (16, 32), (8, 16), (4, 8)]
+    assert type(model.depth.encoder) is encoders.entry("stratified_tiny").target
+    light = saunet.build("model", "sau_net_nano", encoder=Spec.of("encoder", "resnet18", frames=1), pose=None)
+    assert type(light.depth.encoder) is encoders.entry("resnet18").target
+    assert light.pose is None
+    with pytest.raises(ConfigError, match="unknown model 'sau_nett'; did you mean 'sau_net'"):
+        saunet.build("model", "sau_nett")
 
 
 def test_a_spec_is_built_later_with_changes() -> None:

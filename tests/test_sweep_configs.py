@@ -9,8 +9,9 @@ from hydra import compose
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
+from plain import plain
 
-from saunet.cli.config import config_dir, plain
+from saunet.cli.table import config_dir
 
 pytestmark = pytest.mark.usefixtures("hydra")
 

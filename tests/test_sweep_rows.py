@@ -7,10 +7,11 @@ from typing import Any
 
 import pytest
 from hydra import compose
+from plain import plain
 from training_options import train_options
 
-from saunet.cli import app, words
-from saunet.cli.config import config_dir, plain
+from saunet.cli import app, table
+from saunet.cli.table import TOOLS, config_dir
 from saunet.errors import ConfigError
 from saunet.tools.benchmark.tool import PAPER_METHODS
 
@@ -77,7 +78,7 @@ def test_rows_of_table_3_differ_in_the_depth_network_only() -> None:
 
 
 def read(*given: str, folder: Path | None = None) -> tuple[str, ...]:
-    return words.overrides(given, "train", app.table(), conf=folder or config_dir()).overrides
+    return tuple(app.read_words(given, TOOLS["train"], table.read(), folder)[1])
 
 
 def test_a_glob_over_a_table_becomes_its_rows() -> None:
@@ -85,7 +86,9 @@ def test_a_glob_over_a_table_becomes_its_rows() -> None:
     assert read("experiment='glob(table3/stf*)'") == (f"experiment={','.join(TABLE_3[1:])}",)
 
 
-@pytest.mark.parametrize("argument", ["model/encoder=glob(resnet*)", "experiment=table3/stf_t_unet", "a=glob(x,y/*)"])
+@pytest.mark.parametrize(
+    "argument", ["model/encoder=glob(resnet*)", "experiment=table3/stf_t_unet", "name=glob(x,y/*)"]
+)
 def test_what_hydra_understands_is_left_to_it(argument: str) -> None:
     assert read(argument) == (argument,)
 

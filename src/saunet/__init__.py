@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     )
     from saunet.metrics.depth import DepthMetrics
     from saunet.models.depth import DepthNet
+    from saunet.models.systems import ModelOptions
     from saunet.prediction.prediction import Prediction
     from saunet.prediction.predictor import Predictor
     from saunet.prediction.tool import PredictOptions, predict
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from saunet.tools.calibrate.tool import CalibrateOptions, calibrate
     from saunet.tools.doctor.tool import DoctorOptions, doctor
     from saunet.tools.prepare.tool import PrepareOptions, prepare
-    from saunet.training.tool import ModelOptions, TrainOptions, train
+    from saunet.training.tool import TrainOptions, train
 
 __version__ = "0.1.0"
 __all__ = [
@@ -68,6 +69,7 @@ __getattr__ = lazily(
         "losses.functional": "automask combine_sources gradient_loss photometric_error smoothness_loss ssim_loss",
         "metrics.depth": "DepthMetrics",
         "models.depth": "DepthNet",
+        "models.systems": "ModelOptions",
         "prediction.prediction": "Prediction",
         "prediction.predictor": "Predictor",
         "prediction.tool": "PredictOptions predict",
@@ -76,7 +78,7 @@ __getattr__ = lazily(
         "tools.calibrate.tool": "CalibrateOptions calibrate",
         "tools.doctor.tool": "DoctorOptions doctor",
         "tools.prepare.tool": "PrepareOptions prepare",
-        "training.tool": "ModelOptions TrainOptions train",
+        "training.tool": "TrainOptions train",
     },
 )
 
@@ -89,7 +91,8 @@ def build(kind: str, name: str, /, **kwargs: Any) -> Any:
     """Build a registered component.
 
     Args:
-        kind: ``"encoder"``, ``"decoder"``, ``"attention"``, ``"pose"``, ``"objective"``, ``"term"`` or ``"data"``.
+        kind: ``"model"`` (depth and pose network together), ``"encoder"``, ``"decoder"``, ``"attention"``, ``"pose"``,
+            ``"objective"``, ``"term"`` or ``"data"``.
         name: A name from ``available(kind)``.
         **kwargs: Parameters that differ from the component's defaults.
 

@@ -1,4 +1,4 @@
-"""One voice for errors: what was wrong, what was given, what is allowed, how to fix it."""
+"""Errors, and checks that say what was wrong, what was given, what is allowed, and how to fix it."""
 
 from __future__ import annotations
 
@@ -64,16 +64,7 @@ def suggest(name: str, allowed: Iterable[str]) -> str:
 
 
 def one_of(name: str, value: str, allowed: Iterable[str]) -> str:
-    """Return ``value`` if it is one of the allowed words.
-
-    Args:
-        name: Of the parameter, for the message.
-        value: What was given.
-        allowed: The words, in the order in which the message lists them.
-
-    Raises:
-        ConfigError: if it is not; the message names the nearest word and lists all.
-    """
+    """Return the value of a parameter if it is one of the allowed words; the error names the nearest and lists all."""
     words = list(allowed)
     if value not in words:
         hint = suggest(str(value), words)
@@ -82,50 +73,23 @@ def one_of(name: str, value: str, allowed: Iterable[str]) -> str:
 
 
 def positive(name: str, value: float | int, *, allow_zero: bool = False) -> float | int:
-    """Return ``value`` if it is a finite number above zero (or zero, with ``allow_zero``).
-
-    Args:
-        name: Of the parameter, for the message.
-        value: What was given.
-        allow_zero: Let zero pass too.
-
-    Raises:
-        ConfigError: otherwise.
-    """
+    """Return the value of a parameter if it is a finite number above zero (or zero, with ``allow_zero``)."""
     if not math.isfinite(value) or value < 0 or (value == 0 and not allow_zero):
         raise ConfigError(f"{name} is {value}; it must be {'at least' if allow_zero else 'greater than'} 0")
     return value
 
 
 def in_range(name: str, value: float | int, low: float | int, high: float | int) -> float | int:
-    """Return ``value`` if ``low <= value <= high``.
-
-    Args:
-        name: Of the parameter, for the message.
-        value: What was given; NaN is refused.
-        low: Smallest value allowed.
-        high: Largest value allowed.
-
-    Raises:
-        ConfigError: otherwise.
-    """
+    """Return the value of a parameter if ``low <= value <= high``, which NaN is not."""
     if not low <= value <= high:
         raise ConfigError(f"{name} is {value}; it must lie between {low} and {high}")
     return value
 
 
 def divisible(height: int, width: int, divisor: int, *, what: str = "image", by: str = "the encoder stride") -> None:
-    """Check that an image size is a positive multiple of ``divisor`` in both directions.
+    """Check that what has this size, in pixels, is a positive multiple of ``divisor`` in both directions.
 
-    Args:
-        height: Height in pixels.
-        width: Width in pixels.
-        divisor: The number that must divide both.
-        what: What has this size, for the message.
-        by: Where the divisor comes from, for the message.
-
-    Raises:
-        ConfigError: if it does not; the message names the nearest valid size.
+    ``by`` says where the divisor comes from; the error names the nearest valid size.
     """
     if height > 0 and width > 0 and height % divisor == 0 and width % divisor == 0:
         return
@@ -137,15 +101,7 @@ def divisible(height: int, width: int, divisor: int, *, what: str = "image", by:
 
 
 def require_matplotlib(what: str, without: str) -> None:
-    """Check that pictures can be drawn, before anything long is started.
-
-    Args:
-        what: What needs it, with its verb, for the message, such as ``figure=true needs``.
-        without: The setting that does without.
-
-    Raises:
-        ConfigError: if matplotlib is not installed.
-    """
+    """Check that pictures can be drawn: ``what`` is such as ``figure=true needs``, ``without`` the setting without."""
     try:
         import matplotlib  # noqa: F401
     except ImportError as reason:
@@ -153,11 +109,7 @@ def require_matplotlib(what: str, without: str) -> None:
 
 
 def usable_device(name: str | torch.device) -> torch.device:
-    """Return the device of a name, having tried it; ``auto`` is a GPU if there is one, else the CPU.
-
-    Raises:
-        ConfigError: if there is no such device, or it cannot hold a tensor.
-    """
+    """Return the device of a name, having tried it; ``auto`` is a GPU if there is one, else the CPU."""
     import torch
 
     if name == "auto":

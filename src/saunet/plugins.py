@@ -1,7 +1,6 @@
-"""Components from outside the package: modules of the user's own, and installed packages that offer some.
+"""Components from outside the package, in modules that register them when imported.
 
-Importing such a module registers what it declares. Only what the user names, or has installed, is ever imported; a
-checkpoint names the plugins it needs and the user decides.
+Only what the user names, or has installed, is ever imported; a checkpoint names the plugins it needs, the user decides.
 """
 
 from __future__ import annotations
@@ -23,14 +22,9 @@ _installed_loaded = False
 
 
 def load(names: Iterable[str]) -> None:
-    """Import modules that register components.
+    """Import modules by name (from the working directory too), or by the path of a ``.py`` file.
 
-    Args:
-        names: Importable modules (from the working directory too), or paths of ``.py`` files. A file's folder joins
-            ``sys.path``, so that worker processes find the module as well.
-
-    Raises:
-        ConfigError: if one cannot be found or imported.
+    A file's folder joins ``sys.path``, so that worker processes find the module as well.
     """
     for name in names:
         module = _module(name)
@@ -98,12 +92,7 @@ def loaded() -> tuple[str, ...]:
 
 
 def asked_for(path: str, names: Iterable[str] = ()) -> str:
-    """Say what to do about a component that is not registered.
-
-    Args:
-        path: Its import path.
-        names: The plugins that its record names.
-    """
+    """Say what to do about a component at an import path that is not registered, given its record's plugins."""
     needed = [name for name in names if name not in _loaded] or [path.rpartition(".")[0]]
     if needed[0].split(".")[0] == "saunet":
         return "see `saunet components` for what is available"

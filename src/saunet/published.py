@@ -1,9 +1,10 @@
-"""The numbers that the SAU-Net paper prints (Tables 1 to 3, Fig. 10), read from ``published.json`` beside this file."""
+"""The numbers that the SAU-Net paper prints (Tables 1 to 3, Fig. 10), from ``published.json`` beside this file."""
 
 from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 
@@ -13,7 +14,7 @@ class Result:
     """One printed row of Table 1 or 3."""
 
     method: str
-    errors: tuple[float | None, ...]
+    errors: Sequence[float | None]
     """In the order of `saunet.metrics.functional.ERROR_NAMES`; None where the paper prints a dash."""
     pattern: str = ""
     """Table 1: D for depth as supervision, M for monocular video, S for stereo pairs."""
@@ -46,7 +47,6 @@ class Speed:
 class Published:
     """All of it."""
 
-    source: str
     table1: tuple[Result, ...]
     table2: tuple[Size, ...]
     table3: tuple[Result, ...]
@@ -57,14 +57,5 @@ class Published:
 def published() -> Published:
     """Return the paper's numbers."""
     content = json.loads(resources.files("saunet").joinpath("published.json").read_text(encoding="utf-8"))
-    results = [
-        tuple(Result(**{**row, "errors": tuple(row["errors"])}) for row in content[table])
-        for table in ("table1", "table3")
-    ]
-    return Published(
-        source=content["source"],
-        table1=results[0],
-        table2=tuple(Size(**row) for row in content["table2"]),
-        table3=results[1],
-        figure10=tuple(Speed(**row) for row in content["figure10"]),
-    )
+    kinds = {"table1": Result, "table2": Size, "table3": Result, "figure10": Speed}
+    return Published(**{name: tuple(kind(**row) for row in content[name]) for name, kind in kinds.items()})

@@ -1,14 +1,8 @@
 """Components declared once, reachable from Python and from Hydra.
 
-```python
-@encoders.register("stratified_tiny")  # the defaults
-@encoders.register("stratified_small", depths=(2, 2, 18, 2))  # a preset: a name and only what differs
-class StratifiedTransformer(WindowEncoder): ...
-
-
-saunet.build("encoder", "stratified_small", drop_path=0.1)  # Python
-# saunet train model/encoder=stratified_small model.encoder.drop_path=0.1   (command line)
-```
+``@encoders.register("stratified_small", depths=(2, 2, 18, 2))`` on a class serves both
+``saunet.build("encoder", "stratified_small", drop_path=0.1)`` and, on the command line,
+``model/encoder=stratified_small model.encoder.drop_path=0.1``.
 """
 
 from __future__ import annotations
@@ -39,11 +33,6 @@ class Entry:
     def path(self) -> str:
         """Import path of the target, the ``_target_`` of its config node."""
         return f"{self.target.__module__}.{self.target.__qualname__}"
-
-    @property
-    def summary(self) -> str:
-        """First line of the target's docstring."""
-        return schema.summary(self.target)
 
 
 class Registry:
@@ -81,12 +70,8 @@ class Registry:
             if name in self._entries:
                 taken = f"{self.kind} '{name}' is already registered by {self._entries[name].path}"
                 raise ConfigError(f"{taken}; give {target.__module__}.{target.__qualname__} another name")
-            known = schema.parameters(target)
-            for key in preset:
-                if key not in known:
-                    raise TypeError(
-                        f"{self.kind} '{name}': preset key '{key}' is not a parameter of {target.__qualname__}"
-                    )
+            for key in preset.keys() - schema.parameters(target).keys():
+                raise TypeError(f"{self.kind} '{name}': preset key '{key}' is not a parameter of {target.__qualname__}")
             self._entries[name] = Entry(name, target, preset)
             return target
 
@@ -107,11 +92,7 @@ class Registry:
         return functools.partial(self.build, name, **kwargs)
 
     def entry(self, name: str) -> Entry:
-        """Return what is registered under ``name``.
-
-        Raises:
-            ConfigError: if nothing is; the message suggests the nearest name and lists the rest.
-        """
+        """Return what is registered under ``name``; if nothing is, the error suggests the nearest name."""
         self._import_home()
         if name not in self._entries:
             hint = suggest(name, self._entries)
@@ -170,18 +151,14 @@ poses = Registry("pose", "model/pose", "saunet.models.poses")
 terms = Registry("term", "term", "saunet.losses.terms")
 objectives = Registry("objective", "objective", "saunet.losses.objectives")
 datamodules = Registry("data", "data", "saunet.data")
+models = Registry("model", None, "saunet.models.systems")  # its members choose members of other groups
 
-REGISTRIES: dict[str, Registry] = {
-    registry.kind: registry for registry in (encoders, decoders, attentions, poses, terms, objectives, datamodules)
-}
+_ALL = (models, encoders, decoders, attentions, poses, terms, objectives, datamodules)
+REGISTRIES: dict[str, Registry] = {registry.kind: registry for registry in _ALL}
 
 
 def registry(kind: str) -> Registry:
-    """Return the registry of a kind.
-
-    Raises:
-        ConfigError: for an unknown kind.
-    """
+    """Return the registry of a kind."""
     if kind not in REGISTRIES:
         raise ConfigError(f"unknown kind '{kind}'{suggest(kind, REGISTRIES) or ';'} kinds: {', '.join(REGISTRIES)}")
     return REGISTRIES[kind]
@@ -241,15 +218,9 @@ class Spec:
 
 
 def instantiate(node: Any) -> Any:
-    """Build what a plain config describes: mappings with ``_target_`` become components, innermost first.
+    """Build what plain containers describe: mappings with ``_target_`` become components, innermost first.
 
     Only registered components are ever built, whatever a file says, so a checkpoint's config cannot run foreign code.
-
-    Args:
-        node: Plain containers (no DictConfig): the resolved config of a component.
-
-    Raises:
-        ConfigError: if a ``_target_`` is not registered or a key is not a parameter of it.
     """
     if isinstance(node, Mapping):
         values = {key: instantiate(value) for key, value in node.items() if key not in ("_convert_", "_partial_")}
@@ -272,12 +243,7 @@ def _by_path(path: str) -> Entry:
 
 
 def find(path: str, kinds: Iterable[str] = ()) -> Entry | None:
-    """Return the registered component with an import path, None if there is none.
-
-    Args:
-        path: Such as ``saunet.models.encoders.resnet.ResNet``.
-        kinds: Where to look; everywhere by default.
-    """
+    """Return the registered component with an import path, of some kinds or any, None if there is none."""
     owners = [REGISTRIES[kind] for kind in kinds or REGISTRIES]
     for _ in range(2):
         for owner in owners:

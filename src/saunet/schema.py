@@ -1,8 +1,7 @@
-"""Signature -> plain description of the config keys that a component, or a tool's options, has.
+"""The parameters of a component, or of a tool's options, *are* its config keys: signature -> plain description.
 
-The parameters of a component *are* its config keys: names, types, defaults and the sentence in the docstring are read
-from its signature. Descriptions are plain data, so the command line can keep them in a file and check a configuration
-without importing what it configures.
+Names, types, defaults and the sentence in the docstring are read from the signature. Descriptions are plain data, so
+the command line can keep them in a file and check a configuration without importing what it configures.
 """
 
 from __future__ import annotations
@@ -15,58 +14,47 @@ import re
 import textwrap
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Union
+from typing import Any, Literal, Optional, Union
 
 from typing_extensions import Unpack
 
 REQUIRED = "???"
 """Default of a key that must be given; OmegaConf's own mark."""
 _PRIMITIVES = {bool: "bool", int: "int", float: "float", str: "str", Path: "str"}
+_TYPES: dict[str, Any] = {"bool": bool, "int": int, "float": float, "str": str}
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Key:
-    """One config key.
-
-    Args:
-        name: The parameter's name.
-        type: ``bool``, ``int``, ``float``, ``str``, ``any``, ``list[...]`` or ``dict[...]`` of these, ``component`` for
-            a `saunet.registry.Spec`, ``node`` for nested keys; with a trailing ``?`` where None is allowed too.
-        default: Plain data; `REQUIRED` where there is none.
-        help: What it does, in a sentence.
-        choices: The values allowed, where they are few.
-        annotation: The type as Python writes it.
-        node: The nested keys of type ``node``.
-    """
+    """One config key."""
 
     name: str
     type: str
+    """``bool``, ``int``, ``float``, ``str``, ``any``, ``list[...]`` or ``dict[...]`` of these, ``component`` for a
+    `saunet.registry.Spec`, ``node`` for nested keys; with a trailing ``?`` where None is allowed too."""
     default: Any = REQUIRED
     help: str = ""
     choices: tuple[Any, ...] = ()
+    """The values allowed, where they are few."""
     annotation: str = ""
+    """The type as Python writes it."""
     node: Node | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Node:
-    """The config keys of a class or function.
-
-    Args:
-        name: The class's name.
-        path: What to build, the config's ``_target_``; None for a tool's options.
-        summary: First line of the docstring.
-        keys: The keys in order.
-        partial: Whether parameters are missing that the caller supplies.
-    """
+    """The config keys of a class or function."""
 
     name: str
     path: str | None
+    """What to build, the config's ``_target_``; None for a tool's options."""
     summary: str
+    """First line of the docstring."""
     keys: tuple[Key, ...]
     partial: bool = False
+    """Whether parameters are missing that the caller supplies."""
 
     def key(self, dotted: str) -> Key | None:
         """Return the key ``a.b.c`` below this node, or None."""
@@ -90,100 +78,73 @@ _UNPACKED: dict[Any, type] = {}
 
 
 def unpacked(keywords: Any, options: type) -> None:
-    """Let components take ``**kwargs: Unpack[keywords]``: parameters with the types and defaults of a dataclass.
-
-    Args:
-        keywords: A ``TypedDict`` with the names of the fields.
-        options: The dataclass.
-    """
+    """Let components take ``**kwargs: Unpack[keywords]``, whose types and defaults are those of a dataclass."""
     _UNPACKED[keywords] = options
 
 
 def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     """Return the named parameters of a class or function, in order, with annotations resolved.
 
-    Raises:
-        TypeError: if it takes ``*args``, an unannotated parameter, or ``**kwargs`` that no ``Unpack`` of keywords made
-            known by `unpacked` describes: a config key has a name and a type.
+    A config key has a name and a type: ``*args`` and unannotated parameters are refused, and ``**kwargs`` but for an
+    ``Unpack`` of keywords made known by `unpacked`.
     """
-    owner = target.__qualname__
-    function: Any = target.__init__ if inspect.isclass(target) else target
-    hints = typing.get_type_hints(function)
     found: dict[str, inspect.Parameter] = {}
-    for name, parameter in inspect.signature(target).parameters.items():
-        options = _options(parameter, hints.get(name))
+    for parameter, options in _signature(target):
         if options is not None:
             found |= parameters(options)
             continue
+        name, owner = parameter.name, target.__qualname__
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             raise TypeError(f"{owner} takes '{parameter}'; a component names every parameter, each is a config key")
-        if name not in hints:
+        if parameter.annotation is parameter.empty:
             raise TypeError(f"{owner}: parameter '{name}' has no annotation; its type is needed for the config schema")
-        found[name] = parameter.replace(annotation=hints[name])
+        found[name] = parameter
     return found
 
 
-def _options(parameter: inspect.Parameter, annotation: Any) -> type | None:
-    """Return the options class behind ``**kwargs: Unpack[Keywords]``, None for any other parameter."""
-    if parameter.kind is not parameter.VAR_KEYWORD or typing.get_origin(annotation) is not Unpack:
-        return None
-    return _UNPACKED.get(typing.get_args(annotation)[0])
-
-
-def summary(target: Callable[..., Any]) -> str:
-    """Return the first line of a docstring."""
-    return (inspect.getdoc(target) or "").partition("\n")[0]
+def _signature(target: Callable[..., Any]) -> Iterator[tuple[inspect.Parameter, type | None]]:
+    """Yield each parameter with its annotation resolved, and the options class that ``**kwargs`` stand for."""
+    function: Any = target.__init__ if inspect.isclass(target) else target
+    hints = typing.get_type_hints(function)
+    for name, parameter in inspect.signature(target).parameters.items():
+        hint = hints.get(name, parameter.empty)
+        unpacks = parameter.kind is parameter.VAR_KEYWORD and typing.get_origin(hint) is Unpack
+        options = _UNPACKED.get(typing.get_args(hint)[0]) if unpacks else None
+        yield (parameter if unpacks else parameter.replace(annotation=hint)), options
 
 
 def node(
-    target: Callable[..., Any],
-    preset: Mapping[str, Any] | None = None,
-    late: Sequence[str] = (),
-    path: str | None = "",
+    target: Callable[..., Any], preset: Mapping[str, Any] | None = None, late: Sequence[str] = (), path: str | None = ""
 ) -> Node:
-    """Describe the config keys of ``target``.
+    """Describe the config keys of an annotated class or function, with a preset of other defaults.
 
-    Args:
-        target: A class or function with an annotated signature.
-        preset: Defaults that differ from the signature's.
-        late: Parameters that the caller gives at run time; they are no keys, and the node is partial.
-        path: Import path to build from; the target's own by default, None for options, which are not built by path.
+    ``late`` parameters are given by the caller at run time; they are no keys, and the node is partial. ``path`` is what
+    to build, the target's own import path by default, None for options.
     """
-    preset = dict(preset or {})
-    owners: list[Callable[..., Any]] = [target, *_all_options(target)]
-    said = {name: each for owner in reversed(owners) for name, each in _sentences(owner).items()}
+    preset, said = dict(preset or {}), _sentences(target)
+    owners: list[Callable[..., Any]] = [target, *(options for _, options in _signature(target) if options)]
     fields = {name: each for owner in owners for name, each in getattr(owner, "__dataclass_fields__", {}).items()}
     hidden = {name for name, field in fields.items() if not field.metadata.get("cli", True)}
     keys = []
     for name, parameter in parameters(target).items():
         if name in late or name in hidden:
             continue
-        default = _plain(preset.get(name, _default(fields.get(name), parameter)))
         nested = _component(parameter.annotation)
-        kind, choices = _type(parameter.annotation)
         if nested is not None and name not in preset:
             inner = node(nested, path=None if path is None else "")
             keys.append(Key(name, "node", None, said.get(name, ""), node=inner))
-        else:
-            shown = inspect.formatannotation(parameter.annotation)
-            shown = re.sub(r"\b(typing|collections\.abc|pathlib)\.", "", shown)
-            keys.append(Key(name, kind, default, said.get(name, ""), choices, shown))
+            continue
+        default, field = parameter.default, fields.get(name)
+        if field is not None and field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        default = preset.get(name, REQUIRED if default is parameter.empty else default)
+        kind, choices = _type(parameter.annotation)
+        kind = field.metadata.get("type", kind) if field is not None else kind
+        shown = inspect.formatannotation(parameter.annotation)
+        shown = re.sub(r"\b(typing|collections\.abc|pathlib|saunet\.registry)\.", "", shown)
+        keys.append(Key(name, kind, _plain(default), said.get(name, ""), choices, shown))
     own = f"{target.__module__}.{target.__qualname__}" if path == "" else path
-    return Node(target.__qualname__, own, summary(target), tuple(keys), bool(late))
-
-
-def _all_options(target: Callable[..., Any]) -> list[type]:
-    """Return the options classes that ``**kwargs`` stand for."""
-    function: Any = target.__init__ if inspect.isclass(target) else target
-    hints = typing.get_type_hints(function)
-    found = (_options(each, hints.get(name)) for name, each in inspect.signature(target).parameters.items())
-    return [each for each in found if each is not None]
-
-
-def _default(field: Any, parameter: inspect.Parameter) -> Any:
-    if field is not None and field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return REQUIRED if parameter.default is inspect.Parameter.empty else parameter.default
+    return Node(target.__qualname__, own, (inspect.getdoc(target) or "").partition("\n")[0], tuple(keys), bool(late))
 
 
 def _plain(value: Any) -> Any:
@@ -222,15 +183,14 @@ def _type(annotation: Any) -> tuple[str, tuple[Any, ...]]:
         return _PRIMITIVES[annotation], ()
     if _is_spec(annotation):
         return "component", ()
-    plain = _strip_optional(annotation)
-    if plain is not annotation:
-        inner, choices = _type(plain)
-        return (inner if inner == "any" else f"{inner}?"), choices
-    if typing.get_origin(annotation) in (Union, types.UnionType):
-        names = {_type(each)[0] for each in typing.get_args(annotation) if each is not type(None)}
-        if len(names) == 1:  # such as str | Path
-            return names.pop() + ("?" if type(None) in typing.get_args(annotation) else ""), ()
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin in (Union, types.UnionType):
+        found = {_type(each) for each in arguments if each is not type(None)}
+        names = {name for name, _ in found}
+        if len(names) > 1 or "any" in names:
+            return "any", ()
+        choices = found.pop()[1] if len(found) == 1 else ()
+        return names.pop() + ("?" if type(None) in arguments else ""), choices  # such as str | Path | None
     if origin is Literal:
         kinds = {type(a) for a in arguments}
         return (_PRIMITIVES[kinds.pop()] if len(kinds) == 1 else "any"), arguments
@@ -238,6 +198,17 @@ def _type(annotation: Any) -> tuple[str, tuple[Any, ...]]:
         values = {_type(a)[0] for a in arguments[origin in (dict, Mapping) :] if a is not Ellipsis}
         return f"{'dict' if origin in (dict, Mapping) else 'list'}[{values.pop() if len(values) == 1 else 'any'}]", ()
     return "any", ()
+
+
+def python_type(name: str) -> Any:
+    """Return the type that a `Key.type` names, for a tool that checks values by it."""
+    if name.endswith("?"):
+        return Optional[python_type(name[:-1])]  # noqa: UP045 (OmegaConf wants the typing form)
+    kind, _, item = name.partition("[")
+    if kind in ("list", "dict"):
+        inner = python_type(item[:-1])
+        return list[inner] if kind == "list" else dict[str, inner]  # type: ignore[valid-type]
+    return _TYPES.get(name, Any)
 
 
 def _sentences(target: Callable[..., Any]) -> dict[str, str]:
@@ -248,10 +219,8 @@ def _sentences(target: Callable[..., Any]) -> dict[str, str]:
         section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.DOTALL | re.MULTILINE)
         pieces = re.split(r"^    \**(\w+): ", section[1], flags=re.MULTILINE)[1:] if section else []
         said |= zip(pieces[::2], pieces[1::2], strict=True)
-    function: Any = target.__init__ if inspect.isclass(target) else target
-    for name, parameter in inspect.signature(function).parameters.items():
-        if (options := _options(parameter, typing.get_type_hints(function).get(name))) is not None:
-            said = {**_sentences(options), **said}
+    for _, options in _signature(target):
+        said = {**(_sentences(options) if options else {}), **said}
     if dataclasses.is_dataclass(target):
         body = ast.parse(textwrap.dedent(inspect.getsource(target))).body[0].body  # type: ignore[attr-defined]
         for field, below in itertools.pairwise(body):

@@ -14,24 +14,15 @@ from torch import Tensor
 from typing_extensions import NotRequired, TypedDict
 
 
-class FrameBatch(TypedDict):
-    """What the data loader yields: decoded frames as bytes, before anything happened to them on the device."""
-
-    frames: UInt8[Tensor, "b 1+s 3 h w"]
-    """RGB frames; index 0 is the target, then the sources in the order of the data module's ``offsets``, and last the
-    stereo partner, if ``T_stereo_tgt`` says that there is one."""
+class _Sample(TypedDict):
     K: Float[Tensor, "b 3 3"]
-    """Intrinsics in pixels of ``frames`` (integer coordinates are pixel centers)."""
+    """Intrinsics in pixels of the images (integer coordinates are pixel centers)."""
     name: list[str]
     """One readable name a sample, such as ``2011_09_26/..._sync 0000000005 l``."""
     target_depth: NotRequired[Float[Tensor, "b 1 h w"]]
-    """Depth of the target in meters at the size of ``frames``, 0 where unknown; for losses that use LiDAR."""
+    """Depth of the target in meters at the size of the images, 0 where unknown; for losses that use LiDAR."""
     target_teacher: NotRequired[Float[Tensor, "b 1 h w"]]
-    """Depth of the target as another model predicts it, at the size of ``frames``, up to scale, 0 where unknown."""
-    depth: NotRequired[Float[Tensor, "b 1 hg wg"]]
-    """Ground-truth depth in meters at its native size, 0 where unknown, padded to the largest in the batch."""
-    depth_size: NotRequired[Int[Tensor, "b 2"]]
-    """Native (height, width) of each ground truth inside the padding."""
+    """Depth of the target as another model predicts it, at the size of the images, up to scale, 0 where unknown."""
     T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
     """True motion, where the data set knows it: a target point times it is a source point, in meters."""
     T_stereo_tgt: NotRequired[Float[Tensor, "b 4 4"]]
@@ -39,12 +30,30 @@ class FrameBatch(TypedDict):
     Where it is given, the partner's image is the last source."""
     distance: NotRequired[Float[Tensor, "b s"]]
     """Meters the camera traveled between the target and each source; NaN where unknown and for the stereo partner."""
+
+
+class _Truth(TypedDict):
+    depth: NotRequired[Float[Tensor, "b 1 hg wg"]]
+    """Ground-truth depth in meters at its native size, 0 where unknown, padded to the largest in the batch."""
+    depth_size: NotRequired[Int[Tensor, "b 2"]]
+    """Native (height, width) of each ground truth inside the padding."""
+
+
+class FrameBatch(_Sample, _Truth):
+    """What the data loader yields: decoded frames as bytes, before anything happened to them on the device."""
+
+    frames: UInt8[Tensor, "b 1+s 3 h w"]
+    """RGB frames; index 0 is the target, then the sources in the order of the data module's ``offsets``, and last the
+    stereo partner, if ``T_stereo_tgt`` says that there is one."""
     draws: NotRequired[Float[Tensor, "b n"]]
     """Uniform random numbers in [0, 1) that augmentation uses; training samples only."""
 
 
-class TrainBatch(TypedDict):
-    """One training step's input, on the device, augmented. Images are RGB in [0, 1]."""
+class TrainBatch(_Sample):
+    """One training step's input, on the device, augmented; images are RGB in [0, 1].
+
+    All else follows their resize, crop and flip, which puts the stereo partner on the other side.
+    """
 
     target: Float[Tensor, "b 3 h w"]
     """The target image as the networks see it (color-jittered)."""
@@ -54,31 +63,12 @@ class TrainBatch(TypedDict):
     """The target image without color jitter: what the loss compares."""
     loss_sources: Float[Tensor, "b s 3 h w"]
     """The source images without color jitter."""
-    K: Float[Tensor, "b 3 3"]
-    """Intrinsics in pixels, after resize, crop and flip."""
-    name: list[str]
-    """One readable name a sample."""
-    target_depth: NotRequired[Float[Tensor, "b 1 h w"]]
-    """See `FrameBatch`; cropped and flipped with the images."""
-    target_teacher: NotRequired[Float[Tensor, "b 1 h w"]]
-    """See `FrameBatch`; cropped and flipped with the images."""
-    distance: NotRequired[Float[Tensor, "b s"]]
-    """See `FrameBatch`."""
     source_depth: NotRequired[Float[Tensor, "b s 1 h w"]]
     """Predicted depth of the sources, with its graph; the training step adds it if `Objective.needs_source_depth`."""
-    T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
-    """See `FrameBatch`; follows flips."""
-    T_stereo_tgt: NotRequired[Float[Tensor, "b 4 4"]]
-    """See `FrameBatch`; follows flips, which put the partner on the other side."""
 
 
-class EvalBatch(TrainBatch):
+class EvalBatch(TrainBatch, _Truth):
     """A batch without augmentation, with ground truth where the data set has it."""
-
-    depth: NotRequired[Float[Tensor, "b 1 hg wg"]]
-    """See `FrameBatch`."""
-    depth_size: NotRequired[Int[Tensor, "b 2"]]
-    """See `FrameBatch`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,15 @@ import pytest
 from echo_tool import ECHOED, EchoOptions
 
 from saunet.cli import app
+from saunet.cli.table import Tool
 
-ECHO = app.Tool(
-    "return what was given", "echo_tool:EchoOptions", "echo_tool:echo", ("echo road.png",), positional="input"
+ECHO = Tool(
+    "echo",
+    "return what was given",
+    ("echo road.png",),
+    "input",
+    options="echo_tool:EchoOptions",
+    function="echo_tool:echo",
 )
 Said = Callable[..., tuple[int, str, str]]
 
@@ -105,6 +111,41 @@ def test_one_value_is_a_list_of_one_and_names_stay(echo: Said, word: str, names:
     assert _given(echo, word).names == names
 
 
+def test_names_in_a_yaml_file_stay_what_was_typed(echo: Said, tmp_path: Path) -> None:
+    (tmp_path / "conf" / "mine.yaml").write_text(
+        "defaults: [echo, _self_]\noutput_dir: 2024_05_01\ninput: 0001\nnames: [0001, 1e5, 12:30, yes, 2024_05_01]\n"
+        "numbers: [1_000, 1e-4]\ncount: 0x10\nflag: yes\nextra: {factor: 1_000}\ndata: null\n"
+        "inner: {factor: 1e-3, note: 007}\n"
+    )
+    options = _given(echo, "--config-name=mine")
+    assert (options.output_dir, options.input) == ("2024_05_01", "0001")
+    assert options.names == ("0001", "1e5", "12:30", "yes", "2024_05_01")
+    assert options.numbers == (1000.0, 1e-4)
+    assert (options.count, options.flag, options.extra) == (16, True, {"factor": 1000})
+    assert (options.inner.factor, options.inner.note) == (1e-3, "007")
+
+
+def test_names_of_a_component_in_a_yaml_file_stay_what_was_typed(echo: Said, tmp_path: Path) -> None:
+    (tmp_path / "conf" / "data").mkdir()
+    (tmp_path / "conf" / "data" / "mine.yaml").write_text("defaults: [video]\nroot: 2024_05_01\nval_clips: [0001]\n")
+    data = _given(echo, "data=mine").data
+    assert data is not None
+    assert (data.get("root"), data.get("val_clips")) == ("2024_05_01", ["0001"])
+
+
+def test_a_folder_or_video_given_as_data_is_read_as_video(echo: Said) -> None:
+    Path("clips").mkdir()
+    Path("drive.mp4").touch()
+    for path in ("clips", "drive.mp4", "/nowhere/at/all", "./2024_05_01/a=b"):
+        data = _given(echo, f"data={path}").data
+        assert data is not None
+        assert (data.name, data.get("root")) == ("video", path)
+    Path("synthetic").mkdir()  # a data module's name is the data module
+    data = _given(echo, "data=synthetic").data
+    assert data is not None
+    assert data.name == "synthetic"
+
+
 def test_types_nesting_and_components(echo: Said) -> None:
     options = _given(echo, "numbers=3", "flag=true", "inner.factor=2", "data=synthetic_tiny", "data.workers=0")
     assert options.numbers == (3.0,)
@@ -165,6 +206,8 @@ def test_a_sweep_keeps_text_and_writes_its_plan(echo: Said) -> None:
         ("2024_05_01", ("b",)),
     ]
     assert "4 jobs finished" in out
+    assert "HYDRA" not in out + err
+    assert "saunet echo: job 2: input='2024_05_01',names=[a]" in err
     assert "\"input='0001'\"" in Path("sweep/sweep.json").read_text()
 
 

@@ -14,7 +14,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
-from saunet.cli.config import config_dir
+from saunet.cli.table import config_dir
 from saunet.registry import REGISTRIES
 
 from .pages import composed, inline, tools

@@ -20,8 +20,9 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import saunet
-from saunet.cli import app, words
-from saunet.cli.config import config_dir, register_configs
+from saunet.cli import app, table
+from saunet.cli.compose import register_configs
+from saunet.cli.table import config_dir
 from saunet.registry import REGISTRIES
 
 from .pages import PAGES, ROOT, blocks, commands, composed, lines, mistakes
@@ -34,8 +35,8 @@ def _overrides(command: str) -> list[str]:
     """Return the overrides of a printed command: no dots for "and so on", one job of a sweep, no job word or file."""
     _, tool, *given = shlex.split(command)
     kept = [word for word in given if "=" in word and not word.startswith(NOT_INSTALLED)]
-    if app.TOOLS[tool].options:
-        kept = list(words.overrides(kept, tool, app.table(), None, app.TOOLS[tool].aliases, config_dir()).overrides)
+    if app.TOOLS[tool].options is not None:
+        kept = app.read_words(kept, app.TOOLS[tool], table.read())[1]
     single = []
     for override in OverridesParser.create().parse_overrides(kept):
         if override.is_sweep_override():

@@ -6,10 +6,10 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
-from saunet.cli import app, compose
+from saunet.cli import compose, table
 from saunet.training.tool import TrainOptions
 
-_table = functools.cache(app.table)
+_table = functools.cache(table.read)
 
 
 def train_options(plain: Mapping[str, Any]) -> TrainOptions:

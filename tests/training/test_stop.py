@@ -15,7 +15,7 @@ from lightning import Callback, Trainer
 from lightning.pytorch.loggers import CSVLogger
 from omegaconf import OmegaConf
 
-from saunet.cli.config import config_dir
+from saunet.cli.table import config_dir
 from saunet.runs.folder import Stopped
 from saunet.training.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
 from saunet.training.resume import keep_rows

@@ -1,224 +1,83 @@
-"""The command ``saunet``: which tools there are, and the way from a command line to a tool's function.
+"""The command ``saunet``: its words become overrides, Hydra composes them, and a tool is called with its options.
 
-A tool is a dataclass of options and a function that takes it, both in the room that owns the tool. Hydra composes the
-keys, they become the options once, the function is called, and what it returns is printed.
+Hydra's grammar turns ``2024_05_01`` into a number and stumbles over ``=`` and brackets in a path: values of keys that
+hold text or a list are quoted or put into a list first.
 """
 
 from __future__ import annotations
 
+import argparse
+import fnmatch
 import functools
+import inspect
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, NoReturn, Protocol, cast, runtime_checkable
 
 from saunet import __version__, plugins
-from saunet.cli.config import config_dir
+from saunet.cli.table import PLUGINS, TOOLS, Table, Tool, config_dir, imported, read
 from saunet.errors import ConfigError, SaunetError, suggest
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from saunet.cli.compose import Composed
-    from saunet.cli.table import Table
 
 
-@dataclass(frozen=True)
-class Tool:
-    """One tool of the command line.
-
-    Args:
-        summary: What it does, in a line.
-        options: Its options as ``module:Class``; empty for a tool with a command line of its own.
-        function: What is called with them, as ``module:function``.
-        examples: Command lines without ``saunet``.
-        positional: The key that plain words stand for; a trailing ``*`` takes several.
-        aliases: Short form -> key.
-        words: First word -> what it stands for.
-        recorded: Whether the function is also given ``choices`` and ``overrides`` for the record of a run, and
-            ``describe``, which puts an error into one sentence; what it returns is not printed.
-        config: Name of the root config; the tool's own by default.
-        preset: Overrides that come before those of the command line.
-    """
-
-    summary: str
-    options: str = ""
-    function: str = ""
-    examples: Sequence[str] = ()
-    positional: str | None = None
-    aliases: dict[str, str] = field(default_factory=dict)
-    words: dict[str, str] = field(default_factory=dict)
-    recorded: bool = False
-    config: str = ""
-    preset: Sequence[str] = ()
-
-
-TOOLS: dict[str, Tool] = {
-    "train": Tool(
-        "train a depth network on driving video",
-        "saunet.training.tool:TrainOptions",
-        "saunet.training.tool:train",
-        (
-            "train experiment=selfsup data=kitti data.root=/data/kitti/raw",
-            "train experiment=smoke model/encoder=resnet18 epochs=2 lr=2e-4",
-            "train -m sweep=loss_ablation experiment=smoke",
-            "resume outputs/train/2026-01-31_12-00-00",
-        ),
-        aliases={"epochs": "trainer.max_epochs", "lr": "optim.lr", "batch": "data.batch_size"},
-        recorded=True,
-    ),
-    "predict": Tool(
-        "depth of an image, a folder, a video or a camera, as pictures, points and videos",
-        "saunet.prediction.tool:PredictOptions",
-        "saunet.prediction.tool:predict",
-        (
-            "predict road.png output=out",
-            "predict drive.mp4 checkpoint=last.ckpt output=out outputs=[mp4,html] camera=[90]",
-        ),
-        positional="input",
-    ),
-    "evaluate": Tool(
-        "score a checkpoint, or predictions made elsewhere",
-        "saunet.evaluation.tool:EvaluateOptions",
-        "saunet.evaluation.tool:evaluate",
-        ("evaluate last.ckpt data=kitti data.root=/data/kitti/raw", "evaluate predictions=maps data=kitti"),
-        positional="checkpoint",
-    ),
-    "odometry": Tool(
-        "the camera's path through whole sequences, with its errors",
-        "saunet.evaluation.paths:OdometryOptions",
-        "saunet.evaluation.paths:odometry",
-        ("odometry last.ckpt data.root=/data/kitti/odometry",),
-        positional="checkpoint",
-    ),
-    "export": Tool(
-        "write a checkpoint as files to deploy or share, each checked against the network",
-        "saunet.exporting.tool:ExportOptions",
-        "saunet.exporting.tool:export",
-        ("export last.ckpt output=exported",),
-        positional="checkpoint",
-    ),
-    "report": Tool(
-        "one page of tables, curves and pictures from finished runs; how runs differ",
-        "saunet.reporting.tool:ReportOptions",
-        "saunet.reporting.tool:report",
-        ("report outputs/train", "report compare outputs/train/A outputs/train/B"),
-        positional="runs*",
-        words={"compare": "compare=true"},
-    ),
-    "benchmark": Tool(
-        "parameters, FLOPs, time and memory of networks",
-        "saunet.cli.benchmark:BenchmarkCommand",
-        "saunet.cli.benchmark:benchmark",
-        ("benchmark models=[sau_net,street]", "benchmark model/encoder=resnet18 sizes=192x640,320x1024"),
-        recorded=True,
-    ),
-    "doctor": Tool(
-        "look at a data set before hours of training",
-        "saunet.tools.doctor.tool:DoctorOptions",
-        "saunet.tools.doctor.tool:doctor",
-        examples=("doctor data=kitti data.root=/data/kitti/raw",),
-    ),
-    "calibrate": Tool(
-        "make camera.yaml from a video or pictures of a board",
-        "saunet.tools.calibrate.tool:CalibrateOptions",
-        "saunet.tools.calibrate.tool:calibrate",
-        examples=("calibrate print_board=board.png", "calibrate board.mp4 columns=10 rows=7 square=0.025"),
-        positional="input",
-    ),
-    "prepare": Tool(
-        "do once before training: dense depth, a teacher's depth, smaller copies of images",
-        "saunet.tools.prepare.tool:PrepareOptions",
-        "saunet.tools.prepare.tool:prepare",
-        examples=("prepare densify root=/data/kitti/raw",),
-        positional="job",
-    ),
-    "components": Tool(
-        "list every registered component with its keys",
-        function="saunet.cli.components:main",
-        examples=("components encoder",),
-    ),
-    "demo": Tool(
-        "the README's demo: train on rendered video, evaluate, draw",
-        "saunet.training.tool:TrainOptions",
-        "saunet.cli.demo:demo",
-        ("demo", "demo epochs=2"),
-        aliases={"epochs": "trainer.max_epochs", "lr": "optim.lr", "batch": "data.batch_size"},
-        recorded=True,
-        config="train",
-        preset=("experiment=demo",),
-    ),
-}
-"""Every tool by name, in the order of ``saunet --help``."""
+_OVERRIDE = re.compile(r"(?P<sign>\+{0,2}|~)(?P<key>[\w@/.:][\w@/.:-]*)=(?P<value>.*)", re.DOTALL)
+_GLOB = re.compile(r"""['"]?glob\(['"]?(?P<pattern>[^,()'"]*/[^,()'"]*)['"]?\)['"]?""")
+_FUNCTION = re.compile(
+    r"(choice|range|interval|glob|sort|shuffle|tag|extend_list|int|float|str|bool|json_str)\(.*\)", re.DOTALL
+)
+_PLAIN = re.compile(r"[A-Za-z/.~-][\w/.~-]*|\d+[A-Za-z/-][\w/.~-]*")
+_NOT_TEXT = re.compile(r"true|false|yes|no|on|off|null|none|inf|nan|~|\d+e\d+", re.IGNORECASE)
 
 
 @runtime_checkable
 class Partial(Protocol):
     """A result of which some parts failed, each said in one sentence."""
 
-    @property
-    def failures(self) -> Sequence[str]:
-        """One sentence for each part that failed."""
+    failures: Sequence[str]
 
 
 @runtime_checkable
 class Shown(Protocol):
-    """A result that prints itself; others are printed as text."""
+    """A result that prints itself, in colors and at the terminal's width; others are printed as text."""
 
-    def show(self) -> None:
-        """Print tables in colors and at the terminal's width."""
+    show: Callable[[], None]
 
 
 @runtime_checkable
 class Graded(Protocol):
     """A result that decides the exit code."""
 
-    @property
-    def exit_code(self) -> int:
-        """0 if all is well."""
+    exit_code: int
 
 
 @runtime_checkable
 class Costed(Protocol):
-    """A result with a number that a search over sweeps minimizes."""
+    """A result with a number that a search over sweeps minimizes; None if there is none."""
 
-    @property
-    def cost(self) -> float | None:
-        """The number; None if there is none."""
+    cost: float | None
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Entry point of ``saunet``.
-
-    What a user can mend ends in one sentence and exit code 1; only a defect of the program shows a traceback.
-    ``HYDRA_FULL_ERROR=1`` shows it always.
-    """
+    """Entry point of ``saunet``."""
     given = list(sys.argv[1:] if argv is None else argv)
     tool, *rest = given or ["--help"]
     if tool in ("-h", "--help", "help"):
         print(overview())
     elif tool in ("-V", "--version", "version"):
         print(f"saunet {__version__}")
-    elif tool == "--completion" or tool == "--complete":
-        _completion(tool, rest[0] if rest else "")
-    elif tool == "resume":
-        run("train", rest, read=resumed)
-    elif tool in TOOLS:
+    elif tool in (*TOOLS, "resume", "--completion", "--complete"):
         run(tool, rest)
     else:
         hint = suggest(tool, TOOLS) or f"; the tools are {', '.join(TOOLS)}"
         sys.exit(f"saunet: the first word is a tool, not '{tool}'{hint}")
-
-
-def _completion(asked: str, word: str) -> None:
-    from saunet.cli.completion import complete, script
-
-    try:
-        print(script(word) if asked == "--completion" else "\n".join(complete(word, [*TOOLS, "resume"], table())))
-    except ConfigError as error:
-        sys.exit(f"saunet: {error}")
 
 
 def overview() -> str:
@@ -230,47 +89,14 @@ def overview() -> str:
     return "\n".join([*lines, "", "`saunet TOOL --help` lists a tool's keys; --completion bash|zsh|fish sets up Tab."])
 
 
-def table() -> Table:
-    """Return the keys of all tools and components."""
-    from saunet.cli.table import read
+def run(name: str, argv: Sequence[str]) -> None:
+    """Run a tool with the words of a command line; ends in `SystemExit` with the code, unless all went well.
 
-    return read({name: tool.options for name, tool in TOOLS.items() if tool.options})
-
-
-def resumed(words: Sequence[str]) -> list[str]:
-    """Return the command line that continues a run: the run's own, from its last checkpoint, in its folder.
-
-    Args:
-        words: The run's folder, and what shall differ.
-
-    Raises:
-        ConfigError: if that is no run's folder.
-    """
-    from saunet.runs.folder import read
-
-    folder = Path(words[0]).absolute() if words else Path()
-    content = read(folder) if words else {}
-    if not content:
-        raise ConfigError(
-            f"saunet resume takes the folder of a run, with its run.json; got {' '.join(words) or 'none'}"
-        )
-    again = [word for word in content.get("overrides", []) if not word.startswith(("resume=", "init_from="))]
-    return [*again, f"resume={folder / 'checkpoints' / 'last.ckpt'}", f"hydra.run.dir='{folder}'", *words[1:]]
-
-
-def run(name: str, argv: Sequence[str], read: Callable[[Sequence[str]], Sequence[str]] = list) -> None:
-    """Run a tool with the words of a command line.
-
-    Args:
-        name: The tool.
-        argv: The words.
-        read: What makes them the tool's own.
-
-    Raises:
-        SystemExit: with the exit code, unless all went well.
+    What a user can mend is said in one sentence; only a defect of the program shows a traceback.
+    ``HYDRA_FULL_ERROR=1`` shows it always.
     """
     try:
-        code = _run(name, read(argv))
+        code = _run(name, argv)
     except KeyboardInterrupt:
         code = _say(name, "interrupted", 130)
     except SystemExit as stop:  # a run that was asked to stop says how to resume
@@ -282,7 +108,7 @@ def run(name: str, argv: Sequence[str], read: Callable[[Sequence[str]], Sequence
 
         # A process that DDP started inherits the variable.
         debug = os.environ.get("HYDRA_FULL_ERROR") == "1" and "LOCAL_RANK" not in os.environ
-        said = None if debug else sentence(error, None if isinstance(error, SaunetError) else table())
+        said = None if debug else sentence(error, None if isinstance(error, SaunetError) else read())
         if said is None:
             raise
         code = _say(name, said, 1)
@@ -290,106 +116,282 @@ def run(name: str, argv: Sequence[str], read: Callable[[Sequence[str]], Sequence
         raise SystemExit(code)
 
 
+def _say(name: str, message: str, code: int) -> int:
+    print(f"saunet {name}: {message}", file=sys.stderr)
+    return code
+
+
 def _run(name: str, argv: Sequence[str]) -> int:
-    from saunet.cli import compose, words
+    from saunet.cli import help as help_
 
-    tool, conf = TOOLS[name], config_dir()
+    if name.startswith("--"):
+        print("\n".join((help_.complete if name == "--complete" else help_.completion)(argv[0] if argv else "")))
+        return 0
+    if name == "resume":
+        name, argv = "train", resumed(argv)
+    tool = TOOLS[name]
     argv = [tool.words.get(argv[0], argv[0]), *argv[1:]] if argv else []
-    if not tool.options:
-        from saunet.cli.table import imported
-
-        sys.argv[1:] = argv  # it reads them itself
-        imported(tool.function)()
+    if tool.options is None:  # it reads its words itself
+        imported(tool.function)(argv)
         return 0
-    plugins.load(words.named(argv))
-    keys = table()
-    line = words.overrides(argv, name, keys, tool.positional, tool.aliases, conf)
-    flags = line.flags
+    plugins.load(named_plugins(argv))
+    table = read()
+    flags, overrides = read_words(argv, tool, table)
     if flags.help:
-        from saunet.cli.help import tool_help
-
-        print(tool_help(name, tool, keys, words.choices(line.overrides)))
+        print(help_.tool_help(tool, table, choices(overrides)))
         return 0
-    config, overrides = flags.config_name or tool.config or name, [*tool.preset, *line.overrides]
-    with compose.hydra(name, tool.config or name, keys, conf, flags.config_dir) as hydra:
+    from saunet.cli import compose
+
+    config, given = flags.config_name or tool.config or name, [*tool.preset, *overrides]
+    with compose.hydra(tool, table, flags.config_dir) as hydra:
         if flags.cfg:
-            hydra.show_cfg(config, overrides, flags.cfg, flags.package, flags.resolve)
+            hydra.show_cfg(config, given, flags.cfg, flags.package, flags.resolve)
             return 0
         if flags.info:
-            hydra.show_info(flags.info, config, overrides)
+            hydra.show_info(flags.info, config, given)
             return 0
-        composed = None if flags.multirun else compose.single(hydra, config, overrides)
+        composed = None if flags.multirun else compose.single(hydra, config, given)
         if composed is None:
-            from saunet.cli.sweeps import sweep
-
-            return sweep(hydra, config, [*overrides, "hydra.mode=MULTIRUN"], functools.partial(job, name))
+            return compose.sweep(hydra, config, [*given, "hydra.mode=MULTIRUN"], functools.partial(job, name))
     # What starts further processes runs this command again, with the same folder.
-    sys.argv[1:] = [name, *line.again, f"hydra.run.dir='{composed.folder}'"]
-    return call(name, composed, keys)[0]
+    kept = {"--config-dir": flags.config_dir, "--config-name": flags.config_name}
+    again = [*overrides, *(f"{option}={value}" for option, value in kept.items() if value)]
+    sys.argv[1:] = [name, *again, f"hydra.run.dir='{composed.folder}'"]
+    return call(name, composed, table)[0]
 
 
-def call(name: str, composed: Composed, keys: Table) -> tuple[int, object]:
-    """Call a tool's function and print what it returns.
+def resumed(words: Sequence[str]) -> list[str]:
+    """Return the command line that continues a run from its last checkpoint, given its folder and what shall differ."""
+    from saunet.runs import folder as runs
 
-    Returns:
-        The exit code, and the result.
-    """
+    folder = Path(words[0]).absolute() if words else Path()
+    content = runs.read(folder) if words else {}
+    if not content:
+        given = " ".join(words) or "none"
+        raise ConfigError(f"saunet resume takes the folder of a run, with its run.json; got {given}")
+    again = [word for word in content.get("overrides", []) if not word.startswith(("resume=", "init_from="))]
+    return [*again, f"resume={folder / 'checkpoints' / 'last.ckpt'}", f"hydra.run.dir='{folder}'", *words[1:]]
+
+
+def call(name: str, composed: Composed, table: Table) -> tuple[int, object]:
+    """Call a tool's function, print what it returns, and return the exit code and the result."""
     from saunet.cli import compose
     from saunet.cli.errors import sentence
     from saunet.cli.log import quiet
-    from saunet.cli.table import imported
 
-    tool = TOOLS[name]
-    options = compose.options(imported(tool.options), composed, keys)
+    made, called = map(imported, TOOLS[name].paths())
+    options = compose.options(made, composed, table)
     record = {"choices": composed.choices, "overrides": composed.overrides, "describe": sentence}
-    function = imported(tool.function)
+    wanted = inspect.signature(called).parameters
     quiet()
-    result = function(options, **(record if tool.recorded else {}))
+    result = called(options, **{key: value for key, value in record.items() if key in wanted})
     if isinstance(result, Shown):
         result.show()
-    elif result is not None and not tool.recorded:
+    elif result is not None and "describe" not in wanted:
         print(result)
     if isinstance(result, Partial):
         for failure in result.failures:
-            print(f"saunet {name}: {failure}", file=sys.stderr)
+            _say(name, failure, 1)
     return (result.exit_code if isinstance(result, Graded) else 0), result
 
 
 def job(name: str, raising: bool, cfg: DictConfig) -> object:
-    """Do one job of a sweep, perhaps in another process; what goes wrong is said at once and ends this job only.
+    """Do one job of a sweep, perhaps in another process, and return what a search minimizes.
 
-    Returns:
-        What a search minimizes, where the result has a ``cost``.
+    What goes wrong is said at once and ends this job only.
     """
     from hydra.core.hydra_config import HydraConfig
 
     from saunet.cli import compose
     from saunet.cli.errors import sentence
-    from saunet.cli.sweeps import Failed, check_job
 
     hydra, own = HydraConfig.get(), False
+    _say(name, f"job {hydra.job.num}: {hydra.job.override_dirname}", 0)
     try:
         plugins.load(cfg.plugins)
-        keys = table()
         composed = compose.of_job(cfg, cast("DictConfig", hydra))
-        check_job(composed.config, composed.folder)
+        compose.check_job(composed.config, composed.folder)
         own = True
-        code, result = call(name, composed, keys)
+        code, result = call(name, composed, read())
         if code:
             raise ConfigError("some of it failed")
     except Exception as error:
-        if own and TOOLS[name].recorded:
+        if own and "describe" in inspect.signature(imported(TOOLS[name].paths()[1])).parameters:
             from saunet.runs.folder import record_failed_start
 
             record_failed_start(composed.folder, name, error, sentence, overrides=list(composed.overrides))
         reason = sentence(error) or f"{type(error).__name__}: {error}"
-        print(f"saunet {name}: job {hydra.job.num} ({hydra.job.override_dirname}) failed: {reason}", file=sys.stderr)
+        _say(name, f"job {hydra.job.num} ({hydra.job.override_dirname}) failed: {reason}", 1)
         if raising:
             raise
-        return Failed()
+        return compose.Failed()
     return result.cost if isinstance(result, Costed) else None
 
 
-def _say(name: str, message: str, code: int) -> int:
-    print(f"saunet {name}: {message}", file=sys.stderr)
-    return code
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message}; see --help")
+
+
+def split(words: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Return Hydra's options and the other words."""
+    parser = _Parser(add_help=False, allow_abbrev=False)
+    for names in (("-h", "--help"), ("-m", "--multirun"), ("--resolve",), ("-r", "--run")):
+        parser.add_argument(*names, action="store_true")
+    for names in (("-p", "--package"), ("-cd", "--config-dir"), ("-cn", "--config-name")):
+        parser.add_argument(*names)
+    parser.add_argument("-c", "--cfg", choices=["job", "hydra", "all"])
+    parser.add_argument("-i", "--info", nargs="?", const="all")
+    flags, rest = parser.parse_known_args(words)
+    for word, following in zip(rest, [*rest[1:], "VALUE"], strict=False):
+        if word.startswith("-") and not _OVERRIDE.fullmatch(word) and not re.fullmatch(r"-[\d.]+", word):
+            key = word.lstrip("-").replace("-", "_")
+            said = key if "=" in key else f"{key}={following}"
+            raise ConfigError(f"there is no option {word}; settings are written without dashes: {said}")
+    return flags, rest
+
+
+def choices(overrides: Sequence[str]) -> dict[str, str]:
+    """Return what overrides choose: ``{"data": "kitti"}`` for ``data=kitti``."""
+    found = (_OVERRIDE.fullmatch(word) for word in overrides)
+    return {each["key"]: each["value"] for each in found if each and "." not in each["key"]}
+
+
+def named_plugins(words: Sequence[str]) -> list[str]:
+    """Return the plugins that a command line names, which have to be imported before the rest is understood."""
+    given = [word.partition("=")[2] for word in words if word.lstrip("+").startswith(f"{PLUGINS.name}=")]
+    lists = (value[1:-1] if value.startswith("[") and value.endswith("]") else value for value in given)
+    return [item.strip().strip("'\"") for each in lists for item in _parts(each)]
+
+
+def read_words(
+    words: Sequence[str], tool: Tool, table: Table, conf: Path | None = None
+) -> tuple[argparse.Namespace, list[str]]:
+    """Return Hydra's options and, in its grammar, the overrides among the words after ``saunet TOOL``.
+
+    ``conf`` has the YAML files that ``experiment=glob(table3/*)`` sees, where they are not the usual ones.
+    """
+    flags, rest = split(words)
+    sweeping = flags.multirun or any(word.startswith(("sweep=", "hydra.mode=MULTIRUN")) for word in rest)
+    own = flags.config_dir is None and flags.config_name is None
+    return flags, _Reader(tool, table, sweeping, own, conf or config_dir()).overrides(rest)
+
+
+@dataclass(frozen=True)
+class _Reader:
+    tool: Tool
+    table: Table
+    sweeping: bool
+    own: bool
+    """Whether all YAML files are ours, so that a key that they do not have is a mistake: told before Hydra starts."""
+    conf: Path
+
+    def overrides(self, words: Sequence[str]) -> list[str]:
+        made, plain = [], []
+        for word in words:
+            found = _OVERRIDE.fullmatch(word)
+            if found is None and word.startswith("~"):
+                made.append(word)
+            elif found is None or (self.tool.positional and not self._is_key(found["key"]) and Path(word).exists()):
+                plain.append(word)
+            else:
+                key = self.tool.aliases.get(found["key"], found["key"])
+                made += self._override(found["sign"], key, found["value"])
+        return [*made, *self._positional(plain, words)]
+
+    def _is_key(self, key: str) -> bool:
+        first = re.split(r"[./@]", key)[0]
+        return first == "hydra" or bool(self.table.known(self.tool.name, first)) or (self.conf / first).is_dir()
+
+    def _positional(self, plain: Sequence[str], words: Sequence[str]) -> list[str]:
+        if not plain:
+            return []
+        key = self.tool.positional
+        if not key or (len(plain) > 1 and not key.endswith("*")):
+            raise ConfigError(f"'{plain[-1]}' is not KEY=VALUE; see `saunet {self.tool.name} --help` for the keys")
+        name = key.rstrip("*")
+        if any(word.startswith(f"{name}=") for word in words):
+            raise ConfigError(f"{name} is given twice, as {name}=... and as {plain[0]}; leave out one")
+        quoted = ",".join(map(_quoted, plain))
+        return [f"{name}=[{quoted}]" if key.endswith("*") else f"{name}={quoted}"]
+
+    def _override(self, sign: str, key: str, value: str) -> list[str]:
+        own = self.table.tools[self.tool.name]
+        if glob := _GLOB.fullmatch(value):
+            return [f"{sign}{key}={','.join(self._matching(key, glob['pattern']))}"]
+        if self.own and not sign and key != "size" and not self._is_key(key):
+            raise unknown(key, [each.name for each in own.keys])
+        size = re.fullmatch(r"(\d+)x(\d+)", value) if key == "size" and own.key("size") is None else None
+        if size:  # of images, height x width
+            return [f"data.height={size[1]}", f"data.width={size[2]}"]
+        if key == "data" and own.key("data") and self._is_path(value):
+            return [f"{sign}data=video", f"data.root={self._meant(value, 'str')}"]
+        group = key.replace(".", "/")
+        if "." in key and value in self.table.groups.get(group, {}):
+            raise ConfigError(f"{key}={value} sets a value; choose a component with a slash: {group}={value}")
+        return [f"{sign}{key}={self._meant(value, self.table.type(self.tool.name, key).rstrip('?'))}"]
+
+    def _is_path(self, value: str) -> bool:
+        """Return whether ``data=`` names a video or a folder instead of a data module."""
+        return value not in self.table.choices("data") and "${" not in value and ("/" in value or Path(value).exists())
+
+    def _meant(self, value: str, kind: str) -> str:
+        """Return a value as Hydra reads it back unchanged, for a key of this type."""
+        if value in ("", "null", "???") or "${" in value or _FUNCTION.fullmatch(value):
+            return value
+        parts = _parts(value) if self.sweeping else [value]
+        if kind == "str":
+            return ",".join(map(_quoted, parts))
+        return ",".join(_list(each, kind) for each in parts) if kind.startswith("list[") else value
+
+    def _matching(self, group: str, pattern: str) -> list[str]:
+        """Return the names below a group that a pattern matches; Hydra's own glob sees the files of one folder only."""
+        folder = self.conf / group
+        names = sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
+        matching = fnmatch.filter(names, pattern)
+        if not matching:
+            raise ConfigError(f"{group}=glob({pattern}) matches none of: {', '.join(names) or 'no files'}")
+        return matching
+
+
+def _list(value: str, kind: str) -> str:
+    if value.startswith("[") and value.endswith("]"):
+        items = _parts(value[1:-1])
+    else:
+        items = [value] if Path(value).exists() else _parts(value)
+    return f"[{','.join(_quoted(item.strip()) if kind.startswith('list[str') else item for item in items)}]"
+
+
+def _quoted(text: str) -> str:
+    """Return text in quotes, where Hydra would read it as something else without."""
+    if len(text) > 1 and text[0] in "'\"" and text[-1] == text[0]:
+        return text
+    if (_PLAIN.fullmatch(text) and not _NOT_TEXT.fullmatch(text)) or "${" in text:
+        return text
+    escaped = re.sub(r"(\\*)'", lambda quote: quote[1] * 2 + "\\'", text)
+    trailing = len(escaped) - len(escaped.rstrip("\\"))
+    return f"'{escaped}{chr(92) * trailing}'"
+
+
+def _parts(text: str) -> list[str]:
+    """Split at the commas outside of quotes and brackets."""
+    parts, depth, quote = [""], 0, ""
+    for index, char in enumerate(text):
+        if quote:
+            quote = "" if char == quote and text[index - 1] != "\\" else quote
+        elif char in "'\"":
+            quote = char
+        elif char in "[{(":
+            depth += 1
+        elif char in "]})":
+            depth -= 1
+        elif char == "," and depth == 0:
+            parts.append("")
+            continue
+        parts[-1] += char
+    return parts if text else []
+
+
+def unknown(key: str, known: Sequence[str]) -> ConfigError:
+    """Return the error for an unknown key, with the nearest one and all."""
+    return ConfigError(f"unknown key '{key}'{suggest(key, known) or ';'} allowed: {', '.join(known)}")

@@ -1,32 +1,44 @@
 """Hydra and nothing else: a tool's configuration, composed and checked by type, becomes the tool's options.
 
-Nothing is written here: Hydra's own run folder appears with the first file that a tool writes, after its checks.
+Nothing is written for a single run: its folder appears with the first file that a tool writes, after its checks. In a
+sweep each job has its folder, one failed job costs no other, and at the end every failure is named.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import logging
+import sys
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Optional, TypeVar, Union
+from typing import TypeVar, Union
 
+import yaml
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra._internal.hydra import Hydra
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
 from hydra.core.utils import configure_log, setup_globals
+from hydra.plugins.config_source import ConfigResult
 from hydra.types import RunMode
 from hydra.version import setbase
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf._utils import get_yaml_loader
 
 from saunet import schema
-from saunet.cli import words
-from saunet.cli.table import Table
+from saunet.cli.app import unknown
+from saunet.cli.table import PLUGINS, TOOLS, TRAINER, Table, Tool, config_dir, read
 from saunet.errors import ConfigError, one_of
 from saunet.registry import Spec
 
@@ -34,108 +46,111 @@ T = TypeVar("T")
 PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "predictions", "resume", "root")
 """Options that name files or folders."""
 _CONVERTED = (tuple, Sequence, Mapping, typing.Literal)
-_TYPES: Mapping[str, object] = {"bool": bool, "int": int, "float": float, "str": str}
 
 
 @contextmanager
-def hydra(tool: str, root: str, table: Table, conf: Path, extra: str | None = None) -> Iterator[Hydra]:
-    """Give Hydra, knowing the keys of a tool and of all components.
-
-    Args:
-        tool: The tool.
-        root: Name of its root config.
-        table: All config keys.
-        conf: The folder of the YAML files.
-        extra: Another folder of YAML files, which comes first.
-
-    Raises:
-        ConfigError: if there is no such folder.
-    """
-    register(table, {root: tool})
+def hydra(tool: Tool, table: Table, extra: str | None = None) -> Iterator[Hydra]:
+    """Give Hydra, knowing the keys of a tool and of all components; an extra folder of YAML files comes first."""
+    _register(table, [tool])
     setbase("1.3")
     setup_globals()
-    path = create_config_search_path(str(conf))
+    path = create_config_search_path(str(config_dir()))
     if extra is not None:
         if not Path(extra).is_dir():
             raise ConfigError(f"--config-dir is {extra}, which is no folder; check the path")
         first = f"file://{Path(extra).resolve()}"
         path.prepend(provider="command-line", path=first, anchor=SearchPathQuery(provider="schema"))
     GlobalHydra.instance().clear()
+    Plugins.instance()  # which registers the sources, of which ours replaces one
+    sources = SourcesRegistry.instance().types
+    usual = sources["file"]
+    sources["file"] = _source(tool.name, table)
     try:
-        yield Hydra.create_main_hydra2(task_name=tool, config_search_path=path)
+        yield Hydra.create_main_hydra2(task_name=tool.name, config_search_path=path)
     finally:
+        sources["file"] = usual
         GlobalHydra.instance().clear()
 
 
-def register(table: Table, roots: Mapping[str, str]) -> None:
-    """Give Hydra the typed keys of tools and of all components.
+def _source(tool: str, table: Table) -> type[FileConfigSource]:
+    """Return what reads YAML files: text as it was written, where YAML would see a number in ``2024_05_01``."""
 
-    Args:
-        table: All config keys.
-        roots: Root config -> the tool whose keys it has.
-    """
+    def keep_text(node: yaml.Node, key: str) -> None:
+        if isinstance(node, yaml.MappingNode):
+            for name, value in node.value:
+                keep_text(value, f"{key}.{name.value}" if key else name.value)
+        elif isinstance(node, yaml.SequenceNode):
+            for each in node.value:
+                keep_text(each, key)
+        elif not node.tag.endswith(":null") and table.type(tool, key).rstrip("?") in ("str", "list[str]"):
+            node.tag = "tag:yaml.org,2002:str"
+
+    class Source(FileConfigSource):
+        def load_config(self, config_path: str) -> ConfigResult:
+            found = super().load_config(config_path)
+            loader = get_yaml_loader()(Path(self.path, self._normalize_file_name(config_path)).read_text("utf-8"))
+            root = loader.get_single_node()
+            if root is not None:
+                package = found.header.get("package") or config_path.rpartition("/")[0].replace("/", ".")
+                keep_text(root, "" if package == "_global_" else package)
+                found.config = OmegaConf.create(loader.construct_document(root))
+            return found
+
+    return Source
+
+
+def register_configs() -> None:
+    """Give Hydra the typed keys of all tools and components, for ``hydra.compose``."""
+    _register(read(), [tool for tool in TOOLS.values() if tool.options is not None])
+
+
+def _register(table: Table, tools: Sequence[Tool]) -> None:
     store = ConfigStore.instance()
-    for root, tool in roots.items():
-        node = table.tools[tool]
-        # A group's members bring the types of its keys.
-        keys = [dataclasses.replace(key, type="any") if key.name in table.library else key for key in node.keys]
-        store.store(name=f"{root}_schema", node=structured(dataclasses.replace(node, keys=(*keys, words.PLUGINS))))
-    for group, nodes in table.groups().items():
+    for tool in tools:
+        node = table.tools[tool.name]
+        # The trainer group's members bring the types of its keys.
+        keys = (dataclasses.replace(key, type="any") if key.name == TRAINER[0] else key for key in node.keys)
+        made = structured(dataclasses.replace(node, keys=tuple(keys)))
+        store.store(name=f"{tool.config or tool.name}_schema", node=made)
+    for group, nodes in table.groups.items():
         for name, each in nodes.items():
             store.store(group=group, name=name, node=structured(each))
+    for name, each in table.components["model"].items():  # a choice of choices
+        parts = [{key.name: key.default} for key in each.keys if f"model/{key.name}" in table.groups]
+        rest = {key.name: key.default for key in each.keys if f"model/{key.name}" not in table.groups}
+        store.store(group="model", name=name, node={"defaults": parts, **rest})
 
 
 def structured(node: schema.Node) -> type:
     """Return the dataclass by which OmegaConf checks a node's keys and types."""
     fields: list[tuple[str, object, object]] = []
     if node.path is not None:
-        fields += [
-            ("_target_", str, dataclasses.field(default=node.path)),
-            ("_convert_", str, dataclasses.field(default="all")),
-        ]
+        fields += [("_target_", str, node.path), ("_convert_", str, "all")]
     if node.partial:
-        fields.append(("_partial_", bool, dataclasses.field(default=True)))
+        fields.append(("_partial_", bool, True))
     for key in node.keys:
         if key.node is not None:
             made = structured(key.node)
             fields.append((key.name, made, dataclasses.field(default_factory=made)))
+        elif isinstance(key.default, list | dict):
+            fields.append((key.name, schema.python_type(key.type), dataclasses.field(default_factory=key.default.copy)))
         else:
-            fields.append((key.name, _python(key.type), _field(key.default)))
+            fields.append((key.name, schema.python_type(key.type), key.default))
     return dataclasses.make_dataclass(node.name, fields)
-
-
-def _python(name: str) -> object:
-    """Return the type that OmegaConf checks for a `saunet.schema.Key.type`."""
-    if name.endswith("?"):
-        return Optional[_python(name[:-1])]  # noqa: UP045 (OmegaConf wants the typing form)
-    kind, _, item = name.partition("[")
-    if kind in ("list", "dict"):
-        inner = _python(item[:-1])
-        return list[inner] if kind == "list" else dict[str, inner]  # type: ignore[valid-type]
-    return _TYPES.get(name, typing.Any)
-
-
-def _field(default: object) -> object:
-    if isinstance(default, list | dict):
-        return dataclasses.field(default_factory=default.copy)
-    return dataclasses.field(default=default)
 
 
 @dataclasses.dataclass(frozen=True)
 class Composed:
-    """A tool's configuration.
-
-    Args:
-        config: As plain data, resolved.
-        choices: Config group -> what was chosen.
-        overrides: What the command line said.
-        folder: The run's folder as ``hydra.run.dir`` says, not made yet.
-    """
+    """A tool's configuration."""
 
     config: Mapping[str, object]
+    """As plain data, resolved."""
     choices: Mapping[str, str | None]
+    """Config group -> what was chosen."""
     overrides: tuple[str, ...]
+    """What the command line said."""
     folder: str
+    """The run's folder as ``hydra.run.dir`` says, not made yet."""
 
 
 def single(hydra: Hydra, name: str, overrides: list[str]) -> Composed | None:
@@ -166,83 +181,35 @@ def single(hydra: Hydra, name: str, overrides: list[str]) -> Composed | None:
 
 
 def of_job(cfg: DictConfig, hydra_cfg: DictConfig) -> Composed:
-    """Return what a job of a sweep, or a single run, is to do.
-
-    Raises:
-        ConfigError: if a value is missing.
-    """
+    """Return what a job of a sweep, or a single run, is to do."""
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
         needed = " ".join(f"{key}=..." for key in missing)
         raise ConfigError(f"{missing[0]} is not set; add {needed} to the command line")
+    choices, overrides = _plain(hydra_cfg.runtime.choices), tuple(hydra_cfg.overrides.task)
+    chosen = {group: None if name is None else str(name) for group, name in choices.items()}
+    return Composed(_plain(cfg), chosen, overrides, str(hydra_cfg.runtime.output_dir))
+
+
+def _plain(cfg: DictConfig) -> dict[str, object]:
     plain = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
-    choices = OmegaConf.to_container(hydra_cfg.runtime.choices, resolve=True)
-    assert isinstance(choices, dict)
-    return Composed(
-        {str(key): value for key, value in plain.items()},
-        {str(key): value for key, value in choices.items()},
-        tuple(hydra_cfg.overrides.task),
-        str(hydra_cfg.runtime.output_dir),
-    )
+    return {str(key): value for key, value in plain.items()}
 
 
 def options(cls: Callable[..., T], composed: Composed, table: Table) -> T:
-    """Build a tool's options.
-
-    Raises:
-        ConfigError: for a key that nobody reads, or a value that the options refuse.
-    """
-    given = {key: value for key, value in composed.config.items() if key != words.PLUGINS.name}
+    """Build a tool's options; a key that nobody reads is an error."""
+    given = {key: value for key, value in composed.config.items() if key != PLUGINS.name}
     _check(given, "", table)
     for key in PATHS:
         if given.get(key) == "":
             raise ConfigError(f"{key}= is empty, perhaps from a shell variable that is not set; name a path")
-    for key in ("checkpoint", "init_from", "resume"):
-        if key in given:
-            given[key] = _checkpoint(given[key], ("last",) if key == "resume" else ("best", "last"))
-    return _build(cls, given, composed, table, "")
-
-
-def _checkpoint(given: object, names: Sequence[str]) -> object:
-    """Return the checkpoint in a run's folder; what is no such folder stays as it is."""
-    files = [Path(str(given)).expanduser() / "checkpoints" / f"{name}.ckpt" for name in names]
-    return next((str(file) for file in files if given and file.is_file()), given)
-
-
-def _build(cls: Callable[..., T], given: Mapping[str, object], composed: Composed, table: Table, prefix: str) -> T:
-    hints = typing.get_type_hints(cls)
-    fields = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]  # a dataclass
-    for key in given:
-        if key not in fields:
-            raise ConfigError(words.nearest(f"{prefix}{key}", [f"{prefix}{name}" for name in fields]))
-    made = {key: _value(hints[key], value, composed, table, f"{prefix}{key}") for key, value in given.items()}
-    return cls(**made)
-
-
-def _value(annotation: object, value: object, composed: Composed, table: Table, key: str) -> object:
-    if value is None:
-        return None
-    if typing.get_origin(annotation) in (Union, types.UnionType):
-        for each in typing.get_args(annotation):
-            if each is Spec or dataclasses.is_dataclass(each) or typing.get_origin(each) in _CONVERTED:
-                return _value(each, value, composed, table, key)
-    if annotation is Spec:
-        assert isinstance(value, Mapping)
-        return Spec(value, composed.choices.get(key.replace(".", "/")))
-    if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
-        assert isinstance(value, Mapping)
-        return _build(annotation, value, composed, table, f"{key}.")
-    if isinstance(value, Mapping) and key in table.library:  # a config group of arguments
-        return {name: each for name, each in value.items() if not str(name).startswith("_")}
-    if typing.get_origin(annotation) is typing.Literal:
-        return one_of(key, str(value), typing.get_args(annotation))
-    if annotation is Path:
-        return Path(str(value))
-    if isinstance(value, list) and typing.get_origin(annotation) in (tuple, Sequence):
-        item, *_ = typing.get_args(annotation)
-        return tuple(_value(item, each, composed, table, key) for each in value)
-    return value
+    for key, names in (("checkpoint", ("best", "last")), ("init_from", ("best", "last")), ("resume", ("last",))):
+        if given.get(key):  # a run's folder stands for the checkpoint in it
+            folder = Path(str(given[key])).expanduser() / "checkpoints"
+            files = [folder / f"{name}.ckpt" for name in names]
+            given[key] = next((str(file) for file in files if file.is_file()), given[key])
+    return _build(cls, given, composed.choices, "")
 
 
 def _check(given: Mapping[str, object], prefix: str, table: Table) -> None:
@@ -251,6 +218,122 @@ def _check(given: Mapping[str, object], prefix: str, table: Table) -> None:
     known = [key.name for key in node.keys] if node else []
     for key, value in given.items():
         if node and key not in known and not key.startswith("_"):
-            raise ConfigError(words.nearest(f"{prefix}{key}", [f"{prefix}{name}" for name in known]))
+            raise unknown(f"{prefix}{key}", [f"{prefix}{name}" for name in known])
         if isinstance(value, Mapping):
             _check(value, f"{prefix}{key}.", table)
+
+
+def _build(cls: Callable[..., T], given: Mapping[str, object], choices: Mapping[str, str | None], prefix: str) -> T:
+    hints = typing.get_type_hints(cls)
+    fields = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]  # a dataclass
+    for key in given:
+        if key not in fields:
+            raise unknown(f"{prefix}{key}", [f"{prefix}{name}" for name in fields])
+    return cls(**{key: _value(hints[key], value, choices, f"{prefix}{key}") for key, value in given.items()})
+
+
+def _value(annotation: object, value: object, choices: Mapping[str, str | None], key: str) -> object:
+    """Return what the options' annotation asks for: a `Spec`, nested options, a path, a tuple, or the value itself."""
+    origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
+    if value is None:
+        return None
+    if origin in (Union, types.UnionType):
+        for each in inner:
+            if each is Spec or dataclasses.is_dataclass(each) or typing.get_origin(each) in _CONVERTED:
+                return _value(each, value, choices, key)
+    if isinstance(value, Mapping):
+        if annotation is Spec:
+            return Spec(value, choices.get(key.replace(".", "/")))
+        if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
+            return _build(annotation, value, choices, f"{key}.")
+        if key == TRAINER[0]:  # a config group of arguments
+            return {name: each for name, each in value.items() if not str(name).startswith("_")}
+    if origin is typing.Literal:
+        return one_of(key, str(value), inner)
+    if annotation is Path:
+        return Path(str(value))
+    if isinstance(value, list) and origin in (tuple, Sequence):
+        return tuple(_value(inner[0], each, choices, key) for each in value)
+    return value
+
+
+class Failed:
+    """What a job returns that failed and said so."""
+
+
+def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[bool, DictConfig], object]) -> int:
+    """Run a job for each combination of the values given, and return the exit code.
+
+    A job's task is given whether it raises what goes wrong, as a search wants it, and its configuration.
+    """
+    from saunet.runs.folder import FILE
+    from saunet.runs.sweep import PLAN, summary, write_plan
+
+    # Each job names itself instead.
+    logging.getLogger("hydra._internal.core_plugins.basic_launcher").setLevel(logging.WARNING)
+    cfg = hydra.compose_config(name, overrides, RunMode.MULTIRUN)
+    HydraConfig.instance().set_config(cfg)
+    folder = Path(str(OmegaConf.select(cfg, "hydra.sweep.dir"))).absolute()
+    planned = _planned(cfg)
+    HydraConfig.instance().cfg = None
+    if planned:
+        write_plan(folder, planned)
+    ended: BaseException | None = None
+    try:
+        returned = hydra.multirun(name, functools.partial(task, not planned), overrides)
+        jobs = [job for batch in returned for job in batch] if planned else []
+        code = 1 if any(isinstance(job.return_value, Failed) for job in jobs) else 0
+    except (Exception, KeyboardInterrupt, SystemExit) as error:
+        ended, code = error, 130 if isinstance(error, KeyboardInterrupt) else 1
+    if isinstance(ended, Exception) and not any(folder.glob("**/.hydra")):  # no job was started
+        for file in (PLAN, "multirun.yaml"):
+            (folder / file).unlink(missing_ok=True)
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+        raise ended
+    if any(folder.glob(f"**/{FILE}")):
+        text, finished = summary(folder, planned)
+    else:  # of a tool that keeps no record of a run
+        finished = code == 0
+        text = f"sweep: {len(planned) if finished else 'not all'} jobs finished; results: {folder}"
+    print(text, file=sys.stdout if finished else sys.stderr)
+    if isinstance(ended, SystemExit):  # a training that was asked to stop says how to resume
+        raise ended
+    return 0 if finished else code or 1
+
+
+def _planned(cfg: DictConfig) -> list[list[str]]:
+    """Return the overrides of every job; none if another sweeper than Hydra's own chooses them."""
+    if "BasicSweeper" not in cfg.hydra.sweeper._target_:
+        return []
+    params = [f"{key}={value}" for key, value in (cfg.hydra.sweeper.params or {}).items()]
+    # Unresolved: some refer to a job, and there is none now.
+    given = OmegaConf.to_container(cfg.hydra.overrides.task, resolve=False)
+    assert isinstance(given, list)
+    parsed = OverridesParser.create().parse_overrides([*params, *map(str, given)])
+    return [list(job) for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]
+
+
+def check_job(config: Mapping[str, object], job: str) -> None:
+    """Check that a job writes into the folder that the sweep gave it alone, and does not start the sweep once more."""
+    folder = config.get("output_dir")
+    if folder:  # an empty one is refused below
+        given, own = Path(str(folder)).resolve(), Path(job).resolve()
+        if own != given and own not in given.parents:
+            raise ConfigError(
+                f"output_dir is '{folder}' and the jobs of a sweep must not share a folder; "
+                f"leave it out and set hydra.sweep.dir={folder}, below which each job gets its own"
+            )
+    trainer = config.get("trainer")
+    if isinstance(trainer, Mapping) and _replays(trainer):
+        raise ConfigError(
+            "--multirun with several processes per job would replay the whole sweep on every process; "
+            "use one process per job, or start each training with a command of its own, such as in a shell loop"
+        )
+
+
+def _replays(trainer: Mapping[str, object]) -> bool:
+    """Return whether a trainer will start further processes by running this command again."""
+    strategy = str(trainer.get("strategy", "auto")).lower()  # a name, or a node with a _target_
+    several = str(trainer.get("devices", 1)) not in ("1", "[0]", "auto") or trainer.get("num_nodes", 1) not in (1, None)
+    return several or any(kind in strategy for kind in ("ddp", "fsdp", "deepspeed"))

@@ -46,24 +46,13 @@ def demo(
 
 
 def draw(predictor: Predictor, drive: Drive, folder: Path) -> None:
-    """Write ``depth.png`` (a few frames with truth and error) and ``depth.mp4`` (the whole drive).
-
-    Args:
-        predictor: A `saunet.prediction.predictor.Predictor`.
-        drive: A `saunet.data.drive.Drive` with true depth.
-        folder: Where the files go.
-    """
-    frames = list(drive.indices)
-    chosen = [frames[round(place)] for place in np.linspace(0, len(frames) - 1, PICTURES + 2)[1:-1]]
-    panels = []
-    for frame in chosen:
+    """Write ``depth.png`` (a few frames with truth and error) and ``depth.mp4`` (the whole drive, which has depth)."""
+    frames, panels = list(drive.indices), []
+    for place in np.linspace(0, len(frames) - 1, PICTURES + 2)[1:-1]:
+        frame = frames[round(place)]
         prediction = predictor.predict(drive.image(frame))
         panels.append(depth_panel(prediction.image, prediction.disparity, drive.depth(frame), tile_width=384))
     write_image(folder / "depth.png", np.concatenate(panels, axis=1))
-    options = PredictOptions(
-        checkpoint=folder / "checkpoints" / "best.ckpt",
-        input=(drive.image(frame) for frame in frames),
-        output=folder,
-        overwrite=True,
-    )
+    best, images = folder / "checkpoints" / "best.ckpt", (drive.image(frame) for frame in frames)
+    options = PredictOptions(checkpoint=best, input=images, output=folder, overwrite=True)
     predict(options, predictor).clips[0].replace(folder / "depth.mp4")

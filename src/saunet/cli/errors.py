@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import re
 
-from saunet.cli.table import Table
+from saunet.cli.table import HIDDEN, Table
 from saunet.errors import SaunetError, suggest
-
-HIDDEN = ("base", "lightning")
-"""Members of config groups that others build on and nobody chooses."""
 
 
 def sentence(error: BaseException, table: Table | None = None) -> str | None:
-    """Return one sentence; None for a defect of the program.
-
-    Args:
-        error: What was raised.
-        table: Config keys, for the names that are allowed.
-    """
-    cause = error.__cause__
+    """Return one sentence; None for a defect of the program. The table has the keys that are allowed."""
+    cause, kind = error.__cause__, type(error).__name__  # by name: nothing is imported for its errors
     text = f"{error}\n{cause or ''}"
     if isinstance(error, SaunetError):
         return str(error)
-    if type(error).__name__ == "OutOfMemoryError":  # torch's, which is not imported for its name
+    if kind == "OutOfMemoryError":
         return "the GPU's memory is too small for this; lower the batch size (in training data.batch_size) or the size"
     if "Config group override must be a string or a list" in text:
         return "a group of the config cannot be null; choose logger=none, or set single members to null"
@@ -35,41 +27,36 @@ def sentence(error: BaseException, table: Table | None = None) -> str | None:
     missing = re.search(r"\b(wandb|mlflow)\b", text) if isinstance(error, ModuleNotFoundError) else None
     if missing:
         return f"logger={missing[1]} needs a package that is not installed; run `pip install 'saunet[track]'`"
-    if type(error).__name__ == "ProcessExitedException":  # a process that was spawned is gone
+    if kind == "ProcessExitedException":  # a process that was spawned is gone
         return f"{_line(str(error))}, so the run ends; resume with resume= and the run's last.ckpt"
-    room = type(error).__module__.partition(".")[0]
-    if room not in ("hydra", "omegaconf"):
-        if isinstance(error, OSError):
-            return f"cannot use {error.filename or 'a file'}: {error.strerror or error}; check the path and its rights"
-        return None
-    if type(error).__name__ == "OverrideParseException":
-        given = str(getattr(error, "override", ""))
-        key, _, value = given.partition("=")
-        return f"{given} cannot be read; put the value in quotes: \"{key}='{value}'\""
-    return _of_hydra(text, table)
+    if type(error).__module__.partition(".")[0] in ("hydra", "omegaconf"):
+        return _of_hydra(str(getattr(error, "override", "")) if kind == "OverrideParseException" else "", text, table)
+    if isinstance(error, OSError):
+        return f"cannot use {error.filename or 'a file'}: {error.strerror or error}; check the path and its rights"
+    return None
 
 
-def _of_hydra(text: str, table: Table | None) -> str:
+def _of_hydra(unread: str, text: str, table: Table | None) -> str:
+    if unread:
+        key, _, value = unread.partition("=")
+        return f"{unread} cannot be read; put the value in quotes: \"{key}='{value}'\""
     wanted = re.search(r"Could not find '([^']+)'", text)
     listed = re.search(r"Available options in '([^']+)':\n(.*?)(?=\n\S|\Z)", text, re.DOTALL)
     if wanted and listed:
         options = [option for option in listed[2].split() if option not in HIDDEN]
         name = wanted[1].rpartition("/")[2]
         return f"unknown {listed[1]} '{name}'{suggest(name, options) or ';'} available: {', '.join(options)}"
-    ambiguous = re.search(r"Ambiguous value for argument '([^=]+)=(.*)'", text)
-    if ambiguous:
+    if ambiguous := re.search(r"Ambiguous value for argument '([^=]+)=(.*)'", text):
         key, value = ambiguous.groups()
         return f"{key}={value} has several values; add -m to run once for each, or write a list: {key}=[{value}]"
     full_key = re.search(r"full_key: (\S+)", text)
-    unknown = re.search(r"Key '([\w-]+)' (?:is )?not in '(\w+)'", text)
-    if unknown:
+    if unknown := re.search(r"Key '([\w-]+)' (?:is )?not in '(\w+)'", text):
         node = table.by_name(unknown[2]) if table else None
         allowed = [key.name for key in node.keys] if node else []
         key = full_key[1] if full_key else unknown[1]
         said = suggest(unknown[1], allowed).replace(f"'{unknown[1]}'", "")
         return f"unknown key '{key}'{said or ';'} allowed: {', '.join(allowed)}" if allowed else f"unknown key '{key}'"
-    there = re.search(r"Could not append to config\. An item is already at '([^']+)'", text)
-    if there:
+    if there := re.search(r"Could not append to config\. An item is already at '([^']+)'", text):
         return f"+{there[1]}=... adds a key and there is one already; leave out the plus sign: {there[1]}=..."
     wrong = re.search(r"Value '.*' of type .*|Cannot (?:assign|convert) .*|Invalid value .*", text)
     if wrong and full_key:

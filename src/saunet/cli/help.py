@@ -1,104 +1,202 @@
-"""Help: what a tool's keys are, with type, default and a sentence each."""
+"""What there is: a tool's help, the list of components, and Tab completion, all from the table of keys alone."""
 
 from __future__ import annotations
 
+import argparse
 import re
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 from saunet import schema
-from saunet.cli import words
-from saunet.cli.app import Tool
-from saunet.cli.config import config_dir
-from saunet.cli.errors import HIDDEN
-from saunet.cli.table import Table
+from saunet.cli.app import choices
+from saunet.cli.table import TOOLS, TRAINER, Table, Tool, config_dir, read
+from saunet.errors import ConfigError, one_of
+from saunet.registry import REGISTRIES, registry
 
 WIDTH = 118
+COMPONENT = ("component", "component?")
+PARTS = (TRAINER[0], "callbacks", "logger")
+"""Keys that a config group fills, beside those of components."""
+NETWORKS = ("encoder", "decoder", "attention", "pose")
+COUNTED = {"decoder": ", after stratified_tiny", "attention": ", for 64 channels"}
+"""What `count` assumes, for the kinds whose size depends on their neighbors."""
+SCRIPTS = {
+    "bash": """_saunet() {
+  local IFS=$'\\n' line="${COMP_LINE:0:$COMP_POINT}" word cut
+  word="${line##* }"; cut="${word%"${word##*[=:]}"}"
+  COMPREPLY=($(saunet --complete "$line" 2>/dev/null))
+  COMPREPLY=("${COMPREPLY[@]#"$cut"}")
+}
+complete -o nospace -o default -F _saunet saunet""",
+    "zsh": """_saunet() {
+  local -a found
+  found=("${(@f)$(saunet --complete "${LBUFFER}" 2>/dev/null)}")
+  compadd -U -S '' -- $found
+}
+compdef _saunet saunet""",
+    "fish": """function _saunet
+  saunet --complete (commandline -cp) 2>/dev/null
+end
+complete -c saunet -f -a '(_saunet)'""",
+}
+"""Shell -> what it has to evaluate: ``eval "$(saunet --completion bash)"``."""
 
 
-def tool_help(name: str, tool: Tool, table: Table, given: Mapping[str, str]) -> str:
-    """Return the help of one tool.
-
-    Args:
-        name: Its name.
-        tool: The tool.
-        table: All keys.
-        given: Group -> what the command line chooses.
-    """
+def tool_help(tool: Tool, table: Table, given: Mapping[str, str]) -> str:
+    """Return the help of one tool, where the command line chooses ``given`` by group."""
     plain = f" [{tool.positional.upper().replace('*', ' ...')}]" if tool.positional else ""
-    node = table.tools[name]
-    lines = [f"saunet {name}: {tool.summary}", "", f"usage: saunet {name}{plain} [KEY=VALUE ...]", "", "examples:"]
+    node, said = table.tools[tool.name], f"saunet {tool.name}"
+    lines = [f"{said}: {tool.summary}", "", f"usage: {said}{plain} [KEY=VALUE ...]", "", "examples:"]
     lines += [f"  $ saunet {example}" for example in tool.examples]
     if tool.aliases:
         lines += ["", "short forms:", *(f"  {short}=... is {key}=..." for short, key in tool.aliases.items())]
-    lines += ["", "keys:", *_keys((*node.keys, words.PLUGINS), "")]
-    given = {**defaults(name), **given}
-    for group, key in groups(node, table):
-        now = given.get(group)
-        lines += ["", f"{group}=NAME{f' (now {now})' if now else ''}, one of: {', '.join(choices(group, table))}"]
-        inner = chosen(group, given, table)
-        lines += _keys(inner.keys, f"{key}.") if inner else []
+    lines += ["", "keys:", *described(node.keys, "  ")]
+    chosen = chosen_names(tool, table, given)
+    for group in groups(node):
+        now = chosen.get(group)
+        lines += ["", f"{group}=NAME{f' (now {now})' if now else ''}, one of: {', '.join(table.choices(group))}"]
+        lines += described(chosen_keys(group, chosen, table), f"  {group.replace('/', '.')}.")
     return "\n".join(
         each for line in lines for each in (textwrap.wrap(line, WIDTH, subsequent_indent=" " * 8) if line else [""])
     )
 
 
-def _keys(keys: tuple[schema.Key, ...], prefix: str) -> Iterator[str]:
-    for key in keys:
-        if key.node is not None:
-            yield from _keys(key.node.keys, f"{prefix}{key.name}.")
-        elif key.type not in ("component", "component?") and key.name not in ("trainer", "callbacks", "logger"):
+def described(keys: Sequence[schema.Key], prefix: str) -> Iterator[str]:
+    """Yield a line for each key that holds a value, with what stands before its name."""
+    for name, key in leaves(keys, prefix):
+        if key.name not in PARTS:
             shown = "|".join(map(str, key.choices)) if key.choices else key.annotation.replace(" | None", "")
             default = " (required)" if key.default == schema.REQUIRED else f" = {written(key.default)}"
-            yield f"  {prefix}{key.name}: {shown}{default}{f'  {key.help}' if key.help else ''}"
+            yield f"{name}: {shown}{default}{f'  {key.help}' if key.help else ''}"
+
+
+def leaves(keys: Sequence[schema.Key], prefix: str = "") -> Iterator[tuple[str, schema.Key]]:
+    """Yield the keys that hold a value, those of nested options too, with their whole names."""
+    for key in keys:
+        if key.node is not None:
+            yield from leaves(key.node.keys, f"{prefix}{key.name}.")
+        elif key.type not in COMPONENT:
+            yield f"{prefix}{key.name}", key
 
 
 def written(value: object) -> str:
     """Return a default as one writes it on the command line."""
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
-    if isinstance(value, list):
-        return f"[{','.join(map(written, value))}]"
-    return str(value)
+    return f"[{','.join(map(written, value))}]" if isinstance(value, list) else str(value)
 
 
-def groups(node: schema.Node, table: Table) -> Iterator[tuple[str, str]]:
-    """Yield the config groups of a tool, each with the key that it fills."""
+def groups(node: schema.Node) -> Iterator[str]:
+    """Yield the config groups of a tool."""
     for key in node.keys:
-        if key.type in ("component", "component?") or key.name in (*table.library, "callbacks", "logger"):
-            yield key.name, key.name
-        for inner in key.node.keys if key.node else ():
-            if inner.type in ("component", "component?"):
-                yield f"{key.name}/{inner.name}", f"{key.name}.{inner.name}"
+        if key.type in COMPONENT or key.name in PARTS:
+            yield key.name
+        yield from (
+            f"{key.name}/{inner.name}" for inner in (key.node.keys if key.node else ()) if inner.type in COMPONENT
+        )
         if key.name == "model":
-            yield "model", "model"
+            yield "model"
 
 
-def choices(group: str, table: Table) -> list[str]:
-    """Return what a config group offers."""
-    files = [path.stem for path in (config_dir() / group).glob("*.yaml")]
-    return [each for each in sorted({*files, *table.group(group)}) if each not in HIDDEN]
+def chosen_names(tool: Tool, table: Table, given: Mapping[str, str]) -> dict[str, str]:
+    """Return what is chosen for each group: what the command line says, else what the tool's YAML file says."""
+    file = config_dir() / f"{tool.config or tool.name}.yaml"
+    text = file.read_text(encoding="utf-8") if file.is_file() else ""
+    chosen = {**dict(re.findall(r"^  - (\w+): (?!null$)(\w+)$", text, re.MULTILINE)), **given}
+    model = table.components["model"].get(chosen.get("model", ""))
+    parts = {f"model/{key.name}": str(key.default) for key in (model.keys if model else ())}
+    return {**{group: name for group, name in parts.items() if group in table.groups}, **chosen}
 
 
-def chosen(group: str, given: Mapping[str, str], table: Table) -> schema.Node | None:
-    """Return the keys of what is chosen for a group; None where that brings no keys of its own."""
-    return table.group(group).get("lightning" if group == "trainer" else given.get(group, ""))
+def chosen_keys(group: str, chosen: Mapping[str, str], table: Table) -> Sequence[schema.Key]:
+    """Return the keys that the choice for a group brings; none where that has no keys of its own."""
+    node = table.groups.get(group, {}).get(TRAINER[1] if group == TRAINER[0] else chosen.get(group, ""))
+    return node.keys if node else ()
 
 
-def defaults(tool: str) -> dict[str, str]:
-    """Return what a tool chooses for each group unless told otherwise."""
-    found: dict[str, str] = {}
-    for name in (tool, f"model/{_default(tool, 'model')}"):
-        for line in re.findall(r"^  - (\w+): (\w+)$", _text(name), re.MULTILINE):
-            found[f"model/{line[0]}" if "/" in name else line[0]] = line[1]
-    return {group: name for group, name in found.items() if name != "null"}
+def components(arguments: Sequence[str]) -> None:
+    """Print what is registered: all, a kind, or one component."""
+    parser = argparse.ArgumentParser(
+        prog="saunet components", description="every registered component with its keys, defaults and a sentence each"
+    )
+    parser.add_argument("kind", nargs="?", help=f"one of: {', '.join(REGISTRIES)}; all by default")
+    parser.add_argument("name", nargs="?", help="one component of that kind")
+    parser.add_argument("--count", action="store_true", help="only names and numbers of trainable weights, of networks")
+    given = parser.parse_args(arguments)
+    everything = NETWORKS if given.count else tuple(REGISTRIES)
+    found = read().components
+    for kind in (one_of("the kind", given.kind, REGISTRIES),) if given.kind else everything:
+        if given.count and kind not in NETWORKS:
+            raise ConfigError(f"--count is for networks: {', '.join(NETWORKS)}; got '{kind}'")
+        names = [one_of(kind, given.name, found[kind])] if given.name else sorted(found[kind])
+        print(f"{kind} ({len(found[kind])} registered{COUNTED.get(kind, '') if given.count else ''})")
+        for name in names:
+            if given.count:
+                print(f"  {name:20}{count(kind, name):>12}")
+                continue
+            node, group = found[kind][name], "model" if kind == "model" else REGISTRIES[kind].group
+            choose = f"{group}={name}" if group else f'saunet.build("{kind}", "{name}", ...)'
+            print(f"  {name}\n      {node.summary}\n      choose: {choose}", *described(node.keys, "      "), sep="\n")
+        print()
 
 
-def _default(tool: str, group: str) -> str:
-    found = re.search(rf"^  - {group}: (\w+)$", _text(tool), re.MULTILINE)
-    return found[1] if found else ""
+def count(kind: str, name: str) -> str:
+    """Return the number of parameters of a network, in millions or as it is."""
+    import torch
+
+    from saunet.tools.benchmark import count_parameters
+
+    owner = registry(kind)
+    with torch.device("meta"):  # shapes without memory
+        late: dict[str, object] = {"channels": 64} if "channels" in owner.late else {}
+        if "features" in owner.late:
+            late["features"] = registry("encoder").build("stratified_tiny").features
+        network = owner.build(name, **late)
+    number = count_parameters(network)
+    return f"{number / 1e6:.2f} M" if number > 9999 else str(number)
 
 
-def _text(name: str) -> str:
-    path = config_dir() / f"{name}.yaml"
-    return path.read_text() if path.is_file() else ""
+def completion(shell: str) -> list[str]:
+    """Return what a shell evaluates to complete ``saunet``."""
+    return [SCRIPTS[one_of("--completion", shell, SCRIPTS)]]
+
+
+def complete(line: str) -> list[str]:
+    """Return what the last word of a line can become, given the line up to the cursor, from ``saunet`` on."""
+    given, table = line.split(" ")[1:], read()
+    word = given[-1] if given else ""
+    if len(given) < 2:
+        return [each for each in ("--help", "--version", *TOOLS, "resume") if each.startswith(word)]
+    tool = "train" if given[0] == "resume" else given[0]
+    if tool not in table.tools:
+        return []
+    key, equals, value = word.lstrip("+~").partition("=")
+    sign = word[: len(word) - len(word.lstrip("+~"))]
+    if equals:
+        return [f"{sign}{key}={each}" for each in _values(key, value, tool, table)]
+    return [f"{sign}{each}" for each in _completed(key, tool, table, choices(given[1:-1]))]
+
+
+def _completed(start: str, tool: str, table: Table, given: Mapping[str, str]) -> list[str]:
+    """Return keys, one level at a time: ``data.`` and then ``data.root=``."""
+    chosen = chosen_names(TOOLS[tool], table, given)
+    found = {name for name, _ in leaves(table.tools[tool].keys)}
+    found.update(("experiment", "loss", "sweep") if tool == "train" else ())
+    for group in groups(table.tools[tool]):
+        inner = leaves(chosen_keys(group, chosen, table), f"{group.replace('/', '.')}.")
+        found |= {group, *(name for name, _ in inner)}
+    rests = (each[len(start) :].partition(".") for each in found if each.startswith(start))
+    return sorted({f"{start}{inner}{dot or '='}" for inner, dot, _ in rests})
+
+
+def _values(key: str, start: str, tool: str, table: Table) -> list[str]:
+    names = table.choices(key)
+    for each in () if names else table.known(tool, key)[:1]:
+        names = [written(choice) for choice in each.choices]
+        names = names or (["true", "false"] if each.type.startswith("bool") else [])
+        if not names and each.type.rstrip("?") in ("str", "any", "list[str]"):
+            folder = Path(start if start.endswith("/") else Path(start).parent)
+            files = sorted(folder.iterdir()) if folder.is_dir() else []
+            names = [f"{file}/" if file.is_dir() else str(file) for file in files if not file.name.startswith(".")]
+    return [name for name in names if name.startswith(start)]

@@ -12,10 +12,8 @@ from pathlib import Path
 class RunLog(logging.FileHandler):
     """A log in a run's folder, begun by the first file that the tool writes there: what is said before is kept.
 
-    A tool that is refused leaves neither a folder nor a line in the log of an earlier run.
-
-    Args:
-        filename: The file; each further process of a run has its own.
+    A tool that is refused leaves neither a folder nor a line in the log of an earlier run. Each further process of a
+    run has a file of its own.
     """
 
     def __init__(self, filename: str) -> None:
@@ -46,12 +44,8 @@ class RunLog(logging.FileHandler):
         return folder.stat().st_mtime_ns if folder.is_dir() else None
 
 
-class _NoAdvertisement(logging.Filter):
-    def filter(self, record: logging.LogRecord) -> bool:
-        return not record.getMessage().startswith(("💡", "TPU available", "Loading `train_dataloader` to estimate"))
-
-
-_NO_ADVERTISEMENT = _NoAdvertisement()
+def _no_advertisement(record: logging.LogRecord) -> bool:
+    return not record.getMessage().startswith(("💡", "TPU available", "Loading `train_dataloader` to estimate"))
 
 
 def quiet() -> None:
@@ -61,6 +55,6 @@ def quiet() -> None:
             logging.getLogger(name).handlers.clear()
             logging.getLogger(name).propagate = True
         for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
-            logging.getLogger(name).addFilter(_NO_ADVERTISEMENT)
+            logging.getLogger(name).addFilter(_no_advertisement)
     warnings.filterwarnings("ignore", message=r".*LeafSpec.*")
     warnings.filterwarnings("ignore", message=r".*does not have many workers.*")

@@ -1,4 +1,4 @@
-"""What can be configured, as plain data in a file: the command line reads it instead of importing every component.
+"""The tools, and what can be configured: plain data in a file, read instead of importing every component.
 
 The file lies in the user's cache folder and counts only while the sources, the installed packages and Python are the
 ones that it was made from; otherwise it is made again, which imports everything once.
@@ -7,138 +7,224 @@ ones that it was made from; otherwise it is made again, which imports everything
 from __future__ import annotations
 
 import hashlib
-import importlib
 import json
 import os
+import pkgutil
+import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import cast
 
 import saunet
 from saunet import schema
+from saunet.errors import ConfigError
 from saunet.registry import REGISTRIES
 
-LIBRARY = {("trainer", "lightning"): ("lightning:Trainer", "lightning.Trainer")}
-"""Config nodes that are not components: (group, name) -> what it configures, and the path to build it from."""
+_TEXT = """\
+train: train a depth network on driving video
+    train experiment=selfsup data=kitti data.root=/data/kitti/raw
+    train experiment=smoke model/encoder=resnet18 epochs=2 lr=2e-4
+    train -m sweep=loss_ablation experiment=smoke
+    resume outputs/train/2026-01-31_12-00-00
+predict input: depth of an image, a folder, a video or a camera, as pictures, points and videos
+    predict road.png output=out
+    predict drive.mp4 checkpoint=last.ckpt output=out outputs=[mp4,html] camera=[90]
+evaluate checkpoint: score a checkpoint, or predictions made elsewhere
+    evaluate last.ckpt data=kitti data.root=/data/kitti/raw
+    evaluate predictions=maps data=kitti
+odometry checkpoint: the camera's path through whole sequences, with its errors
+    odometry last.ckpt data.root=/data/kitti/odometry
+export checkpoint: write a checkpoint as files to deploy or share, each checked against the network
+    export last.ckpt output=exported
+report runs*: one page of tables, curves and pictures from finished runs; how runs differ
+    report outputs/train
+    report compare outputs/train/A outputs/train/B
+benchmark: parameters, FLOPs, time and memory of networks
+    benchmark models=[sau_net,street]
+    benchmark model/encoder=resnet18 sizes=192x640,320x1024
+doctor: look at a data set before hours of training
+    doctor data=kitti data.root=/data/kitti/raw
+calibrate input: make camera.yaml from a video or pictures of a board
+    calibrate print_board=board.png
+    calibrate board.mp4 columns=10 rows=7 square=0.025
+prepare job: do once before training: dense depth, a teacher's depth, smaller copies of images
+    prepare densify root=/data/kitti/raw
+components: list every registered component with its keys
+    components encoder
+demo: the README's demo: train on rendered video, evaluate, draw
+    demo
+    demo epochs=2
+"""
+"""Each tool's name, the key that plain words stand for (``*`` takes several), what it does, and examples."""
+
+
+@dataclass(frozen=True)
+class Tool:
+    """One tool: ``saunet predict`` calls `saunet.predict` with `saunet.PredictOptions`.
+
+    Its function may also take ``choices``, ``overrides`` and ``describe``, which puts an error into one sentence, for
+    the record of a run; what it returns is not printed then.
+    """
+
+    name: str
+    summary: str
+    examples: Sequence[str]
+    positional: str = ""
+    aliases: Mapping[str, str] = field(default_factory=dict)
+    words: Mapping[str, str] = field(default_factory=dict)
+    """First word -> what it stands for."""
+    function: str = ""
+    """What is called, as ``module:name``, where it is not the name in saunet."""
+    options: str | None = ""
+    """What it is called with; None if it reads the command line itself."""
+    config: str = ""
+    """The root config, where it is not named like the tool."""
+    preset: Sequence[str] = ()
+    """Overrides that come before those of the command line."""
+
+    def paths(self) -> tuple[str, str]:
+        """Return where the options and the function are, as ``module:name``."""
+        return self.options or f"saunet:{self.name.title()}Options", self.function or f"saunet:{self.name}"
+
+
+TOOLS = {
+    name: Tool(name, summary, [line.strip() for line in examples.splitlines()], positional)
+    for name, positional, summary, examples in re.findall(r"^(\w+) ?([\w*]*): (.*)\n((?: .*\n)+)", _TEXT, re.MULTILINE)
+}
+"""Every tool by name, in the order of ``saunet --help``."""
+_SHORT = {"epochs": "trainer.max_epochs", "lr": "optim.lr", "batch": "data.batch_size"}
+TOOLS["train"] = replace(TOOLS["train"], aliases=_SHORT)
+TOOLS["report"] = replace(TOOLS["report"], words={"compare": "compare=true"})
+TOOLS["components"] = replace(TOOLS["components"], function="saunet.cli.help:components", options=None)
+TOOLS["demo"] = replace(
+    TOOLS["demo"],
+    aliases=_SHORT,
+    function="saunet.cli.demo:demo",
+    options="saunet:TrainOptions",
+    config="train",
+    preset=("experiment=demo",),
+)
+TRAINER = ("trainer", "lightning", "lightning:Trainer", "lightning.Trainer")
+"""A config node that is no component: its group and name, what it configures, and the path to build it from."""
+PLUGINS = schema.Key(
+    "plugins", "list[str]", [], "Your own modules or .py files, imported first; they may register components."
+)
+"""The key that every tool has beside those of its options."""
+HIDDEN = {"base", "lightning"}
+"""Members of config groups that others build on and nobody chooses."""
+
+
+def config_dir() -> Path:
+    """Return the folder of the YAML files: inside the installed package, or ``conf/`` of a source checkout."""
+    package = Path(saunet.__path__[0]).resolve()
+    for folder in (package / "conf", package.parents[1] / "conf"):
+        if (folder / "train.yaml").is_file():
+            return folder
+    raise ConfigError(f"no configuration files beside {package}; reinstall saunet")
 
 
 @dataclass(frozen=True)
 class Table:
-    """Config keys by tool and by component.
+    """Config keys."""
 
-    Args:
-        tools: Tool -> the keys of its options.
-        components: Kind -> name -> the component's keys.
-        library: Group -> name -> the keys of a node that is no component.
-    """
+    tools: Mapping[str, schema.Node]
+    """Tool -> the keys of its options."""
+    components: Mapping[str, Mapping[str, schema.Node]]
+    """Kind -> name -> the component's keys."""
+    groups: Mapping[str, Mapping[str, schema.Node]]
+    """Config group, such as ``model/encoder`` -> name -> keys."""
 
-    tools: dict[str, schema.Node]
-    components: dict[str, dict[str, schema.Node]]
-    library: dict[str, dict[str, schema.Node]]
+    def choices(self, group: str) -> list[str]:
+        """Return the names that a config group offers."""
+        registered = self.components["model"] if group == "model" else self.groups.get(group, {})
+        files = {path.stem for path in (config_dir() / group).glob("*.yaml")}
+        return sorted({*files, *registered} - HIDDEN)
 
-    def group(self, name: str) -> dict[str, schema.Node]:
-        """Return the nodes of a config group such as ``model/encoder`` or ``trainer``; none for an unknown one."""
-        for kind, registry in REGISTRIES.items():
-            if registry.group == name:
-                return self.components[kind]
-        return self.library.get(name, {})
+    def known(self, tool: str, key: str) -> list[schema.Key]:
+        """Return what a key can be: of the tool's options, or of any component that has it."""
+        if own := self.tools[tool].key(key):
+            return [own]
+        nodes = [
+            (node, key[len(group) + 1 :])
+            for group, each in self.groups.items()
+            for node in each.values()
+            if key.startswith(f"{group.replace('/', '.')}.")
+        ]
+        return [found for node, rest in nodes if (found := node.key(rest))]
 
-    def groups(self) -> dict[str, dict[str, schema.Node]]:
-        """Return the nodes of all groups."""
-        named = {registry.group: self.components[kind] for kind, registry in REGISTRIES.items() if registry.group}
-        return {**named, **self.library}
+    def type(self, tool: str, key: str) -> str:
+        """Return the type of a key as `saunet.schema.Key.type`; ``any`` for one that is not known."""
+        found = {each.type for each in self.known(tool, key)}
+        return found.pop() if len(found) == 1 else "any"
 
     def by_path(self, path: object) -> schema.Node | None:
         """Return the keys of what a ``_target_`` names; None if it is no component."""
-        return next((node for each in self.groups().values() for node in each.values() if node.path == path), None)
+        return next((node for each in self.groups.values() for node in each.values() if node.path == path), None)
 
     def by_name(self, name: str) -> schema.Node | None:
         """Return the keys of a class, by its name alone, as in Hydra's messages."""
-        found = [*self.tools.values(), *(node for each in self.groups().values() for node in each.values())]
+        found = [node for each in (self.tools, *self.groups.values()) for node in each.values()]
         inner = [key.node for node in found for key in node.keys if key.node]
         return next((node for node in [*found, *inner] if node.name == name), None)
 
 
 def imported(path: str) -> Callable[..., object]:
     """Return what ``module:name`` names."""
-    module, _, name = path.partition(":")
-    found: Callable[..., object] = getattr(importlib.import_module(module), name)
+    found: Callable[..., object] = pkgutil.resolve_name(path)
     return found
 
 
-def read(tools: dict[str, str]) -> Table:
+def read() -> Table:
     """Return the table, from the file or, where that is missing or outdated, made now and written.
 
     What plugins registered in this process is part of it and never written.
-
-    Args:
-        tools: Tool -> its options as ``module:Class``.
     """
-    plain = _read() or _write(_make(tools))
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    where = hashlib.sha256(f"{sys.executable} {saunet.__path__[0]}".encode()).hexdigest()[:12]
+    file, state, plain = cache / "saunet" / f"keys-{where}.json", _state(), None
+    with suppress(OSError, ValueError):
+        plain = json.loads(file.read_bytes())
+    if plain is None or plain["state"] != state:
+        plain = {"state": state, **_make()}
+        with suppress(OSError):  # without a cache folder it is only slower
+            file.parent.mkdir(parents=True, exist_ok=True)
+            temporary = file.with_suffix(f".{os.getpid()}")
+            temporary.write_text(json.dumps(plain))
+            temporary.replace(file)
+    tools = {name: replace(each, keys=(*each.keys, PLUGINS)) for name, each in _nodes(plain["tools"]).items()}
     components = {kind: _nodes(each) for kind, each in plain["components"].items()}
     for kind, registry in REGISTRIES.items():
         for entry in registry.registered():
             if entry.name not in components[kind]:
                 components[kind][entry.name] = schema.node(entry.target, entry.preset, registry.late)
-    library = {group: _nodes(each) for group, each in plain["library"].items()}
-    return Table(_nodes(plain["tools"]), components, library)
+    groups = {registry.group: components[kind] for kind, registry in REGISTRIES.items() if registry.group}
+    return Table(tools, components, {**groups, TRAINER[0]: _nodes(plain["trainer"])})
 
 
-def _nodes(plain: Mapping[str, object]) -> dict[str, schema.Node]:
-    return {name: schema.Node.from_plain(cast(Mapping[str, object], each)) for name, each in plain.items()}
-
-
-_Plain = dict[str, dict[str, dict[str, object]]]
-
-
-def _make(tools: dict[str, str]) -> _Plain:
-    library: dict[str, dict[str, object]] = {}
-    own = [entry for each in REGISTRIES.values() for entry in each.registered() if entry.path.split(".")[0] != "saunet"]
-    for (group, name), (target, path) in LIBRARY.items():
-        library.setdefault(group, {})[name] = asdict(schema.node(imported(target), path=path))
-    return {
-        "tools": {name: asdict(schema.node(imported(path), path=None)) for name, path in tools.items()},
-        "components": {
-            kind: {entry.name: asdict(registry.node(entry.name)) for entry in registry if entry not in own}
-            for kind, registry in REGISTRIES.items()
-        },
-        "library": library,
-    }
-
-
-def _file() -> Path:
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    where = hashlib.sha256(f"{sys.executable} {saunet.__path__[0]}".encode()).hexdigest()[:12]
-    return Path(cache) / "saunet" / f"keys-{where}.json"
+def _nodes(plain: Mapping[str, Mapping[str, object]]) -> dict[str, schema.Node]:
+    return {name: schema.Node.from_plain(each) for name, each in plain.items()}
 
 
 def _state() -> str:
     """Return what the table depends on: our sources, the folders of installed packages, and Python."""
-    root = Path(saunet.__path__[0])
-    sources = [path.stat() for path in sorted(root.rglob("*.py"))]
+    sources = [path.stat() for path in sorted(Path(saunet.__path__[0]).rglob("*.py"))]
     folders = [Path(each) for each in sys.path if Path(each).name in ("site-packages", "dist-packages")]
     packages = [each.stat().st_mtime_ns for each in folders if each.is_dir()]
     state = [sys.version, saunet.__version__, [(each.st_mtime_ns, each.st_size) for each in sources], packages]
     return hashlib.sha256(json.dumps(state).encode()).hexdigest()
 
 
-def _read() -> _Plain | None:
-    with suppress(OSError, ValueError):
-        plain = json.loads(_file().read_bytes())
-        if plain.pop("state", None) == _state():
-            found: _Plain = plain
-            return found
-    return None
-
-
-def _write(plain: _Plain) -> _Plain:
-    file = _file()
-    with suppress(OSError):  # without a cache folder it is only slower
-        file.parent.mkdir(parents=True, exist_ok=True)
-        temporary = file.with_suffix(f".{os.getpid()}")
-        temporary.write_text(json.dumps({"state": _state(), **plain}))
-        temporary.replace(file)
-    return plain
+def _make() -> dict[str, Mapping[str, object]]:
+    own = [entry for each in REGISTRIES.values() for entry in each.registered() if entry.path.split(".")[0] != "saunet"]
+    _, name, target, path = TRAINER
+    options = {name: tool.paths()[0] for name, tool in TOOLS.items() if tool.options is not None}
+    return {
+        "tools": {name: asdict(schema.node(imported(path), path=None)) for name, path in options.items()},
+        "components": {
+            kind: {entry.name: asdict(registry.node(entry.name)) for entry in registry if entry not in own}
+            for kind, registry in REGISTRIES.items()
+        },
+        "trainer": {name: asdict(schema.node(imported(target), path=path))},
+    }

@@ -21,6 +21,7 @@ from saunet.io.atomic import remove_partial_files
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import protocol
+from saunet.models.systems import ModelOptions
 from saunet.registry import Spec
 from saunet.runs.checkpoint import build_networks, read_checkpoint
 from saunet.runs.folder import Describe, locked, recording
@@ -59,30 +60,6 @@ CALLBACKS: Mapping[str, tuple[str, dict[str, str]]] = {
 LOGGERS = {"csv": "CSVLogger", "tensorboard": "TensorBoardLogger"}
 _TRUSTED = ("lightning.", "torch.", "saunet.")
 """Packages that nested nodes of callbacks, loggers and the trainer may name."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelOptions:
-    """Networks: depth (encoder and decoder) and pose.
-
-    Args:
-        encoder: Depth encoder.
-        decoder: Depth decoder.
-        pose: Pose network; None for training on stereo pairs alone.
-        min_depth: Smallest depth that the network can say, meters up to scale.
-        max_depth: Largest depth.
-
-    Examples:
-        >>> parts = {"encoder": "resnet18", "decoder": "unet", "pose": "posecnn"}
-        >>> saunet.ModelOptions(**{kind: saunet.Spec.of(kind, name) for kind, name in parts.items()}).max_depth
-        100.0
-    """
-
-    encoder: Spec
-    decoder: Spec
-    pose: Spec | None = None
-    min_depth: float = 0.1
-    max_depth: float = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)

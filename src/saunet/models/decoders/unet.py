@@ -15,6 +15,7 @@ from saunet.types import FeatureSpec
 
 
 @decoders.register("unet")
+@decoders.register("unet_narrow", channels=(16, 24, 40, 80, 128))
 class UNetDecoder(SkipDecoder):
     """Upsample, join with the skip feature, convolve: Monodepth2's depth decoder for any encoder.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 from saunet.errors import ConfigError, positive, require_matplotlib, usable_device
 from saunet.io.atomic import check_folder, write_json
 from saunet.io.progress import bar
+from saunet.models.systems import ModelOptions
 from saunet.published import published
 from saunet.tables import Row, Table, columns, show, stdout
 from saunet.tables.drawing import Point, draw_speed, save
@@ -19,18 +21,21 @@ from saunet.tools.benchmark.measure import Measurement, Networks, Plan, run_suit
 
 PAPER_METHODS = {"mono_r18": "Mono R18", "mono_r50": "Mono R50", "packnet": "PackNet", "sau_net": "SAU-Net"}
 """What the paper calls our models."""
+CHANGED = " (changed)"
+"""Stands behind the name of a model that has other parameters: it is not what the paper measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkOptions(Plan):
-    """What `benchmark` measures: every combination of the sequences.
+    """What `benchmark` measures: every combination of the sequences, for ``model`` or each of ``models``.
 
     Args:
-        models: Networks by the name that they are shown under.
-        sizes: Image sizes, ``"<height>x<width>"``.
-        devices: ``cpu``, ``cuda`` or any other that torch knows; ``auto`` is a GPU if there is one.
-        precisions: ``fp32``, ``bf16`` or ``fp16``: the format of weights and activations.
-        modes: ``eager``, ``compiled``.
+        model: Networks; unused where ``models`` is given.
+        models: Registered models by name, to measure side by side; in Python also networks by the name to show.
+        sizes: Image sizes, height x width.
+        devices: cpu, cuda or any other that torch knows; auto is a GPU if there is one.
+        precisions: fp32, bf16 or fp16: the format of weights and activations.
+        modes: eager, compiled.
         batch_sizes: Images per call. Latency is that of the call, throughput is in images.
         runs: Timed calls.
         warmup: Calls before that.
@@ -40,16 +45,16 @@ class BenchmarkOptions(Plan):
         output_dir: Folder for the results; None writes none.
 
     Raises:
-        ConfigError: for an empty sequence, or a word, number or device that cannot work.
+        ConfigError: if there is nothing to measure, or for a word, number or device that cannot work.
 
     Examples:
-        >>> from saunet.tools.benchmark import Networks
-        >>> networks = Networks(torch.nn.Conv2d(3, 1, 3))
-        >>> saunet.BenchmarkOptions(models={"one layer": networks}).runs
+        >>> saunet.BenchmarkOptions(models=["sau_net", "street"], sizes=["192x640"]).runs
         20
     """
 
-    models: Mapping[str, Networks]
+    model: ModelOptions | None = None
+    models: Sequence[str] | Mapping[str, Networks] = field(default=(), metadata={"type": "list[str]"})
+    devices: Sequence[str] = ("auto",)
     threads: int | None = None
     figure: bool = False
     abs_rel: Mapping[str, float] = field(default_factory=dict)
@@ -57,8 +62,8 @@ class BenchmarkOptions(Plan):
 
     def __post_init__(self) -> None:
         Plan.__post_init__(self)
-        if not self.models:
-            raise ConfigError("models is empty, so nothing would be measured; give networks by their names")
+        if not self.models and self.model is None:
+            raise ConfigError("models is empty, so nothing would be measured; name some, such as sau_net")
         if self.threads is not None:
             positive("threads", self.threads)
         if self.figure:
@@ -85,14 +90,22 @@ class BenchmarkResult:
             print(f"results: {self.folder}")
 
 
-def benchmark(options: BenchmarkOptions) -> BenchmarkResult:
+def benchmark(
+    options: BenchmarkOptions, *, choices: Mapping[str, str | None] | None = None, overrides: Sequence[str] = ()
+) -> BenchmarkResult:
     """Measure networks, and write JSON and a picture.
 
     Args:
         options: What to measure, and how.
+        choices: What the command line chose by name: ``model`` names the options' model.
+        overrides: What the command line changed.
+
+    Returns:
+        What was measured; `BenchmarkResult.show` prints the tables.
 
     Raises:
-        ConfigError: if a size does not fit a model; nothing has been measured then.
+        ConfigError: if a size does not fit a model, or ``models`` stands beside changes of a model; nothing has been
+            measured then.
         DataError: if a file cannot be written.
 
     Examples:
@@ -101,10 +114,8 @@ def benchmark(options: BenchmarkOptions) -> BenchmarkResult:
         >>> options = saunet.BenchmarkOptions(models={"one layer": networks}, sizes=("32x64",), runs=1)
         >>> saunet.benchmark(options).measurements[0].depth_parameters
         28
-
-    Returns:
-        What was measured; `BenchmarkResult.show` prints the tables.
     """
+    networks = _networks(options, (choices or {}).get("model"), overrides)
     folder = None if options.output_dir is None else check_folder(options.output_dir)
     if options.threads is not None:
         torch.set_num_threads(options.threads)
@@ -115,12 +126,32 @@ def benchmark(options: BenchmarkOptions) -> BenchmarkResult:
         def progress(text: str, done: int, total: int) -> None:
             shown.update(task, description=text, completed=done, total=total)
 
-        results = run_suite(options.models, plan, progress)
+        results = run_suite(networks, plan, progress)
     if folder is not None:
         write_measurements(results, folder / "benchmark.json")
         if options.figure:
-            draw_figure(results, folder / "benchmark.png", options.abs_rel)
+            given = options.abs_rel
+            own = {label: given[name] for label in networks if (name := label.removesuffix(CHANGED)) in given}
+            draw_figure(results, folder / "benchmark.png", {**given, **own})
     return BenchmarkResult(tuple(results), folder)
+
+
+def _networks(options: BenchmarkOptions, name: str | None, overrides: Sequence[str]) -> dict[str, Networks]:
+    """Return what to measure by the name that it is shown under."""
+    changes = [change for change in overrides if re.match(r"[+~]*model[=./@]", change)]
+    if options.models and changes:
+        raise ConfigError(
+            f"models= measures each model as it is named, so '{changes[0]}' would change nothing; "
+            "leave out one of the two"
+        )
+    if isinstance(options.models, Mapping):
+        return dict(options.models)
+    chosen = {each: ModelOptions.named(each) for each in options.models}
+    if not chosen and options.model is not None:
+        changed = name is not None and not options.model.same_architecture(ModelOptions.named(name))
+        chosen = {(name or "model") + CHANGED * changed: options.model}
+    built = {label: each.build() for label, each in chosen.items()}
+    return {label: Networks(each.depth, each.pose) for label, each in built.items()}
 
 
 def size_table(results: Sequence[Measurement]) -> Table:
