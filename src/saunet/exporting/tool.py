@@ -37,7 +37,7 @@ FORMATS: tuple[str, ...] = ("onnx", "program", "compiled", "safetensors")
 (AOTInductor): machine code, for torch or C++. ``safetensors``: the weights, for saunet and the hub."""
 DEFAULT_FORMATS: tuple[str, ...] = ("onnx", "program", "safetensors")
 TOLERANCE = 1e-4
-"""Largest difference to the original network that passes, as a share of the range of disparity."""
+"""Largest difference to the original network that passes, as a fraction of the range of disparity."""
 FILES = {"onnx": "model.onnx", "program": "model.pt2", "compiled": "model.aoti.pt2", "safetensors": WEIGHTS}
 REPORT = "report.json"
 
