@@ -33,7 +33,7 @@ class RunLog(logging.FileHandler):
         super().close()
 
     def _write(self) -> None:
-        if self.stream is not None or self._changed() != self._before:
+        if self.stream is not None or self._changed() not in (None, self._before):  # None: the folder was removed
             early, self._early = self._early, []
             for each in early:
                 super().emit(each)
