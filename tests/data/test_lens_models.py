@@ -177,3 +177,16 @@ def test_skew_is_straightened_too():
         expected = (K @ [*(ray[:2] * (1 - 0.2 * r + 0.05 * r**2)), 1])[:2]
         got = whole[v, u] + np.array([fraction[v, u] & 31, fraction[v, u] >> 5]) / 32
         np.testing.assert_allclose(got, expected, atol=0.05)
+
+
+def test_a_strongly_bent_lens_is_not_cut_to_its_middle():
+    """OpenCV's own choice for this lens, that of its ChArUco tutorial, has 36 degrees of the 59 that fit."""
+    K = np.array([[452.51072, 0, 317.70297], [0, 456.76708, 277.75156], [0, 0, 1]])
+    numbers = [0.121369256, -1.0854664, 1.178684e-4, -4.62406860e-4, 2.95425894]
+    straight = straight_intrinsics("pinhole", numbers, K, 480, 640, None, "camera.yaml")
+    corners = np.array([[(u - straight[0, 2]) / straight[0, 0], (v - straight[1, 2]) / straight[1, 1], 1]
+                        for u in (0, 639) for v in (0, 479)])  # fmt: skip
+    recorded = pixels("pinhole", numbers, K, corners)
+    assert (recorded > -1).all()
+    assert (recorded < [640, 480]).all()
+    assert straight[0, 0] < 600

@@ -9,16 +9,19 @@ K = np.array([[560.0, 0, 322.0], [0, 558.0, 236.0], [0, 0, 1]])
 SIZE = (480, 640)
 
 
-def poses(count, seed=0, tilt=0.6):
-    """Return count (rotation, shift) that tilt the board and move it over the image, near and far."""
+def poses(count, seed=0, tilt=0.6, spread=1.0):
+    """Return count (rotation, shift) that tilt the board and move it over the image, near and far.
+
+    Twice the ``spread`` takes it into the corners.
+    """
     rng = np.random.default_rng(seed)
     for number in range(count):
         turn = np.array([rng.uniform(-tilt, tilt), rng.uniform(-tilt, tilt), rng.uniform(-0.3, 0.3)])
         place = np.array([(number % 3 - 1) * 0.05, (number // 3 % 3 - 1) * 0.04, rng.uniform(0.36, 0.48)])
-        yield cv2.Rodrigues(turn)[0], place
+        yield cv2.Rodrigues(turn)[0], place * [spread, spread, 1]
 
 
-def views(board, count=14, distortion=None, seed=0, per_square=40, tilt=0.6, undistort=cv2.undistortPoints):
+def views(board, count=14, distortion=None, seed=0, per_square=40, tilt=0.6, undistort=cv2.undistortPoints, spread=1.0):
     """Return pictures of the board, RGB, anti-aliased, with its center at each pose's place.
 
     ``undistort`` is the lens: `cv2.fisheye.undistortPoints` for a fisheye.
@@ -31,7 +34,7 @@ def views(board, count=14, distortion=None, seed=0, per_square=40, tilt=0.6, und
     finer = 3
     S = np.array([[finer, 0, (finer - 1) / 2], [0, finer, (finer - 1) / 2], [0, 0, 1.0]])
     pictures = []
-    for R, t in poses(count, seed, tilt):
+    for R, t in poses(count, seed, tilt, spread):
         H = S @ K @ np.c_[R[:, :2], t] @ A
         large = cv2.warpPerspective(
             texture,

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from board_views import SIZE, K, views
 
-from saunet.data.video.camera import read_camera, write_camera
+import saunet
+from saunet.data.video.camera import CameraFile, read_camera, write_camera
 from saunet.errors import ConfigError, DataError
-from saunet.tools.calibrate.solve import Board, check_picture, solve
+from saunet.tools.calibrate import solve as solving
+from saunet.tools.calibrate.solve import Board, BoardView, check_picture, solve
 
 
 def save(folder, pictures):
@@ -27,6 +29,11 @@ def test_the_camera_of_a_synthetic_chessboard_is_recovered(tmp_path):
     assert result.camera.image_size == SIZE
     assert result.error < 0.2
     assert result.uncertainty < 0.005
+    points, pixels = [view.points for view in result.views], [view.pixels for view in result.views]
+    theirs = cv2.calibrateCameraExtended(points, pixels, SIZE[::-1], None, None)  # its own standard deviations
+    focal = np.ravel(theirs[5])[:2].max() / theirs[1][0, 0]
+    assert result.uncertainty == pytest.approx(focal, rel=0.01)
+    assert 0.1 < result.corner < 3.2
     assert np.abs(result.camera.distortion[0]) < 0.02
     picture = check_picture(result)
     assert picture.shape == (SIZE[0], 2 * SIZE[1], 3)
@@ -42,7 +49,7 @@ def test_charuco_in_a_video_and_distortion(tmp_path):
     board = Board("charuco", columns=8, rows=6)
     distortion = [-0.25, 0.08, 0.0, 0.0, 0.0]
     writer = cv2.VideoWriter(str(tmp_path / "board.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5, SIZE[::-1])
-    for picture in views(board, 12, distortion):
+    for picture in views(board, 14, distortion, spread=2.0):
         writer.write(picture)
     writer.release()
     result = solve(tmp_path / "board.avi", board)
@@ -53,7 +60,7 @@ def test_charuco_in_a_video_and_distortion(tmp_path):
 
 def test_a_fisheye_is_calibrated_on_the_command_line(tmp_path):
     distortion = [-0.25, 0.05, 0.0, 0.0]
-    pictures = views(Board(), 12, distortion, tilt=0.45, undistort=cv2.fisheye.undistortPoints)
+    pictures = views(Board(), 18, distortion, tilt=0.45, undistort=cv2.fisheye.undistortPoints, spread=2.2)
     save(tmp_path / "pictures", pictures)
 
     def calibrated(*overrides):
@@ -121,3 +128,84 @@ def _bent(picture):
 def test_boards_that_cannot_be(options, message):
     with pytest.raises(ConfigError, match=message):
         Board(**options)
+
+
+def seen(model, K, distortion, size, reach, noise=0.1, count=20):
+    """Return a board as a lens sees it, with its center within a fraction of the half picture."""
+    rng = np.random.default_rng(0)
+    points = (np.mgrid[:9, :6, :1].T.reshape(-1, 3) * 0.025).astype(np.float32)
+    project, views = (cv2.fisheye if model == "fisheye" else cv2).projectPoints, []
+    while len(views) < count:
+        R = cv2.Rodrigues(rng.uniform(-0.4, 0.4, 3))[0]
+        depth = rng.uniform(0.2, 0.4)
+        place = [*(rng.uniform(-reach, reach, 2) * depth * size[::-1] / 2 / K[[0, 1], [0, 1]]), depth]
+        at = project(
+            points.reshape(-1, 1, 3).astype(float), cv2.Rodrigues(R)[0], place - R @ points.mean(0), K, distortion
+        )
+        pixels = np.reshape(at[0], (-1, 2)) + rng.normal(0, noise, (len(points), 2))
+        if (pixels >= 0).all() and (pixels <= np.array(size[::-1]) - 1).all():
+            views.append(BoardView(points, pixels.astype(np.float32)))
+    return views
+
+
+WIDE = np.array([[450.0, 0, 479.5], [0, 450, 269.5], [0, 0, 1]])
+ROUND = np.array([[280.0, 0, 479.5], [0, 280, 269.5], [0, 0, 1]])  # 196 degrees from left to right
+
+
+@pytest.mark.parametrize(
+    ("model", "K", "distortion", "all_over"),
+    [("pinhole", WIDE, [-0.25, 0.07, 0.0, 0.0, -0.006], 1.2), ("fisheye", ROUND, [0.03, -0.01, 0.003, -0.001], 0.75)],
+)
+def test_a_board_in_the_middle_only_is_refused_and_one_all_over_is_not(
+    monkeypatch, tmp_path, model, K, distortion, all_over
+):
+    size = (540, 960)
+
+    def solved(reach):
+        pictures = seen(model, K, np.array(distortion), size, reach)
+        monkeypatch.setattr(Board, "find", lambda self, image: pictures.pop())
+        monkeypatch.setattr(
+            solving, "_pictures", lambda source, most: ((np.zeros((*size, 3), np.uint8), 20) for _ in range(20))
+        )
+        return solve(tmp_path, Board(), model)
+
+    good = solved(all_over)
+    np.testing.assert_allclose(good.camera.K[[0, 1], [0, 1]], K[[0, 1], [0, 1]], rtol=0.005)
+    assert good.corner < 3
+    with pytest.raises(DataError, match=r"not to be trusted: the .*corners.* film it along the edges and in all four"):
+        solved(0.2)
+
+
+def test_a_charuco_board_of_old_opencv_is_found_and_said(tmp_path, monkeypatch):
+    old = Board("charuco", columns=8, rows=6)
+    old._charuco.setLegacyPattern(True)
+    save(tmp_path / "pictures", views(old, 14, spread=2.0))
+    monkeypatch.chdir(tmp_path)
+    options = saunet.CalibrateOptions(input="pictures", board="charuco", columns=8, rows=6, export="kalibr", fov=45.0)
+    result = saunet.calibrate(options)
+    assert "OpenCV before 4.6 (legacy pattern)" in str(result)
+    assert "corners to" in str(result)
+    assert "and camera_kalibr.yaml" in str(result)
+    camera = read_camera("camera.yaml")
+    theirs = read_camera("camera_kalibr.yaml")
+    np.testing.assert_allclose(camera.K, K, rtol=0.01)
+    assert camera.fov == 45
+    assert len(camera.distortion) == 4  # Kalibr has no k3
+    np.testing.assert_allclose(theirs.distortion, camera.distortion, rtol=1e-6)
+
+
+def test_another_tools_file_is_converted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    K = np.array([[458.654, 0, 367.215], [0, 457.296, 248.375], [0, 0, 1]])
+    write_camera("folding.yaml", CameraFile(tmp_path, K, (480, 752), (-0.45, 0.0, 0.0, 0.0)))
+    options = {"input": "folding.yaml", "camera_height": 1.4, "export": "colmap"}
+    with pytest.raises(DataError, match=r"folding.yaml: this lens model folds back 262 pixels.* set fov to at most"):
+        saunet.calibrate(saunet.CalibrateOptions(**options))
+    assert not (tmp_path / "camera.yaml").exists()
+    result = saunet.calibrate(saunet.CalibrateOptions(**options, fov=50.0))
+    assert "from folding.yaml: pinhole, fx 458.65" in str(result)
+    camera = read_camera("camera.yaml")
+    assert (camera.camera_height, camera.fov, camera.distortion) == (1.4, 50, (-0.45, 0.0, 0.0, 0.0))
+    np.testing.assert_allclose(read_camera("camera_colmap.txt:1").K, K)
+    with pytest.raises(ConfigError, match=r"camera_colmap.txt exists"):
+        saunet.CalibrateOptions(**options | {"output": "camera.yml"})

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Plain = dict[str, Any]
 Cameras = Iterator[tuple[str, Plain]]
 SUFFIXES = (".yaml", ".yml", ".json", ".txt", ".bin", ".xml")
-EXPORTS = {"ros": "_ros.yaml", "kalibr": "_kalibr.yaml", "colmap": "_cameras.txt", "opencv": "_opencv.yaml"}
+EXPORTS = {"ros": "_ros.yaml", "kalibr": "_kalibr.yaml", "colmap": "_colmap.txt", "opencv": "_opencv.yaml"}
 """Formats that can be written, and the ends of their files' names."""
 
 

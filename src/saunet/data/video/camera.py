@@ -205,7 +205,8 @@ def _numbers(path: Path, key: str, value: Any, counts: Sequence[int]) -> list[fl
 def write_camera(path: str | Path, camera: CameraFile, note: str = "") -> None:
     K, size = camera.K, camera.image_size
     plain: dict[str, Any] = {"image_size": [size[1], size[0]]} if size else {"normalized": True}
-    plain["K"] = [float(f"{number:.8g}") for number in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])]
+    numbers = K.ravel() if K[0, 1] else K[[0, 1, 0, 1], [0, 1, 2, 2]]
+    plain["K"] = [float(f"{number:.8g}") for number in numbers]
     if camera.distortion:
         plain["distortion"] = [float(f"{number:.8g}") for number in camera.distortion]
     if not camera.is_straight:

@@ -46,7 +46,8 @@ def project(model: str, coefficients: Sequence[float], rays: Float[np.ndarray, "
             return shown
         if model in ("fisheye", "thin_prism_fisheye"):
             theta = np.arctan2(rho, Z)
-            u, v = np.where(rho > 0, theta / rho, 1) * X, np.where(rho > 0, theta / rho, 1) * Y
+            ratio: NDArray[np.float64] = np.where(rho > 0, theta / rho, 1)
+            u, v = ratio * X, ratio * Y
             q = theta**2
             if model == "fisheye":
                 scale = 1 + q * (k[0] + q * (k[1] + q * (k[2] + q * k[3])))
@@ -100,13 +101,10 @@ def fold(
 
     Beyond that radius no ray of the model arrives: its numbers were fitted to the middle of the picture only.
     """
-    angles = np.linspace(0, np.pi / 2 - 0.01 if model == "pinhole" else np.pi, 2000)
     around = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-    sines = np.sin(angles)[:, None]
-    rays = np.stack(
-        [sines * np.cos(around), sines * np.sin(around), np.repeat(np.cos(angles)[:, None], len(around), 1)], -1
-    )
-    seen = project(model, coefficients, rays)
+    angles = np.linspace(0, np.pi / 2 - 0.01 if model == "pinhole" else np.pi, 2000)
+    sines, cosines = np.sin(angles)[:, None], np.repeat(np.cos(angles)[:, None], len(around), 1)
+    seen = project(model, coefficients, np.stack([sines * np.cos(around), sines * np.sin(around), cosines], -1))
     grows = np.diff(np.linalg.norm(seen, axis=-1), axis=0) > 0  # NaN does not grow
     last = np.where(grows.all(0), len(angles) - 1, grows.argmin(0))
     ends = np.stack([seen[place, column] for column, place in enumerate(last)]) @ K[:2, :2].T
@@ -152,7 +150,7 @@ def straight_intrinsics(
         edges = np.concatenate(
             [[(x, y) for x in u for y in (0, height - 1)], [(x, y) for y in v for x in (0, width - 1)]]
         )
-        rays = _rays(candidate, edges)
+        rays = rays_of(candidate, edges)
         at = pixels(model, coefficients, K, rays)
         inside = (at > -1).all() and (at[:, 0] < width).all() and (at[:, 1] < height).all()
         return bool(inside and np.arctan(np.hypot(rays[:, 0], rays[:, 1]).max()) < angle)
@@ -177,12 +175,13 @@ def straight_intrinsics(
     if model == "pinhole" and not K[0, 1]:  # OpenCV overlooks skew
         size = (width, height)
         optimal = np.array(cv2.getOptimalNewCameraMatrix(K, np.array(coefficients), size, 0.0, size)[0], np.float64)
-        if fits(optimal):
+        own = straight(widest)  # wider only where OpenCV's five iterations did not converge
+        if fits(optimal) and optimal[0, 0] * optimal[1, 1] < 1.05 * own[0, 0] * own[1, 1]:
             return optimal
     return straight(widest)
 
 
-def _rays(K: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+def rays_of(K: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rays of pixels of a straight picture, z = 1."""
     return np.concatenate([(at - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones((len(at), 1))], axis=1)
 
@@ -204,6 +203,6 @@ def straightening_maps(
     columns = np.arange(width, dtype=np.float64)
     for row in range(height):  # row by row: large pictures need little memory
         at = np.stack([columns, np.full(width, float(row))], axis=1)
-        from_where[row] = pixels(model, coefficients, K, _rays(straight, at))
+        from_where[row] = pixels(model, coefficients, K, rays_of(straight, at))
     first, second = cv2.convertMaps(from_where[..., 0], from_where[..., 1], cv2.CV_16SC2)
     return np.asarray(first), np.asarray(second)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from saunet.data.loading.sampling import evenly
 from saunet.data.video.camera import CameraFile, Lens
 from saunet.data.video.clips import frame_paths
+from saunet.data.video.lens_models import fold, rays_of
 from saunet.errors import ConfigError, DataError, in_range, one_of, positive, suggest
 from saunet.io.images import read_image, resize
 from saunet.io.video import VideoReader
@@ -26,6 +28,8 @@ _FEWEST_CORNERS = 8
 FEWEST_VIEWS = 8
 UNCERTAIN = 0.02
 """Relative standard deviation of the focal length from which a calibration is refused."""
+UNCERTAIN_CORNER = 0.005
+"""Standard deviation of a corner, over the width, from which a calibration is refused."""
 _CELLS = (6, 8)
 """Rows and columns of the grid on which coverage is counted."""
 
@@ -72,7 +76,13 @@ class Board:
                 has = f"dictionary {dictionary} has {len(words.bytesList)} markers and the board needs {needed}"
                 raise ConfigError(f"{has}; {fix}")
             self._charuco = cv2.aruco.CharucoBoard((columns, rows), self.square, marker * self.square, words)
-            self._detector = cv2.aruco.CharucoDetector(self._charuco)
+            self._detectors = [cv2.aruco.CharucoDetector(self._charuco)]
+            if rows % 2 == 0:  # then OpenCV before 4.6 laid the markers out otherwise
+                old = cv2.aruco.CharucoBoard((columns, rows), self.square, marker * self.square, words)
+                old.setLegacyPattern(True)
+                self._detectors.append(cv2.aruco.CharucoDetector(old))
+        self.legacy = 0
+        """Pictures in which only the layout of OpenCV before 4.6 was found."""
 
     def __str__(self) -> str:
         return f"{self.kind} of {self.columns}x{self.rows} squares ({self.columns - 1}x{self.rows - 1} inner corners)"
@@ -108,8 +118,12 @@ class Board:
         return BoardView(points.astype(np.float32), pixels)
 
     def _find_charuco(self, gray: NDArray[np.uint8]) -> BoardView | None:
-        corners, numbers, _, _ = self._detector.detectBoard(gray)
-        if numbers is None or len(numbers) < _FEWEST_CORNERS:
+        for old, detector in enumerate(self._detectors):
+            corners, numbers, _, _ = detector.detectBoard(gray)
+            if numbers is not None and len(numbers) >= _FEWEST_CORNERS:
+                self.legacy += old
+                break
+        else:
             return None
         points = np.asarray(self._charuco.getChessboardCorners())[np.asarray(numbers).ravel()]
         return BoardView(points.astype(np.float32), np.asarray(corners, dtype=np.float32).reshape(-1, 2))
@@ -123,7 +137,9 @@ class Calibration:
     error: float
     """Root mean square reprojection error in pixels."""
     uncertainty: float
-    """Standard deviation of the focal length over the focal length; NaN for a fisheye lens."""
+    """Standard deviation of the focal length over the focal length."""
+    corner: float
+    """Standard deviation in pixels of where the least known corner of the picture lies."""
     coverage: float
     """Fraction of the image in which the board was seen."""
     views: tuple[BoardView, ...]
@@ -141,8 +157,9 @@ def solve(
     views: int = 40,
     max_error: float = 1.0,
     advance: Callable[[int, int | None], None] = lambda done, total: None,
+    k3: bool = True,
 ) -> Calibration:
-    """Calibrate a camera from a video or a folder of pictures of a board held in many places and tilts."""
+    """Calibrate a camera from a video or a folder of pictures of a board; ``k3`` is the third radial number."""
     most = max(FEWEST_VIEWS, views)
     found: list[BoardView] = []
     looked_at, size, example = 0, (0, 0), None
@@ -165,15 +182,23 @@ def solve(
             "keep the whole board in view, sharp and flat"
         )
     chosen = _most_different(found, size, most)
-    K, distortion, error, uncertainty, used = _solve(chosen, size, model)
-    problem = _problem(error, uncertainty, max_error, float(K[0, 0]) / size[1])
+    fit, used = _solve(chosen, size, model, k3)
+    # Without fps, also where the source is a video: it is that recording's, and other recordings have their own.
+    known = fit.error if fit.error > 0 else None
+    camera = CameraFile(Path(source), fit.K, size, tuple(fit.distortion), model, reprojection_error=known)
+    covariance = _covariance(fit, used)
+    uncertainty = float(np.sqrt(np.diag(covariance)[:2]).max() / fit.K[0, 0])
+    problem = _problem(fit.error, uncertainty, max_error, float(fit.K[0, 0]) / size[1])
+    corner = np.inf
+    if not problem:
+        with contextlib.suppress(DataError):  # where there is no straight picture no corner is known
+            corner = _corner(fit, covariance, Lens(camera, *size).K, size)
+        problem = _outside(fit, used, corner, size)
     if problem:
         raise DataError(f"the calibration from {source} is not to be trusted: {problem}")
-    # Without fps, also where the source is a video: it is that recording's, and other recordings have their own.
-    known = error if error > 0 else None
-    camera = CameraFile(Path(source), K, size, tuple(distortion), model, reprojection_error=known)
     dropped = len(chosen) - len(used)
-    return Calibration(camera, error, uncertainty, _coverage(used, size), tuple(used), looked_at, dropped, example)
+    coverage = _coverage(used, size)
+    return Calibration(camera, fit.error, uncertainty, corner, coverage, tuple(used), looked_at, dropped, example)
 
 
 def check_picture(result: Calibration) -> UInt8[np.ndarray, "_ _ 3"]:
@@ -221,48 +246,91 @@ def _feature(view: BoardView, size: tuple[int, int]) -> NDArray[np.float64]:
     return np.concatenate([center, spread, fit[:2].ravel()])
 
 
-def _solve(
-    views: Sequence[BoardView], size: tuple[int, int], model: str
-) -> tuple[NDArray[np.float64], list[float], float, float, list[BoardView]]:
-    """Return K, distortion, error, uncertainty and the views used, without those that fit badly."""
+@dataclass(frozen=True)
+class _Fit:
+    model: str
+    K: NDArray[np.float64]
+    distortion: list[float]
+    error: float
+    poses: tuple[tuple[Any, Any], ...]
+    """Rotation vector and shift of each view."""
+
+    def project(self, points: NDArray[Any], pose: tuple[Any, Any]) -> tuple[NDArray[Any], ...]:
+        """Return n x 2 pixels, and what 2n coordinates change by per fx, fy, cx, cy, distortion, and per pose."""
+        numbers, count = np.array(self.distortion), 4 + len(self.distortion)
+        flat = points.reshape(-1, 1, 3).astype(np.float64)
+        if self.model == "fisheye":
+            seen, J = cv2.fisheye.projectPoints(flat, *pose, self.K, numbers)
+            return np.reshape(seen, (-1, 2)), np.asarray(J)[:, :count], np.asarray(J)[:, count : count + 6]
+        seen, J = cv2.projectPoints(flat, *pose, self.K, numbers)
+        return np.reshape(seen, (-1, 2)), np.asarray(J)[:, 6 : 6 + count], np.asarray(J)[:, :6]
+
+
+def _solve(views: Sequence[BoardView], size: tuple[int, int], model: str, k3: bool) -> tuple[_Fit, list[BoardView]]:
+    """Return the fit and the views used, without those that fit badly."""
     used = list(views)
     while True:
-        K, distortion, error, uncertainty, errors = (_fisheye if model == "fisheye" else _pinhole)(used, size)
+        fit = _fisheye(used, size) if model == "fisheye" else _pinhole(used, size, k3)
+        misses = [fit.project(view.points, pose)[0] - view.pixels for view, pose in zip(used, fit.poses, strict=True)]
+        errors = np.array([np.sqrt((miss**2).sum(1).mean()) for miss in misses])
         good = errors <= max(0.5, 3 * float(np.median(errors)))
         if good.all() or int(good.sum()) < FEWEST_VIEWS:
-            return K, distortion, error, uncertainty, used
+            return fit, used
         used = [view for view, fits in zip(used, good, strict=True) if fits]
 
 
-Solution = tuple[NDArray[np.float64], list[float], float, float, NDArray[np.float64]]
-
-
-def _pinhole(views: Sequence[BoardView], size: tuple[int, int]) -> Solution:
+def _pinhole(views: Sequence[BoardView], size: tuple[int, int], k3: bool) -> _Fit:
     points, pixels = [view.points for view in views], [view.pixels for view in views]
-    result = cv2.calibrateCameraExtended(points, pixels, (size[1], size[0]), None, None)  # type: ignore[call-overload]
-    error, K, distortion, _, _, deviations, _, errors = result
-    uncertainty = float(np.max(np.ravel(deviations)[:2] / np.array([K[0, 0], K[1, 1]])))
-    return np.asarray(K, np.float64), np.ravel(distortion)[:5].tolist(), float(error), uncertainty, np.ravel(errors)
+    flags = 0 if k3 else cv2.CALIB_FIX_K3
+    fit = cv2.calibrateCamera(points, pixels, (size[1], size[0]), None, None, flags=flags)
+    error, K, distortion, rotations, shifts = fit
+    numbers = np.ravel(distortion)[: 5 if k3 else 4].tolist()
+    return _Fit("pinhole", np.asarray(K, np.float64), numbers, float(error), tuple(zip(rotations, shifts, strict=True)))
 
 
-def _fisheye(views: Sequence[BoardView], size: tuple[int, int]) -> Solution:
+def _fisheye(views: Sequence[BoardView], size: tuple[int, int]) -> _Fit:
     points = [view.points[None].astype(np.float64) for view in views]
     pixels = [view.pixels[None].astype(np.float64) for view in views]
     flags = _flag("CALIB_RECOMPUTE_EXTRINSIC") | _flag("CALIB_FIX_SKEW")
-    try:
-        error, K, distortion, rotations, shifts = cv2.fisheye.calibrate(
-            points, pixels, (size[1], size[0]), np.zeros((3, 3)), np.zeros((4, 1)), flags=flags
-        )
-    except cv2.error as reason:
+    height, width = size
+    best, problem = None, ""
+    for focal in (0.0, 0.25, 0.32, 0.4, 0.65):  # in widths; OpenCV's own guess, 0, fails for many wide lenses
+        K = np.array([[focal * width, 0, (width - 1) / 2], [0, focal * width, (height - 1) / 2], [0, 0, 1]])
+        guess = _flag("CALIB_USE_INTRINSIC_GUESS") if focal else 0
+        try:
+            fit = cv2.fisheye.calibrate(points, pixels, (width, height), K, np.zeros((4, 1)), flags=flags | guess)
+            best = fit if best is None or fit[0] < best[0] else best
+            if best[0] < 0.5:
+                break
+        except cv2.error as reason:
+            problem = problem or str(reason).strip().splitlines()[-1]
+    if best is None:
         raise DataError(
-            f"the views do not fit a fisheye lens ({str(reason).strip().splitlines()[-1]}); "
+            f"the views do not fit a fisheye lens ({problem}); "
             "hold the board nearer to the middle and tilt it less, or use lens=pinhole"
-        ) from reason
-    errors = []
-    for each, seen, rotation, shift in zip(points, pixels, rotations, shifts, strict=True):
-        expected, _ = cv2.fisheye.projectPoints(each, rotation, shift, K, distortion)
-        errors.append(float(np.sqrt(((np.asarray(expected) - seen) ** 2).sum(-1).mean())))
-    return np.asarray(K, np.float64), np.ravel(distortion).tolist(), float(error), float("nan"), np.array(errors)
+        )
+    error, K, distortion, rotations, shifts = best
+    poses = tuple(zip(rotations, shifts, strict=True))
+    return _Fit("fisheye", np.asarray(K, np.float64), np.ravel(distortion).tolist(), float(error), poses)
+
+
+def _covariance(fit: _Fit, views: Sequence[BoardView]) -> NDArray[np.float64]:
+    """Return the covariance of fx, fy, cx, cy and the distortion, with the poses of the board left free."""
+    count = 4 + len(fit.distortion)
+    normal, squares, rows = np.zeros((count, count)), 0.0, -count - 6 * len(views)
+    for view, pose in zip(views, fit.poses, strict=True):
+        seen, inner, outer = fit.project(view.points, pose)
+        normal += inner.T @ inner - inner.T @ outer @ np.linalg.pinv(outer) @ inner
+        squares, rows = squares + float(((seen - view.pixels) ** 2).sum()), rows + 2 * len(seen)
+    return np.asarray(squares / rows * np.linalg.inv(normal))
+
+
+def _corner(fit: _Fit, covariance: NDArray[np.float64], straight: NDArray[np.float64], size: tuple[int, int]) -> float:
+    """Return the standard deviation in pixels of where the least known corner of the straight picture is recorded."""
+    corners = np.array([(x, y) for x in (0.0, size[1] - 1) for y in (0.0, size[0] - 1)])
+    _, J, _ = fit.project(rays_of(straight, corners), (np.zeros(3), np.zeros(3)))
+    J = J.reshape(4, 2, -1)
+    return float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ J.transpose(0, 2, 1))[:, -1].max()))
 
 
 def _flag(name: str) -> int:
@@ -281,6 +349,24 @@ def _problem(error: float, uncertainty: float, max_error: float, focal: float) -
         return f"a focal length of {focal:.1f} picture widths is impossible; {remedy}"
     if uncertainty > UNCERTAIN:
         return f"the focal length is known to {uncertainty:.1%} only; {remedy}"
+    return None
+
+
+def _outside(fit: _Fit, views: Sequence[BoardView], corner: float, size: tuple[int, int]) -> str | None:
+    """Return what is wrong with the model where the board was not seen; None if nothing is."""
+    center, (height, width) = fit.K[:2, 2], size
+    seen = max(float(np.linalg.norm(view.pixels - center, axis=1).max()) for view in views)
+    far = float(np.linalg.norm(np.maximum(center, [width - 1, height - 1] - center)))
+    remedy = (
+        f"the board was seen up to {seen:.0f} pixels from the center and the picture reaches {far:.0f}: "
+        "film it along the edges and in all four corners too"
+    )
+    _, radius = fold(fit.model, fit.distortion, fit.K, height, width)
+    if corner == np.inf:
+        what = f"folds back {radius:.0f} pixels from the center" if np.isfinite(radius) else "gives no straight picture"
+        return f"the lens model {what}; {remedy}"
+    if not corner <= UNCERTAIN_CORNER * width:
+        return f"the picture's corners are known to {corner:.0f} pixels only; {remedy}"
     return None
 
 

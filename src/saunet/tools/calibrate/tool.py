@@ -1,15 +1,16 @@
-"""The calibration tool: print a board, or make ``camera.yaml`` from a video or pictures of it."""
+"""The calibration tool: print a board, or make ``camera.yaml`` from pictures of it or from another tool's file."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from saunet.data.video.camera import write_camera
-from saunet.errors import ConfigError, one_of, positive
+from saunet.data.video.calibrations import EXPORTS, SUFFIXES, export_camera, split_name
+from saunet.data.video.camera import Lens, read_camera, write_camera
+from saunet.data.video.lens_models import WIDEST
+from saunet.errors import ConfigError, in_range, one_of, positive
 from saunet.io.images import write_image
 from saunet.io.progress import bar
 from saunet.tools.calibrate.solve import Board, Calibration, check_picture, solve
@@ -28,7 +29,8 @@ class CalibrateOptions:
     """
 
     input: str | None = None
-    """A video, or a folder of pictures, of the board held in many places and tilts."""
+    """A video, or a folder of pictures, of the board held in many places and tilts; or a calibration ``FILE[:camera]``
+    of another tool, to convert."""
     output: str = "camera.yaml"
     """The camera file to write; a picture to check it by is written beside it."""
     board: Literal["chessboard", "charuco"] = "chessboard"
@@ -53,6 +55,10 @@ class CalibrateOptions:
     """Height of the camera above the road in meters, for the camera file."""
     condition: str | None = None
     """Weather or light, for the camera file."""
+    fov: float | None = None
+    """Horizontal degrees of the straightened picture, for the camera file; as wide as it can be if None."""
+    export: Literal["ros", "kalibr", "colmap", "opencv"] | None = None
+    """Also write the camera for this tool, beside ``output``."""
     print_board: str | None = None
     """Write a picture of the board to this file, and do nothing else."""
     overwrite: bool = False
@@ -66,13 +72,23 @@ class CalibrateOptions:
             raise ConfigError(
                 "input is not set; add input=board.mp4 (a video or a folder of pictures), or print_board=..."
             )
-        if Path(self.output).exists() and not self.overwrite:
-            raise ConfigError(f"{self.output} exists; choose another output, or set overwrite=true")
+        if self.export is not None:
+            one_of("export", self.export, EXPORTS)
+        if self.fov is not None:
+            in_range("fov", self.fov, 1.0, WIDEST)
+        for path in filter(None, (Path(self.output), self.exported())):
+            if path.exists() and not self.overwrite:
+                raise ConfigError(f"{path} exists; choose another output, or set overwrite=true")
         one_of("lens", self.lens, ("pinhole", "fisheye"))
         positive("views", self.views)
         positive("max_error", self.max_error)
         if self.camera_height is not None:
             positive("camera_height", self.camera_height)
+
+    def exported(self) -> Path | None:
+        """Return the file for another tool; None if none is wished."""
+        output = Path(self.output)
+        return output.with_name(output.stem + EXPORTS[self.export]) if self.export else None
 
     def target(self) -> Board:
         """Return the board."""
@@ -87,7 +103,7 @@ class CalibrateResult:
     """The camera file, or the picture of the board."""
     summary: str
     calibration: Calibration | None = None
-    """None if a board was printed."""
+    """None if a board was printed or a file converted."""
 
     def __str__(self) -> str:
         return self.summary
@@ -118,24 +134,41 @@ def calibrate(
         how = "print it, glue it to something flat, and measure a square"
         return CalibrateResult(Path(options.print_board), f"{board}: {options.print_board}; {how}")
     assert options.input is not None
-    with bar() as shown:
-        task = shown.add_task("looking for the board", total=None)
-        advance = advance or (lambda done, total: shown.update(task, completed=done, total=total))
-        result = solve(options.input, board, options.lens, options.views, options.max_error, advance)
-    output = Path(options.output)
-    camera = replace(result.camera, camera_height=options.camera_height, condition=options.condition)
-    note = f"from {len(result.views)} views of a {board} in {Path(options.input).name}"
+    result = None
+    if split_name(options.input)[0].suffix.lower() in SUFFIXES:
+        camera = read_camera(options.input)
+        note = f"from {options.input}"
+    else:
+        with bar() as shown:
+            task = shown.add_task("looking for the board", total=None)
+            advance = advance or (lambda done, total: shown.update(task, completed=done, total=total))
+            k3 = options.export != "kalibr"  # which has no such number
+            result = solve(options.input, board, options.lens, options.views, options.max_error, advance, k3)
+        camera = result.camera
+        note = f"from {len(result.views)} views of a {board} in {Path(options.input).name}"
+    own: dict[str, Any] = {"camera_height": options.camera_height, "condition": options.condition, "fov": options.fov}
+    camera = replace(camera, **{key: value for key, value in own.items() if value is not None})
+    if camera.image_size:
+        Lens(camera, *camera.image_size)  # a lens that cannot be straightened is refused before anything is written
+    output, exported, K = Path(options.output), options.exported(), camera.K
+    if exported and options.export:
+        export_camera(exported, camera, options.export)
     write_camera(output, camera, f"saunet calibrate: {note}")
+    known = f"fx {K[0, 0]:.2f}, fy {K[1, 1]:.2f}, cx {K[0, 2]:.2f}, cy {K[1, 2]:.2f}"
+    files = f"camera: {output}" + (f" and {exported}" if exported else "")
+    if result is None:
+        return CalibrateResult(output, f"{note}: {camera.model}, {known}\n{files}")
     picture = output.with_name(f"{output.stem}_check.png")
-    write_image(picture, check_picture(result))
-    K = camera.K
-    known = "" if math.isnan(result.uncertainty) else f"; focal length known to {result.uncertainty:.2%}"
+    write_image(picture, check_picture(replace(result, camera=camera)))
     lines = [
         f"{note} ({result.looked_at} looked at, {result.dropped} left out as misfits)",
-        f"reprojection error {result.error:.3f} px{known}",
-        f"fx {K[0, 0]:.2f}, fy {K[1, 1]:.2f}, cx {K[0, 2]:.2f}, cy {K[1, 2]:.2f}",
+        f"reprojection error {result.error:.3f} px; focal length known to {result.uncertainty:.2%}, "
+        f"the picture's corners to {result.corner:.2f} px",
+        known,
     ]
+    if board.legacy:
+        lines.append("the board has the layout of OpenCV before 4.6 (legacy pattern)")
     if result.coverage < 0.6:
         lines.append(f"the board was seen in {result.coverage:.0%} of the image only: hold it into the corners too")
-    lines.append(f"camera: {output}; look at {picture}: straight lines must be straight on its right side")
+    lines.append(f"{files}; look at {picture}: straight lines must be straight on its right side")
     return CalibrateResult(output, "\n".join(lines), result)
