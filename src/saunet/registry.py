@@ -21,7 +21,7 @@ from saunet.errors import ConfigError, suggest
 C = TypeVar("C", bound=Callable[..., Any])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Entry:
     """A registered name: what it builds and the defaults that make it this variant."""
 

@@ -51,7 +51,8 @@ _CONVERTED = (tuple, Sequence, Mapping, typing.Literal)
 @contextmanager
 def hydra(tool: Tool, table: Table, extra: str | None = None) -> Iterator[Hydra]:
     """Give Hydra, knowing the keys of a tool and of all components; an extra folder of YAML files comes first."""
-    _register(table, [tool])
+    _register(table)
+    _register_tool(table, tool)
     setbase("1.3")
     setup_globals()
     path = create_config_search_path(str(config_dir()))
@@ -101,17 +102,25 @@ def _source(tool: str, table: Table) -> type[FileConfigSource]:
 
 def register_configs() -> None:
     """Give Hydra the typed keys of all tools and components, for ``hydra.compose``."""
-    _register(read(), [tool for tool in TOOLS.values() if tool.options is not None])
+    table = read()
+    _register(table)
+    for tool in TOOLS.values():
+        if tool.options is not None:
+            _register_tool(table, tool)
 
 
-def _register(table: Table, tools: Sequence[Tool]) -> None:
+@functools.cache
+def _register_tool(table: Table, tool: Tool) -> None:
+    node = table.tools[tool.name]
+    # The trainer group's members bring the types of its keys.
+    keys = (dataclasses.replace(key, type="any") if key.name == TRAINER[0] else key for key in node.keys)
+    made = structured(dataclasses.replace(node, keys=tuple(keys)))
+    ConfigStore.instance().store(name=f"{tool.config or tool.name}_schema", node=made)
+
+
+@functools.lru_cache(maxsize=1)  # the latest table is what the store holds
+def _register(table: Table) -> None:
     store = ConfigStore.instance()
-    for tool in tools:
-        node = table.tools[tool.name]
-        # The trainer group's members bring the types of its keys.
-        keys = (dataclasses.replace(key, type="any") if key.name == TRAINER[0] else key for key in node.keys)
-        made = structured(dataclasses.replace(node, keys=tuple(keys)))
-        store.store(name=f"{tool.config or tool.name}_schema", node=made)
     for group, nodes in table.groups.items():
         for name, each in nodes.items():
             store.store(group=group, name=name, node=structured(each))

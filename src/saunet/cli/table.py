@@ -15,12 +15,13 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import saunet
 from saunet import schema
 from saunet.errors import ConfigError
-from saunet.registry import REGISTRIES
+from saunet.registry import REGISTRIES, Entry
 
 _TEXT = """\
 train: train a depth network on driving video
@@ -60,7 +61,7 @@ demo: the README's demo: train on rendered video, evaluate, draw
 """Each tool's name, the key that plain words stand for (``*`` takes several), what it does, and examples."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tool:
     """One tool: ``saunet predict`` calls `saunet.predict` with `saunet.PredictOptions`.
 
@@ -125,7 +126,7 @@ def config_dir() -> Path:
     raise ConfigError(f"no configuration files beside {package}; reinstall saunet")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
     """Config keys."""
 
@@ -181,9 +182,15 @@ def read() -> Table:
 
     What plugins registered in this process is part of it and never written.
     """
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    registered = tuple(entry for registry in REGISTRIES.values() for entry in registry.registered())
+    return _read(_state(), os.environ.get("XDG_CACHE_HOME"), registered)
+
+
+@lru_cache(maxsize=4)
+def _read(state: str, cache_home: str | None, registered: tuple[Entry, ...]) -> Table:
+    cache = Path(cache_home or Path.home() / ".cache")
     where = hashlib.sha256(f"{sys.executable} {saunet.__path__[0]}".encode()).hexdigest()[:12]
-    file, state, plain = cache / "saunet" / f"keys-{where}.json", _state(), None
+    file, plain = cache / "saunet" / f"keys-{where}.json", None
     with suppress(OSError, ValueError):
         plain = json.loads(file.read_bytes())
     if plain is None or plain["state"] != state:
