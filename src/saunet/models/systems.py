@@ -87,7 +87,7 @@ class ModelOptions:
         """
         given = dict(models.entry(name).preset)
         parts = {kind: _spec(kind, given.pop(kind)) for kind in ("encoder", "decoder", "pose") if given.get(kind)}
-        return cls(**parts, **given)
+        return cls(**{**given, **parts})
 
     def build(self) -> DepthAndPose:
         """Build the networks with random weights, or with those that the parts name."""
