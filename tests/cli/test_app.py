@@ -258,3 +258,17 @@ def test_completion(echo: Said, capsys: pytest.CaptureFixture[str]) -> None:
             [sys.executable, "-m", "saunet", "--completion", "bash"], capture_output=True, text=True, check=True
         ).stdout
     )
+
+
+def test_resume_is_listed_and_has_help(capsys: pytest.CaptureFixture[str]) -> None:
+    app.main(["--help"])
+    assert "$ saunet resume outputs/" in capsys.readouterr().out
+    app.main(["resume", "--help"])
+    assert "usage: saunet resume RUN" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("tool", ["train", "doctor", "evaluate", "report"])
+def test_help_says_where_results_go(tool: str, capsys: pytest.CaptureFixture[str]) -> None:
+    app.main([tool, "--help"])
+    said = capsys.readouterr().out
+    assert f" = outputs/{'NAME' if tool == 'train' else tool}/DATE_TIME" in said

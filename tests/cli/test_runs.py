@@ -195,6 +195,6 @@ def test_sigterm_ends_a_run_with_a_message_and_a_record(tmp_path: Path) -> None:
         err = errors.read_text()
         assert run.returncode == 143
         assert "saunet train: stopped by SIGTERM after step" in err
-        assert f"resume with resume={tmp_path}/r/checkpoints/last.ckpt" in err
+        assert f"resume with saunet resume {tmp_path}/r" in err
         assert record(tmp_path / "r")["status"] == "interrupted"
         assert ("resuming from" in heard + out) == (attempt == 1)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import yaml
 
 import saunet
 from saunet.data.video.camera import CameraFile, write_camera
@@ -81,6 +82,21 @@ def measure(
     known = Camera(K, 64, 192) if camera else None
     folder = recording / "out"
     scale_predictor(ScaleOptions(**scale), predictor, source or str(recording / "left"), known, folder, "unused.ckpt")
+
+
+def test_the_height_in_a_camera_file_counts_unless_another_is_given(recording: Path, street: SyntheticDrive) -> None:
+    (recording / "camera.yaml").write_text(
+        yaml.safe_dump({"image_size": [192, 64], "K": street.intrinsics().tolist(), "camera_height": 1.65})
+    )
+    for given, height in ((None, 1.65), (3.3, 3.3)):
+        options = saunet.PredictOptions(
+            checkpoint="unused.ckpt", input=recording / "left", output=recording / f"out{height}", outputs=["npy"],
+            camera=recording / "camera.yaml", scale=ScaleOptions(method="camera_height", camera_height=given),
+        )  # fmt: skip
+        predictor = TrueDepth(street)
+        saunet.predict(options, predictor)
+        assert predictor.scale is not None
+        assert predictor.scale.factor == pytest.approx(height / 1.65 / UNKNOWN, rel=0.03)
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,13 @@ class Graded(Protocol):
     exit_code: int
 
 
+RESUME = "continue a stopped training in its folder, with its own settings"
+RESUME_HELP = """\
+RUN is the run's folder, the one with run.json. Its command line is repeated from its last checkpoint; relative paths in
+it start at the current folder. What follows differs: `saunet resume RUN epochs=20` trains longer. `saunet train --help`
+lists the keys."""
+
+
 @runtime_checkable
 class Costed(Protocol):
     """A result with a number that a search over sweeps minimizes; None if there is none."""
@@ -86,6 +93,8 @@ def overview() -> str:
     lines = [f"saunet {__version__}: self-supervised monocular depth", "", "usage: saunet TOOL [KEY=VALUE ...]", ""]
     for name, tool in TOOLS.items():
         lines += [f"  {name:{width}}  {tool.summary}", f"  {'':{width}}  $ saunet {tool.examples[0]}"]
+        if name == "train":
+            lines += [f"  {'resume':{width}}  {RESUME}", f"  {'':{width}}  $ saunet resume outputs/train/RUN"]
     return "\n".join([*lines, "", "`saunet TOOL --help` lists a tool's keys; --completion bash|zsh|fish sets up Tab."])
 
 
@@ -128,6 +137,9 @@ def _run(name: str, argv: Sequence[str]) -> int:
         print("\n".join((help_.complete if name == "--complete" else help_.completion)(argv[0] if argv else "")))
         return 0
     if name == "resume":
+        if {"-h", "--help"} & set(argv):
+            print(f"saunet resume: {RESUME}\n\nusage: saunet resume RUN [KEY=VALUE ...]\n\n{RESUME_HELP}")
+            return 0
         name, argv = "train", resumed(argv)
     tool = TOOLS[name]
     argv = [tool.words.get(argv[0], argv[0]), *argv[1:]] if argv else []

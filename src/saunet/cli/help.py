@@ -6,6 +6,7 @@ import argparse
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from saunet import schema
@@ -51,7 +52,7 @@ def tool_help(tool: Tool, table: Table, given: Mapping[str, str]) -> str:
     lines += [f"  $ saunet {example}" for example in tool.examples]
     if tool.aliases:
         lines += ["", "short forms:", *(f"  {short}=... is {key}=..." for short, key in tool.aliases.items())]
-    lines += ["", "keys:", *described(node.keys, "  ")]
+    lines += ["", "keys:", *described(_with_folder(node.keys, tool), "  ")]
     chosen = chosen_names(tool, table, given)
     for group in groups(node):
         now = chosen.get(group)
@@ -60,6 +61,18 @@ def tool_help(tool: Tool, table: Table, given: Mapping[str, str]) -> str:
     return "\n".join(
         each for line in lines for each in (textwrap.wrap(line, WIDTH, subsequent_indent=" " * 8) if line else [""])
     )
+
+
+def _with_folder(keys: Sequence[schema.Key], tool: Tool) -> list[schema.Key]:
+    """Give the key of the folder for results the default that the tool's YAML file gives it."""
+    found = re.search(r"^    dir: (outputs/\S+)", _yaml(tool), re.MULTILINE)
+    folder = found and found[1].replace("${name}", "NAME").partition("${now")[0] + "DATE_TIME"
+    return [replace(key, default=folder) if folder and key.name == "output_dir" else key for key in keys]
+
+
+def _yaml(tool: Tool) -> str:
+    file = config_dir() / f"{tool.config or tool.name}.yaml"
+    return file.read_text(encoding="utf-8") if file.is_file() else ""
 
 
 def described(keys: Sequence[schema.Key], prefix: str) -> Iterator[str]:
@@ -101,9 +114,7 @@ def groups(node: schema.Node) -> Iterator[str]:
 
 def chosen_names(tool: Tool, table: Table, given: Mapping[str, str]) -> dict[str, str]:
     """Return what is chosen for each group: what the command line says, else what the tool's YAML file says."""
-    file = config_dir() / f"{tool.config or tool.name}.yaml"
-    text = file.read_text(encoding="utf-8") if file.is_file() else ""
-    chosen = {**dict(re.findall(r"^  - (\w+): (?!null$)(\w+)$", text, re.MULTILINE)), **given}
+    chosen = {**dict(re.findall(r"^  - (\w+): (?!null$)(\w+)$", _yaml(tool), re.MULTILINE)), **given}
     model = table.components["model"].get(chosen.get("model", ""))
     parts = {f"model/{key.name}": str(key.default) for key in (model.keys if model else ())}
     return {**{group: name for group, name in parts.items() if group in table.groups}, **chosen}

@@ -90,7 +90,7 @@ class EvaluateOptions:
         truth_cache: Folder that keeps projected LiDAR ground truth.
         export: Folder for the predictions as 16-bit PNG, meters x 256.
         device: Where to predict; ``auto`` takes a GPU if there is one.
-        output_dir: Folder for the results; None writes none.
+        output_dir: Folder for the results; None, as in Python, writes none.
 
     Raises:
         ConfigError: if an option cannot work, or not beside another one.

@@ -52,7 +52,7 @@ class ExportOptions:
 
     Args:
         checkpoint: The model: a checkpoint, an exported folder, or a shipped model's name.
-        output: The folder for the files of `FILES`, ``config.json``, ``report.json`` and ``README.md``.
+        output: The folder for the model's files, ``config.json``, ``report.json`` and ``README.md``.
         formats: ``onnx``, ``program`` (torch.export), ``compiled`` (AOTInductor), ``safetensors``.
         images: Real images to compare on, besides random ones: a file, a folder or a pattern, in Python also several;
             at most eight are taken, evenly.

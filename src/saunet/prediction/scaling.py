@@ -26,8 +26,12 @@ def apply_scale(
     camera: Camera | None,
     folder: Path,
     checkpoint: str | Path,
+    camera_height: float | None = None,
 ) -> None:
-    """Give a predictor the scale that is asked for; print and write down what was measured."""
+    """Give a predictor the scale that is asked for; print and write down what was measured.
+
+    The camera's height is the one of its file, and counts unless the options give one.
+    """
     if options.measures:
         import torch
 
@@ -51,7 +55,8 @@ def apply_scale(
             if pose is not None:
                 pose, offsets = pose.eval(), model.record.offsets
         with _batches(options, predictor, source, camera, offsets) as batches:
-            estimate = estimate_scale(options.method, batches, depth, pose, options.camera_height)
+            height = camera_height if options.camera_height is None else options.camera_height
+            estimate = estimate_scale(options.method, batches, depth, pose, height)
         print(estimate)
         write_json(folder / "scale.json", estimate.as_json())
         predictor.scale = estimate.scale()

@@ -192,8 +192,8 @@ def predict(
         if predictor is None:
             device = str(usable_device(options.device))
             predictor = load(options.checkpoint, device=device, flip=options.flip, keep_aspect=options.keep_aspect)
-        camera = _camera(options, recording, predictor)
-        apply_scale(options.scale, predictor, options.input, camera, folder, options.checkpoint)
+        camera, height = _camera(options, recording, predictor)
+        apply_scale(options.scale, predictor, options.input, camera, folder, options.checkpoint, height)
         print(f"depth is {predictor.unit}")
         remove_partial_files(folder)
         if "trajectory" in outputs and odometer is None:
@@ -306,33 +306,41 @@ def _refuse_existing(sink: Sink, overwrite: bool) -> None:
             raise ConfigError(f"{path} exists; choose another output folder, or set overwrite=true")
 
 
-def _camera(options: PredictOptions, recording: Recording, predictor: ImagePredictor) -> Camera | None:
-    """Return the true intrinsics of what is predicted, None if they are not given; make the predictor undistort."""
+def _camera(
+    options: PredictOptions, recording: Recording, predictor: ImagePredictor
+) -> tuple[Camera | None, float | None]:
+    """Return the true intrinsics of what is predicted and the camera's height, None if they are not given.
+
+    Makes the predictor undistort.
+    """
     given = options.camera if options.undistort is None else options.undistort
     if given is None or isinstance(given, Camera):
-        return given
+        return given, None
     numbers = _numbers(str(given)) if isinstance(given, str | Path) else given
     if numbers is not None:
         size = recording.first_size
-        return None if size is None else Camera.from_numbers(numbers, *size)
+        return None if size is None else Camera.from_numbers(numbers, *size), None
+    from saunet.data.video.calibrations import split_name
     from saunet.data.video.camera import Undistorter, read_camera
 
     file = read_camera(str(given))
     if options.undistort is not None:
         predictor.undistort = undistorter = Undistorter(file)
-        predictor.undistorted_by = f"camera {hashlib.sha256(file.path.read_bytes()).hexdigest()[:16]}"
+        content = hashlib.sha256(f"{split_name(str(given))[1]}\n".encode() + file.path.read_bytes())
+        predictor.undistorted_by = f"camera {content.hexdigest()[:16]}"
         size = file.image_size or recording.first_size
         if size is None:
-            return None
+            return None, file.camera_height
         lens = undistorter.lens(*size)
-        return Camera(lens.K, lens.height, lens.width)
+        return Camera(lens.K, lens.height, lens.width), file.camera_height
     if not file.is_straight:
         raise ConfigError(
             f"camera={given} describes a lens with distortion, and points need straight images; "
             f"set undistort={given} in its place"
         )
     size = recording.first_size
-    return None if size is None else Camera(file.intrinsics(*size, "the images"), *size)
+    camera = None if size is None else Camera(file.intrinsics(*size, "the images"), *size)
+    return camera, file.camera_height
 
 
 def _numbers(text: str) -> list[float] | None:

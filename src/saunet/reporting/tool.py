@@ -48,7 +48,7 @@ class ReportOptions:
         figures: Draw curves, if matplotlib is installed.
         device: Where scenes are predicted; ``auto`` takes a GPU if there is one.
         flip: Average with the prediction of the mirrored image.
-        output_dir: Folder for the page, its Markdown, its tables and its pictures; None writes none.
+        output_dir: Folder for the page, its Markdown, its tables and its pictures; None, as in Python, writes none.
 
     Raises:
         ConfigError: if an option cannot work.

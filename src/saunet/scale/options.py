@@ -20,8 +20,9 @@ class ScaleOptions:
     """How depth becomes meters without ground truth; see docs/scale.md.
 
     Args:
-        method: One of `SCALE_METHODS`.
-        camera_height: Meters from the road to the camera; by default what the data say.
+        method: ``auto`` (the factor that the checkpoint stores, if any), ``none``, ``stored``, or one that measures:
+            ``camera_height``, ``speed``, ``stereo``.
+        camera_height: Meters from the road to the camera; by default what the data or ``camera.yaml`` say.
         speeds: A CSV file with the columns ``time`` or ``frame``, ``speed`` and, of several drives, ``drive``.
         fps: Frames per second of the speeds.
         partner: Images of the other camera of a stereo pair.

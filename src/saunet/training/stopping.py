@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -18,7 +19,7 @@ from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from torch import distributed
 
 from saunet.errors import SaunetError, positive
-from saunet.runs.folder import Stopped, mark_lost
+from saunet.runs.folder import Stopped, mark_lost, read
 
 LAST = "last.ckpt"
 
@@ -26,7 +27,12 @@ LAST = "last.ckpt"
 def way_on(folder: str | Path) -> str:
     """Return how a run with this checkpoint folder is resumed, as the end of a sentence."""
     last = Path(folder) / LAST
-    return f"resume with resume={last}" if last.is_file() else "no checkpoint was written yet, so start again"
+    if not last.is_file():
+        return "no checkpoint was written yet, so start again"
+    run = last.parent.parent
+    if last.parent.name == "checkpoints" and read(run).get("overrides"):  # started from a command line
+        return f"resume with saunet resume {shlex.quote(str(run))}"
+    return f"resume with resume={last}"
 
 
 class GracefulStop(Callback):
