@@ -108,7 +108,7 @@ TOOLS["demo"] = replace(
     preset=("experiment=demo",),
 )
 TRAINER = ("trainer", "lightning", "lightning:Trainer", "lightning.Trainer")
-"""A config node that is no component: its group and name, what it configures, and the path to build it from."""
+"""A config node that is not a component: its group and name, what it configures, and the path to build it from."""
 PLUGINS = schema.Key(
     "plugins", "list[str]", [], "Your own modules or .py files, imported first; they may register components."
 )

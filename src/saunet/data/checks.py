@@ -20,7 +20,7 @@ SHRUNK = 0.3
 """A center nearer than this to a corner, both ways, is that of K of another image size; crops move it one way."""
 ROTATION_ERROR = 1e-3
 """Largest difference of R R^T from 1; matrices printed with seven digits, as KITTI's, are within 2e-7."""
-LOOKED_AT = 5  # frames whose size is looked at: a broken or odd one among them decides nothing
+LOOKED_AT = 5  # frames whose size is read: a broken or odd one among them must not decide
 
 
 def check_intrinsics(

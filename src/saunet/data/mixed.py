@@ -62,7 +62,7 @@ class MixedDataModule(DepthDataModule):
         for name, source in sources.items():
             if not isinstance(source, DepthDataModule) or isinstance(source, MixedDataModule) or "/" in name:
                 raise ConfigError(
-                    f"data.sources.{name} is {type(source).__name__}; it must be a data module that is no mixture, and "
+                    f"data.sources.{name} is {type(source).__name__}; it must be a data module other than a mixture, and "
                     "its name must not contain '/'"
                 )
             self.sources[name] = self._fitted(name, source)

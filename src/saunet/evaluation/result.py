@@ -391,7 +391,7 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
 def as_json(result: EvaluationResult) -> dict[str, object]:
     """Return the summaries and the exact rules they were computed under as plain data; NaN becomes None.
 
-    ``images`` holds the `fingerprint` of each protocol's images, by which others tell whether numbers compare.
+    ``images`` holds the `fingerprint` of each protocol's images, which shows whether numbers are comparable.
     """
     content: dict[str, object] = {
         "settings": dict(result.settings),

@@ -9,7 +9,7 @@ from rich.console import Console
 
 
 def bar(show: bool = True, unit: str = "", taken: bool = False) -> progress.Progress:
-    """Return a progress bar with counts and the time left; silent where nobody looks (a file, a pipe)."""
+    """Return a progress bar with counts and the time left; silent in a file or a pipe."""
     console = Console(stderr=True)
     columns: list[progress.ProgressColumn] = [progress.BarColumn(), progress.MofNCompleteColumn()]
     columns += [progress.TextColumn(unit)] if unit else []

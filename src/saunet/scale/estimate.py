@@ -159,7 +159,7 @@ def _measurement(
     if method == "speed":
         if motion is None:
             raise ConfigError(
-                "scale.method=speed needs the pose network, which this model has not; use a checkpoint of a training "
+                "scale.method=speed needs a pose network, which this model does not have; use a checkpoint of a training "
                 "on video, or another method"
             )
         return "speed", lambda batch: speed_factors(motion(batch["target"], batch["sources"]), batch["distance"])

@@ -365,7 +365,7 @@ def _trainer(options: TrainOptions, loggers: list[Any]) -> Trainer:
 
 
 def _part(key: str, node: Any, kind: type) -> Any:
-    """Build a callback, logger or part of the trainer from its node; what is no node is returned as it is."""
+    """Build a callback, logger or part of the trainer from its node; anything else is returned as it is."""
     if isinstance(node, list | tuple):
         return [_part(key, each, object) for each in node]
     if node is None or not isinstance(node, Mapping):

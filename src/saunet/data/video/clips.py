@@ -53,7 +53,7 @@ class Recording:
 
     paths: tuple[Path, ...]
     numbers: tuple[int, ...]  # number of each in the clip as recorded, from 0
-    fps: float | None  # frames a second as recorded; None where nobody says
+    fps: float | None  # frames per second as recorded; None if unknown
     missing: int = 0  # frames at the end that a video claims to hold and that cannot be decoded
     passed_over: int = 0  # frames between those taken, which the frame rate asked for does not need
     times: tuple[float, ...] | None = None
