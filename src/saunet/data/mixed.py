@@ -62,8 +62,8 @@ class MixedDataModule(DepthDataModule):
         for name, source in sources.items():
             if not isinstance(source, DepthDataModule) or isinstance(source, MixedDataModule) or "/" in name:
                 raise ConfigError(
-                    f"data.sources.{name} is {type(source).__name__}; it must be a data module other than a mixture, and "
-                    "its name must not contain '/'"
+                    f"data.sources.{name} is {type(source).__name__}; it must be a data module other than a mixture, "
+                    "and its name must not contain '/'"
                 )
             self.sources[name] = self._fitted(name, source)
         self._names = {

@@ -74,8 +74,8 @@ class Buckets:
 def near_edge(truth: Float[Tensor, "h w"], radius: int, ratio: float) -> Bool[Tensor, "h w"]:
     """Find pixels whose measured neighbors in the same row differ in depth by more than a factor.
 
-    Only pixels of the same row are compared: along it a flat road keeps its depth, while upwards it recedes without any edge. Works
-    for dense depth and for scan lines, but takes in walls that recede fast; `depth_edges` is sharper.
+    Only pixels of the same row are compared: along it a flat road keeps its depth, while upwards it recedes without any
+    edge. Works for dense depth and for scan lines, but takes in walls that recede fast; `depth_edges` is sharper.
     """
     if truth.numel() == 0:
         return truth > 0

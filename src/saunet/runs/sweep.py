@@ -68,6 +68,9 @@ def sweeps_ratio(runs: Sequence[Run]) -> bool:
     return bool(keys) and keys <= {"objective.alpha", "objective.beta"} and len(ratios) > 1
 
 
+_LONGEST_LABEL = 32  # characters; single runs whose settings take more go by their folders
+
+
 def labels(groups: Sequence[Sequence[Run]]) -> list[list[str]]:
     """Return a short name for every run, unlike all others, made of what sets it apart within its group."""
     named = [_labels(group) for group in groups]
@@ -87,7 +90,9 @@ def _labels(runs: Sequence[Run]) -> list[str]:
     if sweeps_ratio(runs) and None not in ratios:
         return [f"{RATIO} = {value:.4g}" for value in ratios]
     keys = differing(runs, by_overrides=all(run.job is not None for run in runs))
-    return [_label(run, keys) for run in runs]
+    named = [_label(run, keys) for run in runs]
+    single = any(run.job is None for run in runs)
+    return [run.name for run in runs] if single and max(map(len, named), default=0) > _LONGEST_LABEL else named
 
 
 def _label(run: Run, keys: Sequence[str]) -> str:

@@ -159,8 +159,8 @@ def _measurement(
     if method == "speed":
         if motion is None:
             raise ConfigError(
-                "scale.method=speed needs a pose network, which this model does not have; use a checkpoint of a training "
-                "on video, or another method"
+                "scale.method=speed needs a pose network, which this model does not have; use a checkpoint of a "
+                "training on video, or another method"
             )
         return "speed", lambda batch: speed_factors(motion(batch["target"], batch["sources"]), batch["distance"])
     return "stereo baseline", lambda batch: stereo_factors(

@@ -175,8 +175,8 @@ class MovingAverage(WeightAveraging):
     """Exponential moving average of a model's parameters and buffers, which Lightning validates and saves.
 
     The first steps weigh more than ``decay`` says, so that the fresh weights are soon forgotten: after n steps the
-    decay is at most (1 + n) / (10 + n). Tensors that are not floating-point (a counter) are copied. A checkpoint holds the
-    average as ``state_dict`` and the weights that are trained as ``current_model_state``.
+    decay is at most (1 + n) / (10 + n). Tensors that are not floating-point (a counter) are copied. A checkpoint
+    holds the average as ``state_dict`` and the weights that are trained as ``current_model_state``.
     """
 
     def __init__(self, decay: float) -> None:
