@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pickle
@@ -11,7 +12,7 @@ import pytest
 from clip_tree import CAMERA, frames, make_clip, make_video
 from jaxtyping import TypeCheckError
 
-from saunet.data.video.clips import every, find_clips, frame_paths, read_clip
+from saunet.data.video.clips import CUT, cuts, every, find_clips, frame_paths, read_clip, relative_change
 from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 
@@ -128,6 +129,45 @@ def test_doubled_and_static_frames_are_left_out_and_counted(tmp_path):
     kept = module(tmp_path / "r", static="keep", val_share=0.0)
     kept.setup("fit")
     assert len(names(kept, "train")) == 14
+
+
+def test_a_clip_is_split_at_cuts_and_loops(tmp_path):
+    one, other = frames(8, 1), frames(8, 1, seed=1)
+    folder = make_clip(tmp_path / "r", "a", [*one, *other, *one])
+    data = module(tmp_path / "r", val_share=0.0)
+    data.setup("fit")
+    drive = data.drives()[0]
+    assert drive.left_out["split at cuts"] == 2
+    assert list(drive.indices) == [*range(8), *range(9, 17), *range(18, 26)]
+    assert [drive.recorded(index) for index in drive.indices] == list(range(24))  # nothing is lost
+    assert len(names(data, "train")) == 3 * 6
+    assert "2 split at cuts" in data.summary("train")
+    assert len(list(folder.iterdir())) == 24
+
+
+def test_fast_motion_is_no_cut():
+    quick = frames(12, 12)  # farther than the texture's grain: no frame resembles the one before
+    change = np.array([np.nan, *(relative_change(a, b) for a, b in itertools.pairwise(quick))])
+    assert (change[1:] > CUT).all()
+    assert not cuts(change).any()
+    assert np.flatnonzero(cuts(np.array([np.nan, 0.3, 0.9, 0.3, 0.3, 0.9, 0.9, 0.9]))).tolist() == [2]
+
+
+def test_frames_of_one_color_are_told(tmp_path):
+    pictures = frames(8)
+    black = [np.zeros_like(pictures[0])] * 3
+    make_video(tmp_path / "r" / "v.avi", [*pictures[:4], *black, *pictures[4:]])
+    data = module(tmp_path / "r", val_share=0.0)
+    with pytest.warns(UserWarning, match=r"3 frames of .*v\.avi have one single color"):
+        data.setup("fit")
+    drive = data.drives()[0]
+    assert drive.left_out["doubled"] == 2  # of the three, one is left, with no neighbor on either side
+    assert drive.left_out["split at cuts"] == 2
+    with pytest.warns(UserWarning, match="one single color"):  # also from the cache
+        module(tmp_path / "r").drives()
+    make_video(tmp_path / "b" / "v.avi", black)
+    with pytest.raises(DataError, match=r"every one of the 3 frames of .* has one single color"):
+        module(tmp_path / "b").drives()
 
 
 def test_even_steps_of_parallax(tmp_path):

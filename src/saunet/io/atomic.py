@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -19,13 +20,18 @@ _HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
 _PARTIAL = re.compile(rf"\..*\.{_HOST}\.(\d+)\.partial(\.\w+)?")
 
 
-def remove_partial_files(folder: str | Path) -> list[Path]:
-    """Remove what `replacing` left below a folder in processes of this machine that were killed; return what it was."""
-    found = ((path, _PARTIAL.fullmatch(path.name)) for path in Path(folder).rglob(".*.partial*"))
-    gone = [path for path, name in found if name and path.is_file() and not process_lives(int(name[1]))]
+def partial_name(name: str, suffix: str = "") -> str:
+    """Return how this process calls what becomes ``name``, a file or a folder, while it is incomplete."""
+    return f".{name}.{_HOST}.{os.getpid()}.partial{suffix}"
+
+
+def remove_partial_files(folder: str | Path, pattern: str = "**/.*.partial*") -> list[Path]:
+    """Remove what processes of this machine that were killed left incomplete in a folder; return what it was."""
+    found = ((path, _PARTIAL.fullmatch(path.name)) for path in Path(folder).glob(pattern))
+    gone = [path for path, name in found if name and not process_lives(int(name[1]))]
     for path in gone:
         with contextlib.suppress(OSError):
-            path.unlink()
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
     return gone
 
 
@@ -48,7 +54,7 @@ def replacing(path: str | Path, error: type[SaunetError] = DataError) -> Iterato
     ever reads half a file, even after Ctrl-C, a full disk or a power cut (data reach the disk before the name does).
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem[:100]}.{_HOST}.{os.getpid()}.partial{path.suffix}")
+    temporary = path.with_name(partial_name(path.stem[:100], path.suffix))
     try:
         if path.is_dir():
             raise error(f"cannot write {path}: a folder has this name; choose another name")

@@ -57,6 +57,18 @@ def test_a_good_clip_is_described_and_drawn(tmp_path):
     assert manifest_of(found, findings, "m.json").leave_out == {}
 
 
+def test_cuts_are_counted_whoever_reads_the_frames(tmp_path):
+    one, other = frames(10, 1), frames(10, 1, seed=1)
+    make_clip(tmp_path / "r", "a", [*one, *other])
+    text = look(campus(tmp_path / "r"))[2]
+    assert "note: places where the picture changes altogether (cuts, loops, recordings in one folder): 1" in text
+    assert "hardly resemble" not in text  # no sample reaches across
+    images = make_drive(tmp_path / "k", 1, frames=range(20), sides=(2,)) / "image_02" / "data"
+    for number, picture in enumerate([*one, *other]):
+        cv2.imwrite(str(images / f"{number:010d}.png"), cv2.resize(picture, (60, 20)))
+    assert "warning: 1 frames hardly resemble their neighbor, such as 10 of" in look(kitti(tmp_path / "k"))[2]
+
+
 def test_bad_frames_are_found_and_left_out(tmp_path):
     drive = make_drive(tmp_path, 1, frames=range(20), sides=(2,))
     pictures = frames(20, [4] * 8 + [0] * 2 + [4] * 10, size=(20, 60))

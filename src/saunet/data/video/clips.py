@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from saunet.data.loading.selecting import FLOW_WIDTH, MIN_FLOW, median_flow
 from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera
 from saunet.errors import DataError
-from saunet.io.atomic import write_json
+from saunet.io.atomic import partial_name, remove_partial_files, write_json
 from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order, read_image, resize
 from saunet.io.plain import read_json
 from saunet.io.video import VIDEO_SUFFIXES, VideoReader, nearest_steps
@@ -32,6 +32,10 @@ _NO_CLIPS = frozenset({"@eaDir", "__MACOSX"})
 QUALITY = 95  # JPEG quality of cached frames
 SAME_PICTURE = 0.01
 """Mean difference over the picture's standard deviation under which two frames are the same picture twice."""
+CUT = 0.75
+"""The same measure from which two frames may be of different scenes (1.13 if nothing matches): KITTI's neighbors differ
+by up to 0.5, frames of different recordings by 0.88 to 1.0."""
+PEAK = 1.3  # times the changes around it that a cut exceeds: fast motion lasts, a cut does not
 
 
 class FramesCacheError(DataError):
@@ -56,6 +60,7 @@ class Recording:
     fps: float | None  # frames per second as recorded; None if unknown
     missing: int = 0  # frames at the end that a video claims to hold and that cannot be decoded
     passed_over: int = 0  # frames between those taken, which the frame rate asked for does not need
+    plain: int = 0  # frames of a video that have one single color, as where nothing could be decoded
     times: tuple[float, ...] | None = None
     """Seconds of each from any fixed origin, by the video or by stamps in the names; None if unknown."""
 
@@ -115,6 +120,7 @@ def read_clip(
     try:
         facts = read_json(folder / "clip.json")
         numbers, rate, missing = tuple(facts["numbers"]), facts["fps"], int(facts["missing"])
+        plain = int(facts.get("plain", 0))
         times = None if facts["times"] is None else tuple(map(float, facts["times"]))
         count = int(facts["count"])
         if not numbers or (times is not None and len(times) != len(numbers)):
@@ -124,7 +130,7 @@ def read_clip(
     paths = frame_paths(folder)
     if len(paths) != len(numbers):
         raise DataError(f"{folder} holds {len(paths)} of {len(numbers)} frames; delete it, so that it is made again")
-    return Recording(tuple(paths), numbers, rate, missing, count - len(numbers), times)
+    return Recording(tuple(paths), numbers, rate, missing, count - len(numbers), plain, times)
 
 
 def _read_folder(clip: Clip, fps: float | None) -> Recording:
@@ -158,10 +164,11 @@ def _decode(
     advance: Callable[[int, int | None], None],
 ) -> None:
     """Write the frames of a video that are wanted, into a folder that gets its name only when it is complete."""
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    partial = folder.with_name(partial_name(folder.name))
     numbers: list[int] = []
     times: list[float | None] = []
     try:
+        remove_partial_files(folder.parent, ".*.partial")
         partial.mkdir(parents=True, exist_ok=True)
         reader = VideoReader(video, rate)
         for frame in reader.frames(fps):
@@ -178,6 +185,7 @@ def _decode(
             "times": None if None in times else times,
             "count": reader.count,
             "missing": reader.missing,
+            "plain": reader.plain,
         }
         write_json(partial / "clip.json", facts, indent=None)
         try:
@@ -268,6 +276,14 @@ class Motion:
         if known.size and known[0] > 0:
             flow[: known[0]] = flow[known[0]]
         return np.nan_to_num(flow, nan=np.inf) < min_flow
+
+
+def cuts(change: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Say which frames begin another scene (a cut, a loop, the next recording), given the change to the one before."""
+    known = np.nan_to_num(change)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(known, 2), 5)[:, [0, 1, 3, 4]]
+    # The second largest: next to a cut there may be another one, as around a single black frame.
+    return np.asarray((known >= CUT) & (known > PEAK * np.sort(around)[:, -2]))
 
 
 def relative_change(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:

@@ -28,6 +28,7 @@ from saunet.data.video.clips import (
     FramesCacheError,
     Motion,
     Recording,
+    cuts,
     default_cache,
     even_steps,
     find_clips,
@@ -48,7 +49,7 @@ class ClipDrive(Drive):
     """A clip of any camera.
 
     Frames are numbered anew from 0 in the order of time, without those that are `left_out`; a number is skipped where
-    frames on both sides are no neighbors (a broken image or a long stop between them).
+    frames on both sides are no neighbors (a broken image, a long stop or a cut between them).
     """
 
     def __init__(
@@ -154,7 +155,9 @@ def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tup
     broken = np.isin(np.arange(count), motion.unreadable)
     doubled = motion.doubled() & ~broken
     usable = np.flatnonzero(~broken & ~doubled)
-    left_out |= {"unreadable": int(broken.sum()), "doubled": int(doubled.sum())}
+    cut = np.zeros(count, dtype=bool)
+    cut[usable] = cuts(motion.change[usable])
+    left_out |= {"unreadable": int(broken.sum()), "doubled": int(doubled.sum()), "split at cuts": int(cut.sum())}
     if parallax > 0:
         chosen = usable[even_steps(motion.flow[usable], parallax)]
         left_out["closer than the parallax"] = len(usable) - len(chosen)
@@ -164,7 +167,8 @@ def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tup
     for place in usable.tolist():
         if before is not None:
             seconds = (recording.numbers[place] - recording.numbers[before]) / (recording.fps or math.inf)
-            apart = broken[before:place].any() or (place - before > 1 and seconds > LONGEST_STEP)
+            lost = broken[before:place].any() or cut[before + 1 : place + 1].any()
+            apart = lost or (place - before > 1 and seconds > LONGEST_STEP)
             number += 2 if apart else 1
         places[number] = before = place
     return places, left_out
@@ -317,6 +321,12 @@ class VideoDataModule(DepthDataModule):
             lambda done, total: shown.update(task, completed=done, total=total),
         )
         shown.update(task, visible=False)
+        if recording.plain:
+            warnings.warn(
+                f"{recording.plain} frames of {clip.path} have one single color; they may not have been decoded, look "
+                "at the video",
+                stacklevel=2,
+            )
         motion = None
         if self.static == "drop" or self.parallax > 0:
             task = shown.add_task(f"measuring motion of {clip.path.name}", total=len(recording.paths))

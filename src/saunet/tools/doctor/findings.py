@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from saunet.data.loading.selecting import MIN_FLOW, UNREADABLE, Manifest
-from saunet.data.video.clips import SAME_PICTURE
+from saunet.data.video.clips import CUT, PEAK, SAME_PICTURE
 from saunet.errors import UnreadableError
 from saunet.tools.doctor.survey import ABSENT, BANDS, CameraFacts, FrameFacts, Survey
 
@@ -38,7 +38,20 @@ class Finding:
 
 def diagnose(survey: Survey) -> list[Finding]:
     """Return what there is to say about a data set, errors first."""
-    rules = (_splits, _names, _unreadable, _sizes, _cameras, _neighbors, _leak, _parallax, _doubled, _static, _bonnet)
+    rules = (
+        _splits,
+        _names,
+        _unreadable,
+        _sizes,
+        _cameras,
+        _neighbors,
+        _leak,
+        _parallax,
+        _cuts,
+        _doubled,
+        _static,
+        _bonnet,
+    )
     found = [finding for rule in (*rules, _light, _truth, _speed) for finding in rule(survey)]
     return sorted(found, key=lambda finding: ("error", "warning", "note").index(finding.level))
 
@@ -165,6 +178,18 @@ def _parallax(survey: Survey) -> Iterator[Finding]:
     elif middle > 25:
         text = f"the picture moves by {middle:.0f} px a step, so that neighbors hardly overlap"
         yield Finding("warning", text, "use more frames a second or smaller data.offsets")
+
+
+def _cuts(survey: Survey) -> Iterator[Finding]:
+    split = max((reasons.get("split at cuts", 0) for reasons in survey.left_out.values()), default=0)
+    if split:
+        text = f"places where the picture changes altogether (cuts, loops, recordings in one folder): {split}"
+        yield Finding("note", text, "clips are split there, so no sample reaches across")
+    usual = float(np.median([frame.change or 0 for frame in survey.compared()] or [0]))
+    apart = [frame for frame in survey.compared() if (frame.change or 0) >= max(CUT, PEAK * usual)]
+    if apart:
+        text = f"{len(apart)} frames hardly resemble their neighbor, such as {apart[0].index} of '{apart[0].drive}'"
+        yield Finding("warning", text, "is there a cut, or do several recordings share a folder? Put each into its own")
 
 
 def _doubled(survey: Survey) -> Iterator[Finding]:
