@@ -5,13 +5,15 @@ It is read with ``weights_only=True``, and only registered components are ever b
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules import module as hooks
 
 from saunet.errors import CheckpointError, ConfigError
 from saunet.io.atomic import replacing
@@ -40,15 +42,52 @@ class Checkpoint:
         return {key[len(part) + 1 :]: value for key, value in named.items() if key.startswith(f"{part}.")}
 
     def networks(self) -> tuple[DepthNet, nn.Module | None]:
-        """Build the recorded networks, depth and pose, and give them the file's weights."""
+        """Build the recorded networks, depth and pose, and give them the file's weights.
+
+        A file gets networks as large as the weights that it holds: a small one cannot ask for gigabytes.
+        """
+        held = sum(
+            min(each.numel(), each.untyped_storage().nbytes() // each.element_size()) for each in self.state.values()
+        )
         try:
-            depth, pose = build_networks(self.record)
+            with _at_most(4 * held + _ROOM):
+                depth, pose = build_networks(self.record)
             load_weights(depth, self.weights("depth"), "depth network")
             if pose is not None:
                 load_weights(pose, self.weights("pose"), "pose network")
         except (CheckpointError, ConfigError) as error:
             raise CheckpointError(f"{self.path}: {error}") from error
         return depth, pose
+
+
+_ROOM = 1 << 24
+"""Numbers that a network may hold beyond those of its file: buffers that are not stored, and weights that are missing,
+which `load_weights` names."""
+
+
+@contextlib.contextmanager
+def _at_most(numbers: int) -> Iterator[None]:
+    """Refuse a network that is being built as soon as it has more numbers and modules, before they fill memory."""
+    left = numbers
+
+    def count(_: nn.Module, name: str, value: object) -> None:
+        nonlocal left
+        left -= value.numel() if isinstance(value, Tensor) else 1
+        if left < 0:
+            raise CheckpointError(
+                f"the record asks for a network of more than {numbers:,} numbers (at '{name}'), several times what the "
+                "file holds; it is damaged or was edited"
+            )
+
+    registered = (
+        hooks.register_module_parameter_registration_hook,
+        hooks.register_module_buffer_registration_hook,
+        hooks.register_module_module_registration_hook,
+    )
+    with contextlib.ExitStack() as stack:
+        for register in registered:
+            stack.callback(register(count).remove)  # type: ignore[arg-type]
+        yield
 
 
 def build_networks(record: ModelRecord, pretrained: bool = False) -> tuple[DepthNet, nn.Module | None]:

@@ -5,6 +5,7 @@ It stands under ``"saunet"`` in every checkpoint and as JSON beside every export
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -17,6 +18,11 @@ from saunet.registry import find
 FORMAT = 1
 """Version of the record's layout; raised when an older reader would misunderstand a newer file."""
 
+MAX_PIXELS = 1 << 24
+"""Largest input of a network (4K video has 8.3 million pixels): a file cannot ask for more, and no training either."""
+MAX_NUMBER = 1 << 16
+"""Largest whole number among the settings of networks; registered ones reach a few thousand."""
+_VALUES, _DEPTH, _TEXT = 100_000, 64, 10_000
 _SLOTS = ("encoder", "decoder", "pose")
 _NESTED = (*_SLOTS, "attention")
 
@@ -63,6 +69,11 @@ class ModelRecord:
             )
         if self.height < 1 or self.width < 1:
             raise CheckpointError(f"the model record's size is {self.height}x{self.width}; both must be above 0")
+        if self.height * self.width > MAX_PIXELS:
+            raise CheckpointError(
+                f"the model record's size is {self.height}x{self.width}; at most {MAX_PIXELS:,} pixels are allowed, "
+                "which saunet.runs.record.MAX_PIXELS sets"
+            )
 
     def to_plain(self) -> dict[str, Any]:
         """Return what stands under ``"saunet"`` in a checkpoint."""
@@ -81,7 +92,11 @@ class ModelRecord:
 
     @classmethod
     def from_plain(cls, plain: Any) -> ModelRecord:
-        """Read a record, checking that no key is missing, every value can work, and this version knows the layout."""
+        """Read a record, checking that no key is missing, every value can work, and this version knows the layout.
+
+        How much it may ask for is bounded first: values, nesting, numbers (`MAX_NUMBER`) and pixels (`MAX_PIXELS`).
+        """
+        _check_bounds(plain)
         if not isinstance(plain, Mapping) or not isinstance(plain.get("format"), int):
             raise CheckpointError(f"the model record is {_short(plain)}; it must be a mapping with a 'format' number")
         if plain["format"] > FORMAT:
@@ -131,6 +146,42 @@ class ModelRecord:
                     )
 
 
+def _check_bounds(plain: Any) -> None:
+    """Check that a record is plain and small, however often it refers to its own parts."""
+    level = [("", plain)]  # each value with the name it stands under
+    for _ in range(_DEPTH):
+        for name, value in level:
+            if not isinstance(value, str | int | float | Mapping | list | tuple | None) or not isinstance(name, str):
+                raise CheckpointError(f"the model record's '{name}' is a {type(value).__name__}, no plain data")
+            if isinstance(value, int) and abs(value) >= 1 << 63:
+                raise CheckpointError(f"the model record's '{name}' is a number of {value.bit_length()} bits")
+            if isinstance(value, str) and len(value) > _TEXT:
+                raise CheckpointError(f"the model record's '{name[:60]}' has {len(value):,} characters")
+        inside = (
+            (key, child)
+            for name, each in level
+            if isinstance(each, Mapping | list | tuple)
+            for key, child in (each.items() if isinstance(each, Mapping) else ((name, child) for child in each))
+        )
+        level = list(itertools.islice(inside, _VALUES + 1))
+        if not level:
+            return
+        if len(level) > _VALUES:
+            raise CheckpointError(f"the model record has more than {_VALUES:,} values; the file is damaged")
+    raise CheckpointError(f"the model record has more than {_DEPTH} levels of nesting; the file is damaged")
+
+
+def _check_numbers(slot: str, node: Any) -> None:
+    if isinstance(node, Mapping | list | tuple):
+        for value in node.values() if isinstance(node, Mapping) else node:
+            _check_numbers(slot, value)
+    elif isinstance(node, int) and abs(node) > MAX_NUMBER:
+        raise CheckpointError(
+            f"the recorded {slot} asks for {node:,}; whole numbers up to {MAX_NUMBER:,} are allowed, which "
+            "saunet.runs.record.MAX_NUMBER sets"
+        )
+
+
 def _targets(node: Any) -> Iterator[str]:
     """Yield every ``_target_`` of a node, the outermost first."""
     if isinstance(node, Mapping):
@@ -165,6 +216,7 @@ def _get(plain: Mapping[str, Any], key: str, kind: Any) -> Any:
 def _node(model: Mapping[str, Any], slot: str) -> Mapping[str, Any]:
     node: Mapping[str, Any] = _get(model, slot, Mapping)
     _get(node, "_target_", str)
+    _check_numbers(slot, node)
     return node
 
 

@@ -66,6 +66,9 @@ class LastCheckpoint(ModelCheckpoint):
         self.every_n_steps = int(positive("every_n_steps", every_n_steps, allow_zero=True))
         self._saved_at = 0
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take nothing over: a recorded path would be removed after the next save, and a foreign file may name any."""
+
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
