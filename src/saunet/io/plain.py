@@ -7,6 +7,7 @@ grow exponentially, damaged headers. What the system refuses (no such file, no r
 from __future__ import annotations
 
 import ast
+import errno
 import io
 import json
 import math
@@ -118,11 +119,16 @@ def read_arrays(
                 raise _LimitError(f"more than {ARRAY_BYTES:,} bytes")
             found = {}
             for each in archive.infolist():
+                if each.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise _LimitError(f"compression {each.compress_type}")
                 data = archive.read(each)
                 _check_header(io.BytesIO(data), len(data))
                 found[each.filename.removesuffix(".npy")] = np.load(io.BytesIO(data), allow_pickle=False)
             return found
-    except (*_DAMAGED, zipfile.BadZipFile, zlib.error, RuntimeError) as reason:  # RuntimeError: a password
+    # A damaged offset is an invalid argument for the system, a password a RuntimeError.
+    except (*_DAMAGED, zipfile.BadZipFile, zlib.error, RuntimeError, OSError) as reason:
+        if isinstance(reason, OSError) and reason.errno != errno.EINVAL:
+            raise
         raise error(f"{path} cannot be read as a .npz file of numbers ({_excerpt(reason)})") from reason
 
 

@@ -134,7 +134,7 @@ def read_speeds(path: str | Path) -> SpeedTable:
             table = csv.DictReader(file, skipinitialspace=True)
             table.fieldnames = columns = [name.strip() for name in table.fieldnames or ()]
             if "speed" not in columns or not {"time", "frame"} & set(columns):
-                raise DataError(f"{path} has the columns {', '.join(columns) or 'none'}; {_FORMAT}")
+                raise DataError(f"{path} has the columns {', '.join(columns)[:100] or 'none'}; {_FORMAT}")
             unit: Literal["time", "frame"] = "time" if "time" in columns else "frame"
             for number, row in enumerate(table, 2):
                 tick, speed = _numbers(row, f"{path}, line {number}", unit)
@@ -163,7 +163,7 @@ def _numbers(row: Mapping[str, str | None], where: str, unit: str) -> tuple[floa
         speed = tick = math.nan
     if not (math.isfinite(speed) and math.isfinite(tick) and speed >= 0):
         given = ", ".join(f"{key}={value}" for key, value in row.items())
-        raise DataError(f"{where} is not a time and a speed of at least 0 ({given}); {_FORMAT}")
+        raise DataError(f"{where} is not a time and a speed of at least 0 ({given[:100]}); {_FORMAT}")
     return tick, speed
 
 

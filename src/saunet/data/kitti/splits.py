@@ -117,7 +117,8 @@ def read_split(path: Path) -> list[Frame]:
         if not line.strip():
             continue
         words = line.split()
-        if len(words) != 3 or not words[1].isdecimal() or words[2] not in ("l", "r") or words[0].count("/") != 1:
+        number_ok = len(words) == 3 and words[1].isdecimal() and len(words[1]) <= 18
+        if not number_ok or words[2] not in ("l", "r") or words[0].count("/") != 1:
             raise DataError(f"{path}, line {number}: expected {_LINE}, got '{line.strip()[:80]}'")
         frames.append(Frame(words[0], int(words[1]), words[2]))
     if not frames:
