@@ -86,7 +86,7 @@ def _at_most(numbers: int) -> Iterator[None]:
     )
     with contextlib.ExitStack() as stack:
         for register in registered:
-            stack.callback(register(count).remove)  # type: ignore[arg-type]
+            stack.callback(register(count).remove)
         yield
 
 
