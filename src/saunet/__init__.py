@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from saunet.errors import CheckpointError, ConfigError, DataError, SaunetError
+from saunet.errors import CheckpointError, ConfigError, DataError, SaunetError, can_name, checked
 from saunet.lazy import lazily
 from saunet.registry import Spec, attentions, datamodules, decoders, encoders, objectives, poses, registry, terms
 from saunet.weights.locate import DEFAULT, shipped
@@ -80,6 +80,7 @@ __getattr__ = lazily(
         "tools.prepare.tool": "PrepareOptions prepare",
         "training.tool": "TrainOptions train",
     },
+    functions=checked,
 )
 
 
@@ -87,6 +88,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
+@checked
 def build(kind: str, name: str, /, **kwargs: Any) -> Any:
     """Build a registered component.
 
@@ -110,6 +112,7 @@ def build(kind: str, name: str, /, **kwargs: Any) -> Any:
     return registry(kind).build(name, **kwargs)
 
 
+@checked
 def available(kind: str) -> list[str]:
     """Return the registered names of a kind, sorted.
 
@@ -129,6 +132,7 @@ def available(kind: str) -> list[str]:
     return shipped() if kind == "weights" else registry(kind).names()
 
 
+@checked
 def load(source: Any = DEFAULT, *, device: str = "cpu", flip: bool = False, keep_aspect: bool = False) -> Any:
     """Load a trained model for prediction: ``saunet.load("last.ckpt").predict(image)``.
 
@@ -153,8 +157,9 @@ def load(source: Any = DEFAULT, *, device: str = "cpu", flip: bool = False, keep
         >>> model.predict(image).depth.shape
         (96, 160)
     """
-    if not isinstance(source, str | Path) or not str(source):
-        raise CheckpointError(f"saunet.load got {source!r}; give the path of a checkpoint or an exported folder")
+    if not isinstance(source, str | Path) or not str(source) or not can_name(source, 255):
+        got = f"a name of {len(str(source))} characters" if isinstance(source, str | Path) else type(source).__name__
+        raise CheckpointError(f"saunet.load got {got}; give the path of a checkpoint or an exported folder")
     from saunet.prediction.prediction import load as load_any
 
     return load_any(source, device=device, flip=flip, keep_aspect=keep_aspect)

@@ -3,9 +3,21 @@
 from __future__ import annotations
 
 import difflib
+import functools
+import inspect
 import math
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+import numbers
+import reprlib
+import sys
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union
+
+from typing_extensions import Unpack
+
+C = TypeVar("C", bound=Callable[..., Any])
 
 if TYPE_CHECKING:
     import torch
@@ -74,7 +86,7 @@ def one_of(name: str, value: str, allowed: Iterable[str]) -> str:
 
 def positive(name: str, value: float | int, *, allow_zero: bool = False) -> float | int:
     """Return the value of a parameter if it is a finite number above zero (or zero, with ``allow_zero``)."""
-    if not math.isfinite(value) or value < 0 or (value == 0 and not allow_zero):
+    if not 0 <= value < math.inf or (value == 0 and not allow_zero):
         raise ConfigError(f"{name} is {value}; it must be {'at least' if allow_zero else 'greater than'} 0")
     return value
 
@@ -121,3 +133,93 @@ def usable_device(name: str | torch.device) -> torch.device:
         available = ", ".join(["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))])
         raise ConfigError(f"device '{name}' cannot be used here; available: {available}") from reason
     return device
+
+
+def checked(target: C) -> C:
+    """Let a function, or a class when it is made, refuse arguments that its annotations do not allow.
+
+    Shapes are compared with each other too. It takes some microseconds a call, so it belongs where users' values enter.
+    """
+    function: Any = target.__init__ if inspect.isclass(target) else target
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def checking(*args: Any, **kwargs: Any) -> Any:
+        torch = sys.modules.get("torch")
+        if torch is None or not torch.compiler.is_compiling():
+            try:
+                given = signature.bind(*args, **kwargs).arguments
+            except TypeError:  # Python says it better
+                return function(*args, **kwargs)
+            keywords = next((p.name for p in signature.parameters.values() if p.kind is p.VAR_KEYWORD), "")
+            check_arguments(target, {**given, **given.get(keywords, {})}, _hints(function))
+        return function(*args, **kwargs)
+
+    if inspect.isclass(target):
+        target.__init__ = checking  # type: ignore[method-assign]
+        return target
+    return checking  # type: ignore[return-value]
+
+
+def check_arguments(target: Callable[..., Any], given: Mapping[str, Any], hints: Mapping[str, Any]) -> None:
+    """Check arguments against annotations, by name; what has none is not checked."""
+    from jaxtyping import jaxtyped
+
+    with jaxtyped("context"):  # sizes of one name are equal
+        for name, value in given.items():
+            if name in hints and not _conforms(value, hints[name]):
+                shape, kind = getattr(value, "shape", None), type(value).__name__
+                got = reprlib.repr(value) if shape is None else f"{value.dtype} of shape {tuple(shape)}"
+                said = getattr(target, "__annotations__", {}).get(name, hints[name])
+                allowed = said if isinstance(said, str) else inspect.formatannotation(said)
+                limits = ", with names of at most 255 bytes" if not can_name(value, 255) else ""
+                got = " ".join(got.split())
+                raise ConfigError(f"{target.__name__}: {name} is {got} ({kind}); it must be {allowed}{limits}")
+
+
+@functools.cache
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the annotations, without those that name what only a type checker imports."""
+    found, plain = {}, inspect.unwrap(function)
+    for name, hint in getattr(plain, "__annotations__", {}).items():
+        try:
+            found[name] = hint = eval(hint, plain.__globals__) if isinstance(hint, str) else hint
+        except NameError:
+            continue
+        if typing.get_origin(hint) is Unpack:
+            found |= typing.get_type_hints(typing.get_args(hint)[0])
+    return found
+
+
+def can_name(value: Any, longest: int = 4096) -> bool:
+    """Return whether text can be the path of a file, with names of so many bytes; other text is never so long."""
+    parts = str(value).encode("utf-8", "surrogatepass").split(b"/") if isinstance(value, str | PurePath) else [b""]
+    return max(map(len, parts)) <= longest and len(parts) <= 2000 and not any(b"\0" in part for part in parts)
+
+
+def _conforms(value: Any, hint: Any) -> bool:
+    """Return whether a value is what an annotation says, as far as that can be told without using it up."""
+    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any or isinstance(hint, TypeVar):
+        return True
+    if hint is None:
+        return value is None
+    if origin in (Union, types.UnionType):
+        paths = any(inspect.isclass(each) and issubclass(each, PurePath) for each in inside)
+        return any(_conforms(value, each) for each in inside) and (not paths or can_name(value, 255))
+    if origin is Literal:
+        return any(value is each or (type(value) is type(each) and value == each) for each in inside)
+    if origin in (list, tuple, Sequence):
+        of = (inside or (Any,))[0]
+        return isinstance(value, Sequence) and not isinstance(value, str) and all(_conforms(each, of) for each in value)
+    if origin in (dict, Mapping):
+        return isinstance(value, Mapping)
+    if hint in (int, float):
+        endless = isinstance(value, int) and abs(value) >= 1 << 63
+        return isinstance(value, numbers.Integral if hint is int else numbers.Real) and not endless
+    if not can_name(value):
+        return False
+    try:
+        return isinstance(value, origin or hint)
+    except TypeError:  # a protocol, or another annotation that values are not instances of
+        return True

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from saunet import plugins, schema
-from saunet.errors import ConfigError, suggest
+from saunet.errors import ConfigError, check_arguments, checked, suggest
 
 C = TypeVar("C", bound=Callable[..., Any])
 
@@ -85,6 +85,8 @@ class Registry:
         """
         entry = self.entry(name)
         _check_keys(f"{self.kind} '{name}'", entry.target, kwargs)
+        hints = {key: each.annotation for key, each in schema.parameters(entry.target).items()}
+        check_arguments(entry.target, kwargs, hints)
         return entry.target(**{**entry.preset, **kwargs})
 
     def partial(self, name: str, /, **kwargs: Any) -> Callable[..., Any]:
@@ -157,6 +159,7 @@ _ALL = (models, encoders, decoders, attentions, poses, terms, objectives, datamo
 REGISTRIES: dict[str, Registry] = {registry.kind: registry for registry in _ALL}
 
 
+@checked
 def registry(kind: str) -> Registry:
     """Return the registry of a kind."""
     if kind not in REGISTRIES:
@@ -164,6 +167,7 @@ def registry(kind: str) -> Registry:
     return REGISTRIES[kind]
 
 
+@checked
 @dataclass(frozen=True, slots=True)
 class Spec:
     """A component that will be built later: which one, and the parameters given for it so far.

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from saunet.data.drive import Drive
-from saunet.errors import ConfigError, positive, usable_device
+from saunet.errors import ConfigError, checked, positive, usable_device
 from saunet.evaluation.predictors import file_stem
 from saunet.evaluation.result import without_nan
 from saunet.io.atomic import check_folder, write_bytes, write_json
@@ -233,6 +233,7 @@ def _told(errors: PathErrors) -> str:
     return f"{errors.predictor}: {snippets}{relative}, turned by {errors.turn:.0f}° to align"
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class OdometryOptions:
     """Which path `odometry` predicts, and how it is compared.

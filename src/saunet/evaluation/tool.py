@@ -16,7 +16,7 @@ from saunet.data.drive import Drive
 from saunet.data.loading.module import surroundings
 from saunet.data.loading.stored import cache_truths
 from saunet.data.loading.windows import measured_distance
-from saunet.errors import ConfigError, DataError, one_of, usable_device
+from saunet.errors import ConfigError, DataError, checked, one_of, usable_device
 from saunet.evaluation.predictors import ExportingPredictor, FilePredictor, NetworkPredictor, Predictor, existing
 from saunet.evaluation.result import EvaluationResult, read_rows, write_results
 from saunet.evaluation.scoring import Buckets, score, score_views
@@ -66,6 +66,7 @@ class EvaluationData(Protocol):
         """Yield true depth maps of a split, 1 h w."""
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
     """What `evaluate` scores, on which images, and how.

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from saunet.errors import CheckpointError, ConfigError, DataError, one_of
+from saunet.errors import CheckpointError, ConfigError, DataError, checked, one_of
 from saunet.exporting import exporters
 from saunet.exporting.card import model_card
 from saunet.exporting.parity import Parity, Run, compare, parity_table, timed
@@ -46,6 +46,7 @@ _PLACES = ("root", "cache")
 """Where the training data lay: nobody's business but the trainer's, and it says nothing about them."""
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
     """What `export` writes.

@@ -7,12 +7,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torchmetrics import Metric
 
-from saunet.errors import DataError
+from saunet.errors import DataError, checked
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import Protocol, evaluate_image
 from saunet.metrics.protocols import protocol as named_protocol
 
 
+@checked
 class DepthMetrics(Metric):
     """Mean over images of the seven depth errors under a protocol.
 

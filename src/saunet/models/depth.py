@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.errors import ConfigError, divisible
+from saunet.errors import ConfigError, checked, divisible
 from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
 from saunet.models.layers.conv import channels_last_weights
 from saunet.types import DepthPyramid
@@ -16,6 +16,7 @@ from saunet.types import DepthPyramid
 torch.export.register_dataclass(DepthPyramid)  # so that a depth network can be exported with its result as it is
 
 
+@checked
 class DepthNet(nn.Module):
     """One image to depth at several scales (SAU-Net section III-A: Z_t from H_t).
 

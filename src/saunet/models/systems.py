@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 
 from torch import Tensor, nn
 
+from saunet.errors import checked
 from saunet.models.depth import DepthNet
 from saunet.registry import Spec, models
 from saunet.types import DepthPyramid
@@ -55,6 +56,7 @@ def _spec(kind: str, part: str | Spec) -> Spec:
     return part if isinstance(part, Spec) else Spec.of(kind, part)
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions:
     """Networks: depth (encoder and decoder) and pose.

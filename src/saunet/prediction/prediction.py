@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from saunet.errors import CheckpointError, ConfigError, DataError, divisible, positive
+from saunet.errors import CheckpointError, ConfigError, DataError, checked, divisible, positive
 from saunet.io.atomic import write_bytes
 from saunet.io.colormaps import colorize
 from saunet.io.images import as_rgb_bytes, network_input, read_image, write_image
@@ -25,6 +25,7 @@ ImageLike = Any
 """A path, an h x w x 3 RGB array (bytes; gray, RGBA and 16-bit work too), or a 3 x h x w tensor (bytes or [0, 1])."""
 
 
+@checked
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
     """Depth of one image, at that image's size.

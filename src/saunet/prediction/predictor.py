@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from saunet.errors import usable_device
+from saunet.errors import checked, usable_device
 from saunet.metrics.functional import flip_blend
 from saunet.models.depth import DepthNet
 from saunet.prediction.prediction import ImagePredictor
@@ -18,6 +18,7 @@ from saunet.runs.record import Scale
 from saunet.weights.files import read_model
 
 
+@checked
 class Predictor(ImagePredictor):
     """Predicts depth with a depth network; the network is moved to ``device`` and set to evaluation.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from saunet.errors import ConfigError, DataError, one_of, positive, usable_device
+from saunet.errors import ConfigError, DataError, checked, one_of, positive, usable_device
 from saunet.io.atomic import remove_partial_files
 from saunet.io.colormaps import COLORMAPS, RunningRange
 from saunet.io.video import CODECS
@@ -30,6 +30,7 @@ CLIP_OUTPUTS: tuple[str, ...] = ("mp4", "html", "trajectory")
 """What can be written for a recording as a whole, besides `OUTPUTS` for each of its frames."""
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class PredictOptions:
     """What `predict` reads, how it predicts, and what it writes.

@@ -14,7 +14,7 @@ from pathlib import Path
 from rich.console import Console
 
 from saunet import __version__
-from saunet.errors import ConfigError, one_of, positive, usable_device
+from saunet.errors import ConfigError, checked, one_of, positive, usable_device
 from saunet.io.atomic import check_folder
 from saunet.published import published
 from saunet.reporting import figures, tables
@@ -32,6 +32,7 @@ Named = dict[str, Run]
 Scenes = str | Sequence[str] | Mapping[str, str | Sequence[str]] | None
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions:
     """What a report is made from, and how.

@@ -16,7 +16,7 @@ from lightning.pytorch.loggers import Logger
 
 from saunet import plugins
 from saunet.data.loading.module import DepthDataModule
-from saunet.errors import ConfigError, SaunetError, divisible, in_range, one_of, positive, suggest
+from saunet.errors import ConfigError, SaunetError, checked, divisible, in_range, one_of, positive, suggest
 from saunet.io.atomic import remove_partial_files
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.functional import ERROR_NAMES
@@ -62,6 +62,7 @@ _TRUSTED = ("lightning.", "torch.", "saunet.")
 """Packages that nested nodes of callbacks, loggers and the trainer may name."""
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
     """A training: its parts, and where it goes.

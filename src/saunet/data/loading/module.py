@@ -32,12 +32,13 @@ from saunet.data.loading.windows import (
     collate,
     find_windows,
 )
-from saunet.errors import ConfigError, DataError
+from saunet.errors import ConfigError, DataError, checked
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
 
 STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("predict",)}
 
 
+@checked
 class DepthDataModule(LightningDataModule):
     """Loaders of frame windows, and the transforms that run on the device.
 

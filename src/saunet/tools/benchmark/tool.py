@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from saunet.errors import ConfigError, positive, require_matplotlib, usable_device
+from saunet.errors import ConfigError, checked, positive, require_matplotlib, usable_device
 from saunet.io.atomic import check_folder, write_json
 from saunet.io.progress import bar
 from saunet.models.systems import ModelOptions
@@ -25,6 +25,7 @@ CHANGED = " (changed)"
 """Stands behind the name of a model that has other parameters: it is not what the paper measured."""
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkOptions(Plan):
     """What `benchmark` measures: every combination of the sequences, for ``model`` or each of ``models``.

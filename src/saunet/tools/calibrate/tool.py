@@ -10,12 +10,13 @@ from typing import Any, Literal
 from saunet.data.video.calibrations import EXPORTS, SUFFIXES, export_camera, split_name
 from saunet.data.video.camera import Lens, read_camera, write_camera
 from saunet.data.video.lens_models import WIDEST
-from saunet.errors import ConfigError, in_range, one_of, positive
+from saunet.errors import ConfigError, checked, in_range, one_of, positive
 from saunet.io.images import write_image
 from saunet.io.progress import bar
 from saunet.tools.calibrate.solve import Board, Calibration, check_picture, solve
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
     """What `calibrate` reads and writes; ``columns`` and ``rows`` count the board's squares.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from saunet.data.loading.selecting import Manifest, write_manifest
-from saunet.errors import ConfigError, one_of, positive
+from saunet.errors import ConfigError, checked, one_of, positive
 from saunet.io.images import write_image
 from saunet.io.progress import bar
 from saunet.registry import Spec
@@ -16,6 +16,7 @@ from saunet.tools.doctor.sheet import draw_sheet
 from saunet.tools.doctor.survey import SPLITS, Survey, survey
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class DoctorOptions:
     """What `doctor` looks at, and where it writes.

@@ -14,7 +14,7 @@ from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.sampling import available_cores
 from saunet.data.loading.stored import DENSE_KINDS, CacheSettings
 from saunet.data.loading.windows import other_view
-from saunet.errors import ConfigError, DataError, one_of, positive, suggest, usable_device
+from saunet.errors import ConfigError, DataError, checked, one_of, positive, suggest, usable_device
 from saunet.registry import Spec
 from saunet.tools.prepare.cache import CacheReport, build_cache
 from saunet.tools.prepare.pool import Done, OnError
@@ -31,6 +31,7 @@ KEYS: dict[str, tuple[str, ...]] = {
 """Job -> the options that it reads."""
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class PrepareOptions:
     """What `prepare` does: one of three jobs, each with options of its own.
