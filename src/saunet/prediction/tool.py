@@ -259,6 +259,8 @@ def _predict_images(
         if failures and todo:
             names = ", ".join(path.name for sink in todo for path in sink.paths)
             raise DataError(f"{failures[0]}; {names} would lack it, so nothing but single images was written")
+        if todo:  # a run that is killed before it notes how many images they show may replace them
+            manifest.write({sink.paths[0].name: {"images": 0, **look} for sink in todo})
 
     count, wanted, into = 0, frames if todo else unfinished, [files, *todo]
     if wanted:
