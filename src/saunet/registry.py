@@ -68,8 +68,10 @@ class Registry:
 
         def declare(target: C) -> C:
             if name in self._entries:
-                taken = f"{self.kind} '{name}' is already registered by {self._entries[name].path}"
-                raise ConfigError(f"{taken}; give {target.__module__}.{target.__qualname__} another name")
+                paths = (self._entries[name].path, f"{target.__module__}.{target.__qualname__}")
+                # A plugin may be imported before the built-in components; its class is the one to rename all the same.
+                kept, renamed = sorted(paths, key=lambda path: not path.startswith("saunet."))
+                raise ConfigError(f"{self.kind} '{name}' is already registered by {kept}; give {renamed} another name")
             for key in preset.keys() - schema.parameters(target).keys():
                 raise TypeError(f"{self.kind} '{name}': preset key '{key}' is not a parameter of {target.__qualname__}")
             self._entries[name] = Entry(name, target, preset)

@@ -90,8 +90,29 @@ def test_a_file_named_like_another_module_is_refused(tmp_path: Path) -> None:
         plugins.load([str(tmp_path / "json.py")])
 
 
-def test_a_taken_name_is_one_sentence() -> None:
+def of_mine() -> None:
+    """A component."""
+
+
+@pytest.mark.parametrize("mine_first", [True, False])
+def test_a_taken_name_asks_to_rename_the_users_class(mine_first: bool) -> None:
     registry = Registry("widget", None, "saunet.geometry")
-    registry.register("x")(plugins.loaded)
-    with pytest.raises(ConfigError, match="'x' is already registered by"):
-        registry.register("x")(plugins.loaded)
+    first, second = (of_mine, plugins.loaded) if mine_first else (plugins.loaded, of_mine)
+    registry.register("x")(first)
+    message = r"'x' is already registered by saunet\.plugins\.loaded; give \S*of_mine another name"
+    with pytest.raises(ConfigError, match=message):
+        registry.register("x")(second)
+
+
+def test_a_plugin_that_takes_a_name_of_saunet_is_told_at_once(tmp_path: Path) -> None:
+    (tmp_path / "my_parts.py").write_text(MINE.replace('"mine"', '"resnet18"'))
+    said = _saunet("train", "plugins=[my_parts]", "--help", folder=tmp_path, code=1)
+    assert "give my_parts.Mine another name" in said
+
+
+def test_components_lists_it(tmp_path: Path) -> None:
+    (tmp_path / "my_parts.py").write_text(MINE)
+    said = _saunet("components", "encoder", "mine", "plugins=[my_parts.py]", folder=tmp_path)
+    assert "choose: model/encoder=mine" in said
+    assert "width: int = 8  Channels." in said
+    assert "plugins: list[str] = []" in _saunet("train", "--help", folder=tmp_path)

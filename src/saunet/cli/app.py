@@ -269,9 +269,13 @@ def choices(overrides: Sequence[str]) -> dict[str, str]:
     return {each["key"]: each["value"] for each in found if each and "." not in each["key"]}
 
 
+def is_plugins(word: str) -> bool:
+    return word.lstrip("+").startswith(f"{PLUGINS.name}=")
+
+
 def named_plugins(words: Sequence[str]) -> list[str]:
     """Return the plugins that a command line names, which have to be imported before the rest is understood."""
-    given = [word.partition("=")[2] for word in words if word.lstrip("+").startswith(f"{PLUGINS.name}=")]
+    given = [word.partition("=")[2] for word in words if is_plugins(word)]
     lists = (value[1:-1] if value.startswith("[") and value.endswith("]") else value for value in given)
     return [item.strip().strip("'\"") for each in lists for item in _parts(each)]
 

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from saunet import schema
-from saunet.cli.app import choices
-from saunet.cli.table import TOOLS, TRAINER, Table, Tool, config_dir, read
+from saunet import plugins, schema
+from saunet.cli.app import choices, is_plugins, named_plugins
+from saunet.cli.table import PLUGINS, TOOLS, TRAINER, Table, Tool, config_dir, read
 from saunet.errors import ConfigError, one_of
 from saunet.registry import REGISTRIES, registry
 
@@ -129,12 +129,15 @@ def chosen_keys(group: str, chosen: Mapping[str, str], table: Table) -> Sequence
 def components(arguments: Sequence[str]) -> None:
     """Print what is registered: all, a kind, or one component."""
     parser = argparse.ArgumentParser(
-        prog="saunet components", description="every registered component with its keys, defaults and a sentence each"
+        prog="saunet components",
+        description="every registered component with its keys, defaults and a sentence each",
+        epilog=f"{PLUGINS.name}=[my_file.py,...]  {PLUGINS.help}",
     )
     parser.add_argument("kind", nargs="?", help=f"one of: {', '.join(REGISTRIES)}; all by default")
     parser.add_argument("name", nargs="?", help="one component of that kind")
     parser.add_argument("--count", action="store_true", help="only names and numbers of trainable weights, of networks")
-    given = parser.parse_args(arguments)
+    plugins.load(named_plugins(arguments))
+    given = parser.parse_args([word for word in arguments if not is_plugins(word)])
     everything = NETWORKS if given.count else tuple(REGISTRIES)
     found = read().components
     for kind in (one_of("the kind", given.kind, REGISTRIES),) if given.kind else everything:

@@ -110,7 +110,11 @@ TOOLS["demo"] = replace(
 TRAINER = ("trainer", "lightning", "lightning:Trainer", "lightning.Trainer")
 """A config node that is not a component: its group and name, what it configures, and the path to build it from."""
 PLUGINS = schema.Key(
-    "plugins", "list[str]", [], "Your own modules or .py files, imported first; they may register components."
+    "plugins",
+    "list[str]",
+    [],
+    "Your own modules or .py files, imported first; they may register components.",
+    annotation="list[str]",
 )
 """The key that every tool has beside those of its options."""
 HIDDEN = {"base", "lightning"}
@@ -206,6 +210,8 @@ def _read(state: str, cache_home: str | None, registered: tuple[Entry, ...]) -> 
         for entry in registry.registered():
             if entry.name not in components[kind]:
                 components[kind][entry.name] = schema.node(entry.target, entry.preset, registry.late)
+            elif not entry.path.startswith("saunet."):
+                registry.names()  # imports the built-in component of that name, which refuses the plugin's
     groups = {registry.group: components[kind] for kind, registry in REGISTRIES.items() if registry.group}
     return Table(tools, components, {**groups, TRAINER[0]: _nodes(plain["trainer"])})
 
