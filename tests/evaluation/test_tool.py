@@ -135,7 +135,7 @@ def test_no_name_is_the_own_protocol_and_nothing_is_written_without_a_folder(opt
 def test_baselines_stand_beside_and_say_what_they_lack(options, capsys):
     result = evaluate(options(baselines=True))
     assert result.predictors == ("predictions", "constant depth")
-    assert "mean depth map is left out: the training drives have no depth" in capsys.readouterr().err
+    assert "no mean-depth baseline: the training drives have no depth" in capsys.readouterr().err
     assert evaluate_network(ConstantDepthNetwork(), Data()).predictors == ("model", "constant depth")
 
 

@@ -176,7 +176,10 @@ def score(
         raise DataError(_NO_IMAGE)
     if not any(row.pixels for row in rows):
         count = len({row.name for row in rows})
-        raise DataError(f"none of the {count} images has ground-truth depth to compare; evaluate on data that have it")
+        raise DataError(
+            f"none of the {count} images has ground-truth depth to compare; evaluate on data that have it, or set "
+            "protocols=[campus], which compares views and needs none"
+        )
     found = tuple(row for (predictor, name), bucket in sums.items() for row in bucket.rows(predictor, name))
     return EvaluationResult(tuple(protocols), tuple(predictors), tuple(rows), found)
 

@@ -309,10 +309,11 @@ def trivial(data: EvaluationData, truth_cache: str | None = None) -> dict[str, P
             cache_truths(data.datasets["train"].drives, truth_cache)
         for depth in data.ground_truths("train"):
             mean.update(depth[None], torch.tensor([depth.shape[-2:]]))
-        mean.depth_map()
+        if not mean.count.any():
+            raise DataError("the training frames have no ground truth")
         found["mean depth map"] = NetworkPredictor(mean)
     except DataError as reason:
-        print(f"the mean depth map is left out: {reason}", file=sys.stderr)
+        print(f"no mean-depth baseline: {reason}", file=sys.stderr)
     return found
 
 

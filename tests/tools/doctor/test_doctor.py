@@ -49,6 +49,8 @@ def test_a_good_clip_is_described_and_drawn(tmp_path):
     assert "camera height 1.4 m" in text
     assert "horizontal field of view 65 degrees" in text
     assert "no ground-truth depth" in text
+    assert "protocols=" not in text  # it is this data set's own
+    assert "protocols=[campus]" in "\n".join(map(str, diagnose(replace(found, protocol="eigen_camera_z"))))
     assert "only 8 training samples" in text
     sheet = draw_sheet(found, findings, "title")
     assert sheet.shape[1:] == (1312, 3)

@@ -246,7 +246,8 @@ def _truth(survey: Survey) -> Iterator[Finding]:
     if not survey.truth_wanted:
         return
     if not truths:
-        text = "no ground-truth depth: training needs none; evaluation compares views of neighboring frames"
+        how = "" if survey.protocol == "campus" else " with protocols=[campus]"
+        text = f"no ground-truth depth: training needs none; evaluation{how} compares views of neighboring frames"
         yield Finding("note", text)
         return
     known = float(np.mean([truth.known for truth in truths]))

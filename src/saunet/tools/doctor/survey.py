@@ -110,6 +110,8 @@ class Survey:
     truths: list[TruthFacts] = field(default_factory=list)
     truth_wanted: int = 0
     """Frames whose ground truth was asked for."""
+    protocol: str = ""
+    """The data set's own evaluation protocol."""
     pictures: list[tuple[str, NDArray[np.uint8]]] = field(default_factory=list)
     """A few frames with their names, 320 wide."""
     numbering: dict[str, str] = field(default_factory=dict)
@@ -137,7 +139,9 @@ def survey(
 ) -> Survey:
     """Set a data module's splits up, and read ``frames`` frames at most (0: all) of all recordings, evenly spread."""
     cacheable = data.cacheable and data.copies is None
-    found = Survey(step=min((abs(offset) for offset in data.offsets), default=1), cacheable=cacheable)
+    found = Survey(
+        step=min((abs(offset) for offset in data.offsets), default=1), cacheable=cacheable, protocol=data.protocol
+    )
     datasets = dict(_set_up(data, splits, found))
     if "train" in datasets and "val" in datasets:
         found.shared_frames = len(_read_by(datasets["train"]) & _read_by(datasets["val"]))
