@@ -32,6 +32,9 @@ class Term(nn.Module):
 
     needs_source_depth: bool = False
     """Whether the batch must hold ``source_depth``, the depth network's answer for the sources."""
+    can_be_empty: bool = True
+    """Whether nothing may be left to compare (all masked, nothing measured), which is worth 0; False for a prior on the
+    prediction alone."""
 
     def __init__(self) -> None:
         super().__init__()

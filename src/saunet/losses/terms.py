@@ -127,6 +127,8 @@ class Smoothness(Term):
     takes the network's relative disparity (its sigmoid).
     """
 
+    can_be_empty = False
+
     def forward(
         self, batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"], views: Sequence[View]
     ) -> TermResult:
@@ -175,6 +177,7 @@ class Gradient(Term):
     ) -> None:
         super().__init__()
         self.target = one_of("target", target, ("image", *_TARGETS))
+        self.can_be_empty = target != "image"
         self.domain = one_of("domain", domain, ("depth", "log_depth", "disparity", "aligned"))
         self.operator = one_of("operator", operator, ("forward", "sobel"))
         self.padding = one_of("padding", padding, ("replicate", "zero"))
