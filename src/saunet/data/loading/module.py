@@ -50,6 +50,13 @@ class DepthDataModule(LightningDataModule):
         cache: Folder of smaller copies made by ``saunet prepare cache``; training and validation read images from it.
         **loading: Fields of `LoadOptions`.
 
+    Attributes:
+        neighbors: Splits whose samples carry source frames; by default ``train`` and ``val``.
+        protocol: Evaluation protocol where none is asked for; ``campus`` fits data without depth.
+        ground_truth: Kind of depth to evaluate on: ``lidar_x``, ``camera_z``, ``improved``, ``exact`` or ``none``.
+        cacheable: Whether ``saunet prepare cache`` can make smaller copies of its images.
+        root: Folder of its files; None if it reads none.
+
     Raises:
         ConfigError: if a parameter is out of range.
         DataError: if the manifest or the cache cannot be read.
@@ -63,9 +70,9 @@ class DepthDataModule(LightningDataModule):
     neighbors: Sequence[str] = ("train", "val")
     """Splits whose samples carry source frames."""
     protocol: str = "eigen_camera_z"
-    """Name of the evaluation protocol that fits this data set's ground truth."""
+    """Name of the evaluation protocol that fits this data set's ground truth; ``campus`` where there is none."""
     ground_truth: str = "camera_z"
-    """What kind of depth evaluation batches carry, as the protocols call it."""
+    """What kind of depth evaluation batches carry: ``lidar_x``, ``camera_z``, ``improved``, ``exact`` or ``none``."""
     cacheable: bool = True
     """Whether ``saunet prepare cache`` can make copies for it."""
     root: str | None = None
