@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from hypothesis import HealthCheck, given, seed, settings
+from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
@@ -211,6 +211,9 @@ class Fuzz:
     def run(self, examples: int, number: int | None = None) -> None:
         """Read so many damaged files; the same ones every time, unless a number draws others."""
         profile = {"database": None, "deadline": None, "suppress_health_check": list(HealthCheck)}
+        profile |= (
+            {"phases": list(Phase)} if number is None else {"phases": [Phase.generate]}
+        )  # shrinking takes minutes
 
         @settings(max_examples=examples, derandomize=number is None, **profile)  # type: ignore[arg-type]
         @given(st.sampled_from(self.seeds).flatmap(damage))
