@@ -144,6 +144,7 @@ def _write_calibration(path: Path, values: Mapping[str, F64 | float]) -> None:
 
 
 def records(T_world_imu: Sequence[F64], seconds: float) -> F64:
+    """Return a drive's OXTS records, one row of numbers per frame."""
     poses = np.asarray(T_world_imu)
     turn = _ENU_WORLD @ poses[:, :3, :3]
     place = poses[:, :3, 3] @ _ENU_WORLD.T

@@ -259,6 +259,7 @@ def _wheel(mesh: Mesh, x: float, z: float, radius: float, side: float, surface: 
 
 
 def tree(mesh: Mesh, rng: np.random.Generator, x: float, z: float, height: float) -> None:
+    """Add a tree of ``height`` meters: a trunk and a crown."""
     bark = Surface("bands", _vary(rng, (0.30, 0.23, 0.17), 0.2), (0.42, 0.36, 0.28))
     green = _vary(rng, (0.22, 0.36, 0.12), 0.25)
     if rng.uniform() < 0.15:
@@ -280,6 +281,7 @@ def bush(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
 
 
 def lamp(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
+    """Add a street lamp."""
     gray = rng.uniform(0.25, 0.6)
     metal = Surface("bands", (gray, gray, gray * 1.03), (gray * 0.7, gray * 0.65, gray * 0.6))
     height = rng.uniform(4.5, 8.0)
@@ -313,6 +315,7 @@ def barrier(mesh: Mesh, rng: np.random.Generator, start: np.ndarray, end: np.nda
 
 
 def billboard(mesh: Mesh, rng: np.random.Generator, x: float, z: float, heading: float) -> None:
+    """Add a billboard on posts, turned by ``heading`` radians."""
     legs = Surface("bands", (0.4, 0.4, 0.42), (0.3, 0.28, 0.26))
     for side in (-1.3, 1.3):
         mesh.cylinder(x + side * float(np.cos(heading)), z - side * float(np.sin(heading)), 0.08, 0.0, 1.6, legs)

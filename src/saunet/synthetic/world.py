@@ -133,6 +133,7 @@ def _smooth(rng: np.random.Generator, count: int, width: float) -> F64:
 
 
 def pose(road: Road, move: Travel, frame: int, lane: float, height: float) -> F64:
+    """Return T_world_cam, 4 4, of a frame on a lane, ``height`` meters above the road."""
     along, pitch = float(move.along[frame]), float(move.pitch[frame])
     x, z = road.point(along, lane + float(move.wander[frame]))
     cosine, sine = np.cos(pitch), np.sin(pitch)

@@ -32,6 +32,7 @@ _LIDAR_KEYS = {"R": (3, 3), "T": (3,)}
 
 
 def read_matrices(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
+    """Read the lines ``KEY: numbers`` of a calibration file as matrices of the shapes that are asked for."""
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except FileNotFoundError as reason:
@@ -124,6 +125,7 @@ def scaled(K: Array, native: tuple[int, int], size: tuple[int, int], images: Pat
 
 
 def read_calibration(folder: Path) -> KittiCalibration:
+    """Read the calibration in the folder of a recording date."""
     path = folder / "calib_cam_to_cam.txt"
     found = read_matrices(path, _CAMERA_KEYS)
     projections = {camera: found[key] for camera in range(4) if (key := f"P_rect_{camera:02d}") in found}

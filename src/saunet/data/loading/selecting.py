@@ -158,6 +158,7 @@ def write_manifest(path: str | Path, manifest: Manifest) -> None:
 
 
 def read_manifest(path: str | Path) -> Manifest:
+    """Read the list of usable frames that `saunet doctor` wrote."""
     path = Path(path).expanduser()
     try:
         plain = read_json(path)

@@ -203,6 +203,7 @@ def _numbers(path: Path, key: str, value: Any, counts: Sequence[int]) -> list[fl
 
 
 def write_camera(path: str | Path, camera: CameraFile, note: str = "") -> None:
+    """Write ``camera.yaml``, with a note as its first comment."""
     K, size = camera.K, camera.image_size
     plain: dict[str, Any] = {"image_size": [size[1], size[0]]} if size else {"normalized": True}
     numbers = K.ravel() if K[0, 1] else K[[0, 1, 0, 1], [0, 1, 2, 2]]
