@@ -119,7 +119,7 @@ def _model(part: str) -> bytes:
         read = read_checkpoint(Path(folder) / "x.ckpt")
     if part == "config":
         return json.dumps(read.record.to_plain()).encode()
-    return save(dict(read.state), {"format": "pt"})
+    return save({name: value.contiguous() for name, value in read.state.items()}, {"format": "pt"})
 
 
 def _export(path: Path) -> object:
