@@ -171,7 +171,9 @@ def check_arguments(target: Callable[..., Any], given: Mapping[str, Any], hints:
                 shape, kind = getattr(value, "shape", None), type(value).__name__
                 got = reprlib.repr(value) if shape is None else f"{value.dtype} of shape {tuple(shape)}"
                 said = getattr(target, "__annotations__", {}).get(name, hints[name])
-                allowed = said if isinstance(said, str) else inspect.formatannotation(said)
+                alias = isinstance(said, str) and said.isidentifier() and not inspect.isclass(hints[name])
+                allowed = said if isinstance(said, str) and not alias else inspect.formatannotation(hints[name])
+                allowed = allowed.replace("typing.", "").replace("collections.abc.", "")
                 limits = ", with names of at most 255 bytes" if not can_name(value, 255) else ""
                 got = " ".join(got.split())
                 raise ConfigError(f"{target.__name__}: {name} is {got} ({kind}); it must be {allowed}{limits}")

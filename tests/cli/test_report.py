@@ -85,7 +85,7 @@ def test_scenes_that_are_no_images(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "saunet", "report", "scenes=3", "."]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert "give images by condition" in done.stderr
+    assert "scenes is 3 (int); it must be str | Sequence[str] | Mapping[str, " in done.stderr
     assert "Traceback" not in done.stderr
 
 

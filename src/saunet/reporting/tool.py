@@ -136,8 +136,6 @@ def _by_condition(scenes: Scenes) -> dict[str, str | Sequence[str]]:
     """Return the images to show by condition; a list or a single path has no condition of its own."""
     if isinstance(scenes, Mapping):
         return {str(key): value for key, value in scenes.items()}
-    if scenes is not None and not isinstance(scenes, str | Sequence):
-        raise ConfigError(f"scenes is {scenes!r}; give images by condition, such as scenes={{kitti: FOLDER}}")
     return {"scenes": scenes} if scenes else {}
 
 
