@@ -168,6 +168,8 @@ def check_arguments(target: Callable[..., Any], given: Mapping[str, Any], hints:
     with jaxtyped("context"):  # sizes of one name are equal
         for name, value in given.items():
             if name in hints and not _conforms(value, hints[name]):
+                if typing.get_origin(hints[name]) is Literal and isinstance(value, str) and len(value) < 100:
+                    one_of(name, value, typing.get_args(hints[name]))  # names the nearest word too
                 shape, kind = getattr(value, "shape", None), type(value).__name__
                 got = reprlib.repr(value) if shape is None else f"{value.dtype} of shape {tuple(shape)}"
                 said = getattr(target, "__annotations__", {}).get(name, hints[name])

@@ -31,7 +31,7 @@ class Notes(LightningModule):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
-def fit(folder, resume=None):
+def fit(folder, resume=None, **settings):
     torch.manual_seed(99 if resume else 1)  # nothing may depend on the global generator
     model, data = Notes(), Drives(height=10, width=15, batch_size=3, workers=0)
     every = ModelCheckpoint(folder, filename="{step}", save_top_k=-1, every_n_train_steps=1)
@@ -43,6 +43,7 @@ def fit(folder, resume=None):
         enable_progress_bar=False,
         enable_model_summary=False,
         limit_val_batches=0,
+        **settings,
     )
     trainer.fit(model, datamodule=data, ckpt_path=resume, weights_only=True)
     return model.seen
@@ -53,4 +54,12 @@ def test_exact_resume_inside_and_between_epochs(tmp_path, cut):
     whole = fit(tmp_path / "whole")  # four batches an epoch
     assert [(epoch, step) for epoch, step, *_ in whole[3:6]] == [(0, 3), (1, 0), (1, 1)]
     rest = fit(tmp_path / "rest", resume=tmp_path / "whole" / f"step={cut}.ckpt")
+    assert rest == whole[cut:]
+
+
+@pytest.mark.parametrize("cut", [1, 2, 4, 5])
+def test_exact_resume_where_a_limit_ends_the_epochs(tmp_path, cut):
+    """After its last step, an epoch that a limit cuts has batches left, and the next one still begins at the first."""
+    whole = fit(tmp_path / "whole", limit_train_batches=2)
+    rest = fit(tmp_path / "rest", tmp_path / "whole" / f"step={cut}.ckpt", limit_train_batches=2)
     assert rest == whole[cut:]

@@ -412,6 +412,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", default="", help="tools whose names begin so")
     parser.add_argument("--keep", help="a folder for what is wrong; by default one that is removed")
     given = parser.parse_args(arguments)
+    if given.keep:
+        Path(given.keep).mkdir(parents=True, exist_ok=True)
     top = Path(tempfile.mkdtemp(dir=given.keep))
     cv2.setNumThreads(1)
     torch.set_num_threads(1)

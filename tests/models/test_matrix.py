@@ -26,6 +26,7 @@ FEW = (
     "stratified_nano+aunet+eca",
     "stratified_nano+lite_mono",
     "resnet18+unet",
+    "resnet18+unet_narrow",
     "resnet18+aunet+se",
     "lite_mono_tiny+packnet",
     "lite_mono_tiny+aunet+cbam",

@@ -132,7 +132,7 @@ def test_a_killed_process_ends_the_run_with_a_sentence_and_a_checkpoint(victim: 
     assert done.returncode != 0
     named = "process 1 of 2 was killed (signal 9)" if victim == 1 else "the first process of the run is gone"
     assert f"saunet train: {named}" in done.stderr
-    assert "resume with saunet resume " in done.stderr
+    assert "resume with resume=" in done.stderr
     record = json.loads((tmp_path / "run.json").read_text())
     assert record["status"] == "failed"
     assert named in record["error"]

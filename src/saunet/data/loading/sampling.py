@@ -33,6 +33,7 @@ class TrainBatches(DistributedSampler[Any]):
         self.share = share(batch_size, world_size)
         self.count = len(dataset)  # type: ignore[arg-type]
         self.start = 0
+        self.start_epoch: int | None = None
         if self.count < batch_size:
             raise ConfigError(
                 f"batch_size is {batch_size} but there are only {self.count} training samples; "
@@ -42,12 +43,17 @@ class TrainBatches(DistributedSampler[Any]):
     def __len__(self) -> int:
         return self.count // self.batch_size
 
+    @property
+    def first(self) -> int:
+        """The batch that the next epoch begins with: where a resumed one was left, and only if it is that epoch."""
+        return self.start if self.start_epoch in (None, self.epoch) else 0
+
     def __iter__(self) -> Iterator[list[Item]]:
         random = np.random.default_rng([self.seed, self.epoch])
         order = random.permutation(self.count)
         seeds = random.integers(2**63, size=self.count)
         first = self.rank * self.share
-        start, self.start = self.start, 0
+        start, self.start = self.first, 0
         for step in range(start, len(self)):
             part = slice(step * self.batch_size + first, step * self.batch_size + first + self.share)
             yield [Item(*each) for each in zip(order[part].tolist(), seeds[part].tolist(), strict=True)]
@@ -143,14 +149,17 @@ class ResumableLoader(Loader):
     _done = 0
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
-        self._done = self.sampler.start  # type: ignore[attr-defined]
+        self._done = self.sampler.first  # type: ignore[attr-defined]
         for batch in super().__iter__():
             self._done += 1
             yield batch
 
     def state_dict(self) -> dict[str, int]:
-        """Return how many batches of this epoch were handed out; 0 after the last."""
-        return {"batches": self._done % max(1, len(self))}
+        """Return how many batches of which epoch were handed out; 0 after the last.
+
+        The epoch counts where a limit ends it early: the next one must not begin in its middle.
+        """
+        return {"batches": self._done % max(1, len(self)), "epoch": self.sampler.epoch}  # type: ignore[attr-defined]
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        self.sampler.start = state["batches"]  # type: ignore[attr-defined]
+        self.sampler.start, self.sampler.start_epoch = state["batches"], state.get("epoch")  # type: ignore[attr-defined]
