@@ -29,7 +29,7 @@ ALLOWED: dict[str, set[str]] = {
     "synthetic": {"errors", "io", "data"},
     "runs": {"plugins", "errors", "io", "registry", "metrics", "models", "__version__"},
     "weights": {"errors", "io", "runs"},
-    "scale": {"errors", "lazy", "types", "io", "geometry", "runs"},
+    "scale": {"errors", "lazy", "types", "io", "geometry", "runs", "weights"},
     "training": {
         "plugins",
         "errors",

@@ -21,20 +21,18 @@ from saunet.evaluation.predictors import ExportingPredictor, FilePredictor, Netw
 from saunet.evaluation.result import EvaluationResult, read_rows, write_results
 from saunet.evaluation.scoring import Buckets, score, score_views
 from saunet.evaluation.statistics import drive_of, with_statistics
-from saunet.io.atomic import check_folder, write_json
+from saunet.io.atomic import check_folder
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
 from saunet.metrics.protocols import Protocol as Rules
 from saunet.metrics.protocols import protocol
 from saunet.models.depth import DepthNet
 from saunet.registry import Spec
-from saunet.runs.checkpoint import store_scale
 from saunet.runs.record import ModelRecord
-from saunet.scale import MetricDepth, MetricMotion, estimate_scale
+from saunet.scale.estimate import MetricDepth, MetricMotion, estimate_scale, keep_scale
 from saunet.scale.options import ScaleOptions
 from saunet.scale.recorded import read_speeds
 from saunet.types import EvalBatch
 from saunet.weights.files import read_model
-from saunet.weights.locate import shipped
 
 STAGES = {"test": "test", "val": "validate"}
 """Splits that can be evaluated, and the stage that sets each up."""
@@ -140,11 +138,7 @@ class EvaluateOptions:
             raise ConfigError("flip=true blends two predictions of a model; leave it out with predictions=...")
         if self.predictions is not None and self.scale.method != "auto":
             raise ConfigError("scale.method measures the scale of a model; leave it out with predictions=...")
-        if self.scale.store and self.checkpoint in shipped():
-            raise ConfigError(
-                f"scale.store=true writes into the checkpoint, but '{self.checkpoint}' comes with saunet and stays as "
-                "it is; leave scale.store out"
-            )
+        self.scale.storable(str(self.checkpoint))
 
 
 def evaluate(options: EvaluateOptions) -> EvaluationResult:
@@ -339,15 +333,9 @@ def _scaled(
         )
         height = data.camera_height if options.scale.camera_height is None else options.scale.camera_height
         estimate = estimate_scale(method, batches, lambda image: depth(image).depth[0], pose, height)
-        print(estimate)
-        measured = estimate.as_json()
-        report = {key: value for key, value in measured.items() if key != "per_frame"}  # scale.json has it
-        if options.output_dir is not None:
-            write_json(Path(options.output_dir) / "scale.json", measured)
-        scale = estimate.scale()
-        if options.scale.store:
-            store_scale(str(options.checkpoint), scale)
-            print(f"stored in {options.checkpoint}")
+        report = {key: value for key, value in estimate.as_json().items() if key != "per_frame"}  # scale.json has it
+        folder = None if options.output_dir is None else Path(options.output_dir)
+        scale = keep_scale(estimate, options.scale.storable(str(options.checkpoint)), folder)
     scale = options.scale.chosen(scale)
     if scale is None:
         return depth, pose, {"method": method, "factor": None}

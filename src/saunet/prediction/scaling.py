@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saunet.errors import ConfigError
-from saunet.io.atomic import write_json
 from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import ImagePredictor
 from saunet.prediction.sources import Input, Recording, camera_number
 from saunet.scale.options import ScaleOptions
-from saunet.weights.locate import shipped
 
 if TYPE_CHECKING:
     from saunet.types import TrainBatch
@@ -35,15 +33,10 @@ def apply_scale(
     if options.measures:
         import torch
 
-        from saunet.runs.checkpoint import store_scale
-        from saunet.scale.estimate import estimate_scale
+        from saunet.scale.estimate import estimate_scale, keep_scale
         from saunet.weights.files import read_model
 
-        if options.store and str(checkpoint) in shipped():
-            raise ConfigError(
-                f"scale.store=true writes into the checkpoint, but '{checkpoint}' comes with saunet and stays "
-                "as it is; leave scale.store out"
-            )
+        store_in = options.storable(checkpoint)
 
         def depth(image: Any) -> Any:
             return 1 / torch.from_numpy(predictor.disparity(image.numpy()))[:, None]
@@ -57,12 +50,7 @@ def apply_scale(
         with _batches(options, predictor, source, camera, offsets) as batches:
             height = camera_height if options.camera_height is None else options.camera_height
             estimate = estimate_scale(options.method, batches, depth, pose, height)
-        print(estimate)
-        write_json(folder / "scale.json", estimate.as_json())
-        predictor.scale = estimate.scale()
-        if options.store:
-            store_scale(checkpoint, predictor.scale)
-            print(f"stored in {checkpoint}")
+        predictor.scale = keep_scale(estimate, store_in, folder)
     predictor.scale = options.chosen(predictor.scale)
 
 

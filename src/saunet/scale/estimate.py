@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -16,6 +17,8 @@ from torch import Tensor, nn
 
 from saunet.errors import ConfigError, DataError, one_of, positive
 from saunet.geometry.ground import fit_ground
+from saunet.io.atomic import write_json
+from saunet.runs.checkpoint import store_scale
 from saunet.runs.record import Scale
 from saunet.scale.options import METHODS
 from saunet.types import DepthPyramid, TrainBatch
@@ -143,6 +146,17 @@ def estimate_scale(
         raise DataError(f"the scale cannot be measured by {method}: {_WHY_NOT[method].format(count=len(factors))}")
     kept_names, kept = zip(*usable, strict=True)
     return ScaleEstimate(method, source, kept_names, kept, len(names) - len(kept))
+
+
+def keep_scale(estimate: ScaleEstimate, store_in: str | Path | None, folder: Path | None) -> Scale:
+    """Say what was measured, write ``scale.json`` into a folder, store the factor in a checkpoint, and return it."""
+    print(estimate)
+    if folder is not None:
+        write_json(folder / "scale.json", estimate.as_json())
+    if store_in is not None:
+        store_scale(store_in, estimate.scale())
+        print(f"stored in {store_in}")
+    return estimate.scale()
 
 
 def _measurement(

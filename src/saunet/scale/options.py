@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from saunet.errors import ConfigError, one_of, positive
 from saunet.runs.record import Scale
+from saunet.weights.locate import shipped
 
 METHODS = ("camera_height", "speed", "stereo")
 """Ways to measure the scale."""
@@ -64,6 +66,15 @@ class ScaleOptions:
     def measures(self) -> bool:
         """Whether the scale is measured on images, not taken from the checkpoint."""
         return self.method in METHODS
+
+    def storable(self, checkpoint: str | Path) -> str | Path | None:
+        """Return the checkpoint to store the measured factor in, None if it is not to be stored."""
+        if self.store and str(checkpoint) in shipped():
+            raise ConfigError(
+                f"scale.store=true writes into the checkpoint, but '{checkpoint}' comes with saunet and stays as it "
+                "is; leave scale.store out"
+            )
+        return checkpoint if self.store else None
 
     def chosen(self, known: Scale | None) -> Scale | None:
         """Return the scale to apply, given the measured or stored one."""
