@@ -100,8 +100,8 @@ def test_garg_crop_truncates_in_double_precision(test_data):
     for size, bounds in facts.items():
         height, width = map(int, size.split("x"))
         expected = tuple(bounds[key] for key in ("row_start", "row_end_exclusive", "col_start", "col_end_exclusive"))
-        assert F.garg_crop(height, width) == expected
-    assert F.garg_crop(370, 1226)[1] == 366
+        assert F.crop_window("garg", height, width) == expected
+    assert F.crop_window("garg", 370, 1226)[1] == 366
 
 
 def test_flip_blend_reference(reference):

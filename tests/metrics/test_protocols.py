@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from saunet.errors import ConfigError
-from saunet.metrics.functional import A1, ABS_REL, RMSE_LOG, flip_blend, garg_crop
+from saunet.metrics.functional import A1, ABS_REL, RMSE_LOG, crop_window, flip_blend
 from saunet.metrics.protocols import PROTOCOLS, Protocol, evaluate_image, protocol, sample_image
 
 EIGEN = protocol("eigen_camera_z")
@@ -50,10 +50,10 @@ def test_eigen_reference_blended(reference):
         close_to_reference(image.errors, data["eigen_metrics_blended_median_scaled"][i])
 
 
-@pytest.mark.parametrize(("scaling", "key"), [("none", "loop_clamped"), ("median", "loop_clamped_median_scaled")])
-def test_loop_without_crop_reference(reference, scaling, key):
+@pytest.mark.parametrize(("alignment", "key"), [("none", "loop_clamped"), ("median", "loop_clamped_median_scaled")])
+def test_loop_without_crop_reference(reference, alignment, key):
     data = reference("metrics")
-    rules = dataclasses.replace(protocol("eigen_improved"), scaling=scaling)
+    rules = dataclasses.replace(protocol("eigen_improved"), alignment=alignment)
     for i in range(4):
         truth = torch.from_numpy(data["plain_gt"][i])
         image = evaluate_image(torch.from_numpy(data["loop_disparity"][i]), truth, rules)
@@ -62,7 +62,7 @@ def test_loop_without_crop_reference(reference, scaling, key):
 
 def test_mask_is_strict_capped_and_cropped():
     truth = torch.full((40, 60), 10.0)
-    top, bottom, left, right = garg_crop(40, 60)
+    top, bottom, left, right = crop_window("garg", 40, 60)
     truth[top, left], truth[top, left + 1], truth[top, left + 2], truth[top, left + 3] = 80.0, 1e-3, 0.0, 79.9
     mask = EIGEN.mask(truth)
     assert mask.sum() == (bottom - top) * (right - left) - 3
@@ -75,14 +75,91 @@ def test_mask_is_strict_capped_and_cropped():
 
 @pytest.mark.parametrize("name", sorted(PROTOCOLS))
 def test_k_times_truth(name):
-    """Median scaling removes a factor exactly; without scaling it shows as the closed form."""
+    """Each alignment removes a factor exactly; without any it shows as the closed form."""
     truth = torch.rand(40, 60, dtype=torch.float64) * 20 + 5
     image = evaluate_image(1 / (1.5 * truth), truth, protocol(name))
     assert image.ratio.item() == pytest.approx(1 / 1.5)
-    scaled = protocol(name).scaling == "median"
+    scaled = protocol(name).alignment != "none"
     assert image.errors[ABS_REL].item() == pytest.approx(0.0 if scaled else 0.5, abs=1e-12)
     assert image.errors[RMSE_LOG].item() == pytest.approx(0.0 if scaled else np.log(1.5), abs=1e-12)
     assert image.errors[A1].item() == (1.0 if scaled else 0.0)
+
+
+def fitted(columns, wanted):
+    return np.linalg.lstsq(np.stack(columns, 1), wanted, rcond=None)[0]
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.5])
+def test_least_squares_alignments_are_those_of_a_solver(factor):
+    generator = torch.Generator().manual_seed(4)
+    truth = torch.rand(30, 40, generator=generator, dtype=torch.float64) * 60 + 3
+    disparity = (0.3 / truth + 0.01 * torch.rand(30, 40, generator=generator)).double()
+    t, d = truth.flatten().numpy(), disparity.flatten().numpy()
+    for alignment in ("least_squares", "least_squares_disparity"):
+        rules = dataclasses.replace(protocol("synthetic"), alignment=alignment, factor=factor)
+        sample = sample_image(disparity, truth, rules)
+        if alignment == "least_squares":
+            expected = fitted([factor / d], t)[0] * factor / d
+        else:
+            slope, shift = fitted([d, np.ones_like(d)], 1 / t)
+            assert sample.shift.item() == pytest.approx(shift)
+            assert sample.ratio.item() == pytest.approx(1 / slope / factor)
+            expected = 1 / np.maximum(slope * d + shift, 1e-9)
+        np.testing.assert_allclose(sample.prediction.numpy(), expected.clip(0.1, 80), rtol=1e-9)
+
+
+def test_disparity_of_any_scale_shift_and_sign_is_aligned():
+    """Affine-invariant models predict disparity whose zero means nothing; some of it is below zero."""
+    truth = torch.linspace(2, 90, 600, dtype=torch.float64).view(20, 30)
+    for slope, shift in ((3.0, -0.5), (-40.0, 7.0)):
+        image = evaluate_image(slope / truth + shift, truth, protocol("syns"))
+        assert image.errors[:4].max() < 1e-6
+        assert image.ratio.item() == pytest.approx(slope)
+
+
+def test_constant_disparity_can_be_aligned():
+    truth = torch.linspace(2, 90, 600, dtype=torch.float64).view(20, 30)
+    sample = sample_image(torch.full((4, 6), 0.37), truth, protocol("syns"))
+    assert sample.prediction.numpy() == pytest.approx(1 / (1 / truth).mean().item())
+
+
+def test_cityscapes_is_the_published_slice():
+    """ManyDepth: of 1024x2048, rows 256 to 768 and columns 192 to 1856; here of images of an eighth of that."""
+    truth = torch.rand(96, 256, dtype=torch.float64) * 100
+    cut = truth[256 // 8 :, 192 // 8 : 1856 // 8]
+    rules = protocol("cityscapes")
+    kept = cut[(cut > 1e-3) & (cut < 80)]
+    torch.testing.assert_close(sample_image(torch.rand(24, 64), truth, rules).target, kept)
+    assert crop_window("cityscapes", 768, 2048) == (256, 768, 192, 1856)
+    assert crop_window("nyu", 480, 640) == (45, 471, 41, 601)
+
+
+@pytest.mark.parametrize(
+    ("name", "limits", "crop", "alignment"),
+    [
+        ("kitti_360", (1e-3, 80), "none", "median"),
+        ("nuscenes", (0.1, 80), "none", "median"),
+        ("cityscapes", (1e-3, 80), "cityscapes", "median"),
+        ("ddad", (1e-3, 200), "none", "median"),
+        ("make3d", (1e-3, 70), "none", "median"),
+        ("indoor", (0.1, 10), "none", "median"),
+        ("nyu", (1e-3, 10), "nyu", "median"),
+        ("syns", (1e-3, 100), "none", "least_squares_disparity"),
+    ],
+)
+def test_published_rules(name, limits, crop, alignment):
+    rules = protocol(name)
+    assert (rules.min_depth, rules.max_depth, rules.crop, rules.alignment) == (*limits, crop, alignment)
+    assert rules.ground_truth == "camera_z"
+
+
+def test_another_alignment_by_name():
+    rules = protocol("ddad/none")
+    assert rules == dataclasses.replace(protocol("ddad"), name="ddad/none", alignment="none")
+    with pytest.raises(ConfigError, match=r"alignment is 'lsq', allowed: median"):
+        protocol("ddad/lsq")
+    with pytest.raises(ConfigError, match="campus/median"):
+        protocol("campus/median")
 
 
 def test_clamps_after_scaling():
@@ -164,7 +241,7 @@ def test_bad_values(change, message):
     ("field", "word", "message"),
     [
         ("crop", "gargs", "crop is 'gargs'; did you mean 'garg'"),
-        ("scaling", "medain", "scaling is 'medain'; did you mean 'median'"),
+        ("alignment", "medain", "alignment is 'medain'; did you mean 'median'"),
         ("ground_truth", "velodyne", "ground_truth is 'velodyne', allowed: lidar_x"),
     ],
 )

@@ -19,7 +19,7 @@ from saunet.io.images import natural_order, read_depth, write_image
 from saunet.io.plain import read_array
 from saunet.metrics.depth import native_depths
 from saunet.metrics.functional import flip_blend
-from saunet.metrics.protocols import Protocol, resize_disparity, sample_image
+from saunet.metrics.protocols import Protocol, aligned_depth, resize_disparity, sample_image
 from saunet.types import DepthPyramid, EvalBatch
 
 Predictor: TypeAlias = Callable[[EvalBatch], Tensor]
@@ -117,7 +117,7 @@ class ExportingPredictor:
     """A predictor that also writes what it predicts, one 16-bit PNG per image (KITTI's format), named by `file_stem`.
 
     The folder can be scored again (``predictions=FOLDER match=name``) with the same result, up to the PNG's 1/256 m.
-    The protocol's factor, scaling and limits make depth of disparity. With median scaling an image needs ground truth,
+    The protocol's factor, alignment and limits make depth of disparity. For an alignment an image needs ground truth,
     and one that has none is not written.
     """
 
@@ -143,12 +143,10 @@ class ExportingPredictor:
     def _depth(self, disparity: Float[Tensor, "h w"], truth: Float[Tensor, "hg wg"]) -> Float[Tensor, "_ _"] | None:
         rules = self.protocol
         sample = sample_image(disparity, truth, rules)
-        if rules.scaling == "median" and sample.target.numel() == 0:
+        if rules.alignment != "none" and sample.target.numel() == 0:
             return None
         size = (truth.shape[0], truth.shape[1]) if truth.numel() > 1 else (disparity.shape[0], disparity.shape[1])
-        factor = rules.factor * (float(sample.ratio) if rules.scaling == "median" else 1.0)
-        depth = factor / resize_disparity(disparity, size).double()
-        return torch.clamp(depth, rules.min_depth, rules.max_depth)
+        return aligned_depth(resize_disparity(disparity, size).double(), sample.ratio, sample.shift, rules)
 
 
 def truths_of(batch: EvalBatch) -> list[Float[Tensor, "_ _"]]:

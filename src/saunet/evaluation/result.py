@@ -33,7 +33,7 @@ class ImageRow:
     pixels: int
     """Pixels compared; 0 where the image has no ground truth, and then the numbers are NaN."""
     scale: float
-    """median(truth)/median(prediction), whether or not it was applied."""
+    """Factor on the depth: that of the alignment, or under none median(truth)/median(prediction)."""
     errors: tuple[float, ...]
     """In the order of `saunet.metrics.functional.ERROR_NAMES`, as everywhere below."""
 

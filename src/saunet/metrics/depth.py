@@ -78,8 +78,9 @@ class DepthMetrics(Metric):
     def compute(self) -> dict[str, Float[Tensor, ""]]:
         """Return the mean of each error, float64, and what else was seen.
 
-        Keys are `ERROR_NAMES`, then ``scale`` and ``scale_std`` (mean and standard deviation over images of the ratio
-        median(truth)/median(prediction)), ``images`` and ``images_without_truth``. Means over no image are NaN.
+        Keys are `ERROR_NAMES`, then ``scale`` and ``scale_std`` (mean and standard deviation over images of the factor
+        on the depth, under no alignment of median(truth)/median(prediction)), ``images`` and
+        ``images_without_truth``. Means over no image are NaN.
         """
         count = self.images.double()
         errors = self.error_sum / count

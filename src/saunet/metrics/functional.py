@@ -1,10 +1,15 @@
-"""Numbers of one depth map against one ground truth: errors, the median, the Garg crop, flip post-processing."""
+"""Numbers of one depth map against one ground truth: errors, the median, crops, flip post-processing."""
 
 from __future__ import annotations
+
+from fractions import Fraction
+from typing import Literal, TypeAlias
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from saunet.errors import one_of
 
 ABS_REL, SQ_REL, RMSE, RMSE_LOG, A1, A2, A3 = range(7)
 """Positions in vectors of errors."""
@@ -14,8 +19,17 @@ ERROR_HEADINGS: tuple[str, ...] = ("Abs Rel ↓", "Sq Rel ↓", "RMSE ↓", "RMS
 RISING: tuple[str, ...] = ERROR_NAMES[A1:]
 """The errors that grow with quality."""
 
-_GARG_ROWS = (0.40810811, 0.99189189)
-_GARG_COLUMNS = (0.03594771, 0.96405229)
+Crop: TypeAlias = Literal["garg", "cityscapes", "nyu", "none"]
+CROPS: dict[str, tuple[float | Fraction, float | Fraction, float | Fraction, float | Fraction]] = {
+    "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229),
+    "cityscapes": (Fraction(256, 768), 1, Fraction(192, 2048), Fraction(1856, 2048)),
+    "nyu": (Fraction(45, 480), Fraction(471, 480), Fraction(41, 640), Fraction(601, 640)),
+    "none": (0, 1, 0, 1),
+}
+"""Top, bottom, left and right end of what is evaluated, as fractions of the height and width of the ground truth.
+
+Garg et al., 2016, for KITTI; ManyDepth (Watson et al., 2021) for Cityscapes without the bottom quarter, which shows the
+car; and the part of NYU's frames that Eigen et al., 2014, evaluate."""
 
 
 def error_terms(prediction: Float[Tensor, " *shape"], target: Float[Tensor, " *shape"]) -> Float[Tensor, "k=7 *shape"]:
@@ -56,15 +70,14 @@ def median(values: Float[Tensor, " n"]) -> Float[Tensor, ""]:
     return (lower + torch.where((values <= lower).sum() > count // 2, lower, above)) / 2
 
 
-def garg_crop(height: int, width: int) -> tuple[int, int, int, int]:
-    """Return the evaluated part of a KITTI image, (top, bottom, left, right), ends exclusive (Garg et al., 2016).
+def crop_window(name: str, height: int, width: int) -> tuple[int, int, int, int]:
+    """Return the evaluated part of an image, (top, bottom, left, right), ends exclusive.
 
-    The products are taken in double precision and truncated, as published code does: at 370x1226 the last row is
-    366.9999993, hence 366; single precision would give 367.
+    The products are taken exactly or in double precision and truncated, as published code does: at 370x1226 Garg's last
+    row is 366.9999993, hence 366; single precision would give 367.
     """
-    top, bottom = (int(part * height) for part in _GARG_ROWS)
-    left, right = (int(part * width) for part in _GARG_COLUMNS)
-    return top, bottom, left, right
+    top, bottom, left, right = CROPS[one_of("crop", name, CROPS)]
+    return int(top * height), int(bottom * height), int(left * width), int(right * width)
 
 
 def flip_blend(
