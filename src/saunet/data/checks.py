@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from saunet.data.drive import Drive
 from saunet.errors import DataError
+from saunet.geometry.camera import scale_intrinsics
 from saunet.io.images import image_size
 
 FOCAL = (0.15, 10.0)
@@ -90,3 +92,16 @@ def check_rotation(R: NDArray[np.float64], where: str) -> None:
         )
     if np.linalg.det(R) < 0:
         raise DataError(f"{where} has a matrix that mirrors (determinant -1) instead of a rotation: swap its axes back")
+
+
+def scaled(
+    K: NDArray[np.float64], native: tuple[int, int], size: tuple[int, int], images: Path, calibration: Path
+) -> NDArray[np.float64]:
+    """Return K of images that may have been scaled, as a whole, from the (height, width) that a calibration is for."""
+    (height, width), (rows, columns) = size, native
+    if abs(height / rows * columns / width - 1) > 0.02:
+        raise DataError(
+            f"{images} has {height}x{width} (height x width) but {calibration} is for {rows}x{columns}; "
+            "use the original images or ones scaled as a whole"
+        )
+    return scale_intrinsics(torch.from_numpy(K), width / columns, height / rows).numpy()

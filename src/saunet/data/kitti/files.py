@@ -14,13 +14,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from saunet.data.checks import check_intrinsics, check_rotation
-from saunet.data.loading.windows import nearest_map
+from saunet.data.lidar import scatter
 from saunet.errors import DataError, one_of
-from saunet.geometry.camera import scale_intrinsics
 from saunet.io.images import read_bytes
 
 Array = NDArray[np.float64]
@@ -113,17 +111,6 @@ def zero_based(K: Array) -> Array:
     return moved
 
 
-def scaled(K: Array, native: tuple[int, int], size: tuple[int, int], images: Path, calibration: Path) -> Array:
-    """Return K of images that may have been scaled, as a whole, from the (height, width) that a calibration is for."""
-    (height, width), (rows, columns) = size, native
-    if abs(height / rows * columns / width - 1) > 0.02:
-        raise DataError(
-            f"{images} has {height}x{width} (height x width) but {calibration} is for {rows}x{columns}; "
-            "use the original images or ones scaled as a whole"
-        )
-    return scale_intrinsics(torch.from_numpy(K), width / columns, height / rows).numpy()
-
-
 def read_calibration(folder: Path) -> KittiCalibration:
     """Read the calibration in the folder of a recording date."""
     path = folder / "calib_cam_to_cam.txt"
@@ -194,9 +181,7 @@ def lidar_depth(
     homogeneous, ahead = homogeneous[visible], ahead[visible]
     z = homogeneous[:, 2]
     columns, rows = np.round(homogeneous[:, :2].T / z) - 1
-    inside = (columns >= 0) & (columns < size[1]) & (rows >= 0) & (rows < size[0])
-    values = (z if kind == "camera_z" else ahead[:, 0])[inside]
-    return nearest_map(rows[inside].astype(np.int64), columns[inside].astype(np.int64), values, size)
+    return scatter(rows, columns, z if kind == "camera_z" else ahead[:, 0], size)
 
 
 def oxts_speed(path: Path) -> float:

@@ -13,7 +13,7 @@ from saunet.data.kitti import splits
 from saunet.data.kitti.raw import CAMERA_HEIGHT, CAMERAS, DEPTH_KINDS, DepthKind, KittiRaw
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
-from saunet.data.loading.selecting import Frame, has_speed, hold_out, hold_out_drives, moving
+from saunet.data.loading.selecting import Frame, has_speed, hold_out, hold_out_drives, moving, with_truth
 from saunet.data.loading.stored import DENSE_KINDS, DepthMaps
 from saunet.data.loading.windows import Selection, measured_distance, reach
 from saunet.errors import ConfigError, DataError, in_range, one_of, suggest
@@ -126,7 +126,7 @@ class KittiDataModule(DepthDataModule):
         if self.static != "keep" and split in ("train", "val"):
             selections = [moving(each, by_speed=self.static == "speed", skip_unreadable=skip) for each in selections]
         if split == "test":
-            selections = [_with_truth(selection) for selection in selections]
+            selections = [with_truth(selection) for selection in selections]
         if split == "train" and self.target_depth and not any(map(_has_truth, selections)):
             raise DataError(
                 f"target_depth is true but no training frame below {raw.root} has {kind} depth; "
@@ -214,9 +214,3 @@ def _known(value: str, name: str, words: Sequence[str]) -> str:
 
 def _has_truth(selection: Selection) -> bool:
     return any(selection.drive.has_depth(frame) for frame in selection.frames)
-
-
-def _with_truth(selection: Selection) -> Selection:
-    existing = set(selection.drive.indices)
-    have = [f for f in selection.frames if f not in existing or selection.drive.has_depth(f)]
-    return Selection(selection.drive, have, {"without ground truth": len(selection.frames) - len(have)})

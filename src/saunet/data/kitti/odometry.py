@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
-from saunet.data.checks import check_intrinsics, check_rotation, common_size
+from saunet.data.checks import check_intrinsics, check_rotation, common_size, scaled
 from saunet.data.drive import Drive
-from saunet.data.kitti.files import read_matrices, read_times, scaled, zero_based
+from saunet.data.kitti.files import read_matrices, read_times, zero_based
 from saunet.data.kitti.raw import CAMERA_HEIGHT, frame_files
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
-from saunet.data.loading.selecting import Frame, hold_out_tails
+from saunet.data.loading.selecting import Frame, hold_out_tails, with_poses
 from saunet.data.loading.windows import Selection, reach
 from saunet.errors import DataError, in_range, one_of
 from saunet.io.images import read_image
@@ -181,10 +181,7 @@ class KittiOdometryDataModule(DepthDataModule):
                 frames = [frame.number for frame in (train if split == "train" else val)]
                 if not frames:
                     continue
-            if self.with_pose and split in self.neighbors:  # of the frame, and of those neighbors that exist
-                unknown = {index for index in drive.indices if drive.pose(index) is None}
-                known = [i for i in frames if not unknown & {i + offset for offset in (0, *self.offsets)}]
-                left_out["without pose"] = len(frames) - len(known)
-                frames = known
-            selections.append(Selection(drive, frames, left_out))
+            selection = Selection(drive, frames, left_out)
+            posed = self.with_pose and split in self.neighbors
+            selections.append(with_poses(selection, self.offsets) if posed else selection)
         return selections

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.data.checks import check_intrinsics, common_size
+from saunet.data.checks import check_intrinsics, common_size, scaled
 from saunet.data.drive import Drive
 from saunet.data.kitti.files import (
     KittiCalibration,
@@ -23,7 +23,6 @@ from saunet.data.kitti.files import (
     read_calibration,
     read_scan,
     read_timestamps,
-    scaled,
 )
 from saunet.errors import DataError, one_of
 from saunet.io.images import read_depth, read_image

@@ -257,6 +257,22 @@ def _speed(drive: Drive, frame: int, skip_unreadable: bool) -> float | None:
         return None
 
 
+def with_truth(selection: Selection) -> Selection:
+    """Return a selection without the frames that have no ground truth; frames that do not exist stay, to be counted."""
+    existing = set(selection.drive.indices)
+    have = [f for f in selection.frames if f not in existing or selection.drive.has_depth(f)]
+    lost = len(selection.frames) - len(have)
+    return Selection(selection.drive, have, {**selection.left_out, "without ground truth": lost})
+
+
+def with_poses(selection: Selection, offsets: Sequence[int]) -> Selection:
+    """Return a selection without the frames whose pose, or that of a neighbor that exists, is unknown."""
+    drive, frames, left_out = selection
+    unknown = {index for index in drive.indices if drive.pose(index) is None}
+    known = [frame for frame in frames if not unknown & {frame + offset for offset in (0, *offsets)}]
+    return Selection(drive, known, {**left_out, "without pose": len(frames) - len(known)})
+
+
 def readable(selection: Selection, offsets: Sequence[int], with_depth: bool) -> Selection:
     """Return a selection without the frames that cannot be read, themselves or a neighbor, each decoded once."""
     drive, window = selection.drive, (0, *offsets)

@@ -1,0 +1,261 @@
+"""What the public data sets share: recordings made of image files, and data modules made of whole recordings."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import os
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from saunet.data.checks import check_intrinsics, common_size, scaled
+from saunet.data.drive import Drive
+from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.selecting import with_poses, with_truth
+from saunet.data.loading.windows import Selection
+from saunet.errors import DataError, SaunetError
+from saunet.io.images import read_image
+
+Array = NDArray[np.float64]
+
+
+class FilesDrive(Drive):
+    """A recording of image files with one K; a subclass adds the depth that its data set has.
+
+    Args:
+        name: As in `Drive.name`.
+        paths: Frame number -> image file.
+        K: 3 x 3, in pixels (whose centers are integers) of images of ``size``; images scaled as a whole may be used.
+        calibration: File that K comes from, for messages.
+        size: (height, width) that K belongs to; None where the files do not say.
+        times: Frame number -> seconds.
+        poses: Frame number -> T_world_cam, 4 x 4, meters.
+        camera_height: Meters above the road.
+        condition: Weather or light.
+        folder: Folder of the recording.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        paths: Mapping[int, Path],
+        K: Array,
+        calibration: Path,
+        size: tuple[int, int] | None = None,
+        *,
+        times: Mapping[int, float] | None = None,
+        poses: Mapping[int, Array] | None = None,
+        camera_height: float | None = None,
+        condition: str | None = None,
+        folder: Path | None = None,
+    ) -> None:
+        self._name, self.paths, self.calibrated_K, self.calibration, self._given_size = (
+            name,
+            paths,
+            K,
+            calibration,
+            size,
+        )
+        self._times, self._poses = times or {}, poses or {}
+        self._camera_height, self._condition, self._folder = camera_height, condition, folder
+        self._indices = sorted(paths)
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def indices(self) -> Sequence[int]:
+        return self._indices
+
+    def path(self, index: int) -> Path:
+        return self.paths[index]
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        return read_image(self.path(index))
+
+    def intrinsics(self, index: int) -> Array:
+        return self._scaled.copy()
+
+    @functools.cached_property
+    def _scaled(self) -> Array:
+        native, where = self.native_size, str(self.calibration)
+        check_intrinsics(self.calibrated_K, *native, where)
+        return scaled(self.calibrated_K, native, self.recorded_size, self._common[0], self.calibration)
+
+    @property
+    def native_size(self) -> tuple[int, int]:
+        """(height, width) of the images that the calibration is for, and of computed depth maps."""
+        return self._given_size or self.recorded_size
+
+    @property
+    def recorded_size(self) -> tuple[int, int]:
+        """(height, width) of the image files."""
+        return self._common[1]
+
+    @functools.cached_property
+    def _common(self) -> tuple[Path, tuple[int, int]]:
+        return common_size([self.paths[index] for index in self._indices])
+
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        return self.recorded_size
+
+    def time(self, index: int) -> float | None:
+        return self._times.get(index)
+
+    def pose(self, index: int) -> Array | None:
+        return self._poses.get(index)
+
+    @property
+    def folder(self) -> Path | None:
+        return self._folder
+
+    @property
+    def camera_height(self) -> float | None:
+        return self._camera_height
+
+    @property
+    def condition(self) -> str | None:
+        return self._condition
+
+
+class FilesDataModule(DepthDataModule):
+    """A data set whose splits are lists of recordings; a subclass implements `drives` in place of `select`."""
+
+    root: str
+
+    def drives(self, split: str) -> Sequence[Drive]:
+        """Return the recordings of ``train``, ``val``, ``test`` or ``predict``."""
+        raise NotImplementedError(f"{type(self).__name__} does not say which recordings belong to '{split}'")
+
+    def targets(self, split: str, drive: Drive) -> Sequence[int]:
+        """Return the frames of a recording that a split wants: all of them unless a subclass says otherwise."""
+        return drive.indices
+
+    def select(self, split: str) -> Sequence[Selection]:
+        """Return the targets of a split's recordings, tests only with ground truth, poses where they are asked for."""
+        selections = [Selection(drive, self.targets(split, drive)) for drive in self.drives(split)]
+        if split == "test" and self.ground_truth != "none":
+            selections = [with_truth(selection) for selection in selections]
+        if self.with_pose and split in self.neighbors:
+            selections = [with_poses(selection, self.offsets) for selection in selections]
+        known = (drive.has_depth(frame) for drive, frames, _ in selections for frame in frames)
+        if split == "train" and self.target_depth and not any(known):
+            raise DataError(
+                f"target_depth is true but no training frame below {self.root} has depth; add the files with depth "
+                "(see docs/datasets.md), or set data.target_depth=false"
+            )
+        return selections
+
+
+def find_root(root: str | Path, holds: str, what: str) -> Path:
+    """Return the folder with an entry ``holds`` (a name or pattern): root, one or two below, or the one above.
+
+    Raises:
+        DataError: if there is none; ``what`` says in the message what such a folder is.
+    """
+    folder = Path(root).expanduser().absolute()
+    if not folder.is_dir():
+        raise DataError(f"no data root at {folder}; set data.root to {what}")
+    for pattern in (holds, f"*/{holds}", f"*/*/{holds}", f"../{holds}"):
+        found = sorted(folder.glob(pattern))
+        if found:
+            depth = len(Path(holds).parts)
+            return found[0].parents[depth - 1].resolve()
+    raise DataError(f"no '{holds}' at {folder}, one or two levels below or one above; set data.root to {what}")
+
+
+def transform(
+    quaternion: Sequence[float | int],
+    translation: Sequence[float | int],
+    order: Literal["wxyz", "xyzw"],
+    where: str,
+) -> Float[ndarray, "4 4"]:
+    """Return the rigid motion of a quaternion (in the stated order of its numbers) and a translation, 4 x 4.
+
+    ``where`` names the record in messages. A norm more than 1 % from 1 is an error; smaller ones are normalized.
+    """
+    numbers = np.array([*quaternion, *translation], np.float64)
+    length = float(np.linalg.norm(numbers[:4]))
+    if numbers.shape != (7,) or not np.isfinite(numbers).all() or abs(length - 1) > 0.01:
+        raise DataError(
+            f"{where} has rotation {list(quaternion)} and translation {list(translation)}; expected a quaternion of "
+            f"length 1 (it has {length:.4g}) and three finite numbers: copy the file again"
+        )
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(np.roll(numbers[:4], -1) if order == "wxyz" else numbers[:4]).as_matrix()
+    T[:3, 3] = numbers[4:]
+    return T
+
+
+@contextlib.contextmanager
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Turn what plain data of another shape raise into one sentence; ``what`` says what the file should be."""
+    try:
+        yield
+    except SaunetError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as reason:
+        lacks = f"lacks {reason}" if isinstance(reason, KeyError) else str(reason)
+        raise DataError(f"{path} is not {what} as published ({lacks}); copy it again") from reason
+
+
+class Listing:
+    """Which files exist, each folder listed once."""
+
+    def __init__(self) -> None:
+        self._names: dict[Path, set[str]] = {}
+
+    def __contains__(self, path: Path) -> bool:
+        folder = path.parent
+        if folder not in self._names:
+            self._names[folder] = set(os.listdir(folder)) if folder.is_dir() else set()
+        return path.name in self._names[folder]
+
+
+def those_present(paths: Sequence[Path], there: Listing, what: str, fix: str) -> list[Path]:
+    """Return the paths that exist; warn with a count where some are missing.
+
+    Raises:
+        DataError: if none of them exists.
+    """
+    missing = [path for path in paths if path not in there]
+    if missing:
+        message = f"{len(missing)} of {len(paths)} {what} are missing, such as {missing[0]}; {fix}"
+        if len(missing) == len(paths):
+            raise DataError(message)
+        warnings.warn(message, stacklevel=3)
+    return [path for path in paths if path in there]
+
+
+def associate(first: Float[ndarray, " n"], second: Float[ndarray, " m"], most: float) -> list[tuple[int, int]]:
+    """Return pairs of places in two lists of ascending times, nearest first served, each place at most once.
+
+    ``most`` are the seconds that the two times of a pair may differ; pairs are sorted by the first place.
+    """
+    low, high = (np.searchsorted(second, first + sign * most, side) for sign, side in ((-1, "left"), (1, "right")))
+    close = [(abs(first[i] - second[j]), i, j) for i in range(len(first)) for j in range(low[i], high[i])]
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, i, j in sorted(close):
+        if i not in pairs and j not in taken:
+            pairs[i] = j
+            taken.add(j)
+    return sorted(pairs.items())
+
+
+def file_key(path: Path, *facts: Any) -> str:
+    """Return a hash of a file's place, size and age and of all else that ground truth is computed from."""
+    state = path.stat()
+    plain = [each.tolist() if isinstance(each, np.ndarray) else each for each in facts]
+    return hashlib.sha256(repr((str(path.absolute()), state.st_size, state.st_mtime_ns, plain)).encode()).hexdigest()
