@@ -14,6 +14,7 @@ ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "lazy": set(),
     "schema": set(),
+    "threads": set(),
     "types": set(),
     "fingerprint": set(),
     "published": set(),
@@ -25,7 +26,7 @@ ALLOWED: dict[str, set[str]] = {
     "models": {"errors", "registry", "types", "io", "geometry"},
     "losses": {"errors", "registry", "types", "geometry"},
     "metrics": {"errors", "types", "geometry"},
-    "data": {"errors", "registry", "schema", "types", "io", "fingerprint", "geometry", "synthetic"},
+    "data": {"errors", "registry", "schema", "threads", "types", "io", "fingerprint", "geometry", "synthetic"},
     "synthetic": {"errors", "io", "data"},
     "runs": {"plugins", "errors", "io", "registry", "metrics", "models", "__version__"},
     "weights": {"errors", "io", "runs"},
@@ -34,6 +35,7 @@ ALLOWED: dict[str, set[str]] = {
         "plugins",
         "errors",
         "registry",
+        "threads",
         "types",
         "io",
         "geometry",
@@ -88,7 +90,7 @@ ALLOWED: dict[str, set[str]] = {
         "tools",
         "__version__",
     },
-    "tools": {"errors", "registry", "io", "tables", "models", "data", "prediction", "published"},
+    "tools": {"errors", "registry", "threads", "io", "tables", "models", "data", "prediction", "published"},
 }
 # third-party package -> the rooms that may import it
 THIRD_PARTY: dict[str, set[str]] = {

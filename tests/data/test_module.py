@@ -5,9 +5,9 @@ import torch
 from drives import NumberDrive
 
 from saunet.data.loading.module import DepthDataModule
-from saunet.data.loading.sampling import available_cores
 from saunet.data.loading.windows import Selection
 from saunet.errors import ConfigError, DataError
+from saunet.threads import available_cores
 
 
 class Drives(DepthDataModule):

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, NoReturn, Protocol, cast, runtime_checkable
 from saunet import __version__, plugins
 from saunet.cli.table import PLUGINS, TOOLS, Table, Tool, config_dir, imported, read
 from saunet.errors import ConfigError, SaunetError, suggest
+from saunet.threads import wait_briefly
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -104,6 +105,7 @@ def run(name: str, argv: Sequence[str]) -> None:
     What a user can mend is said in one sentence; only a defect of the program shows a traceback.
     ``HYDRA_FULL_ERROR=1`` shows it always.
     """
+    wait_briefly()
     try:
         code = _run(name, argv)
     except KeyboardInterrupt:

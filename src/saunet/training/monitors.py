@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import torch
 from jaxtyping import Bool, Float
 from lightning import Callback, LightningModule, Trainer
@@ -17,10 +19,10 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor, distributed
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from saunet.data.loading.sampling import available_cores
 from saunet.errors import CheckpointError, SaunetError, in_range, one_of, positive
 from saunet.geometry import full_precision
 from saunet.runs.checkpoint import atomic_save
+from saunet.threads import SETTINGS, Usage, available_cores, free
 from saunet.types import DepthPyramid, LossTerms
 
 FAR = 0.8
@@ -31,6 +33,8 @@ NAMED = 3
 """Bad batches named at most in one message."""
 AHEAD = 8
 """Batches that the device may lag behind before their flags are waited for."""
+_LOOK = 0.5
+"""Seconds over which the use of the cores is measured before the first step."""
 
 
 def health(
@@ -242,6 +246,65 @@ class LoaderMonitor(Callback):
         if loading.share > self.share and not self._said:
             self._said = True
             rank_zero_info(sentence(loading, trainer))
+
+
+class Threads(Callback):
+    """Compute with as many threads as find a core, measured before the first step and again while training.
+
+    More threads than free cores wait for each other most of the time. The user's ``OMP_NUM_THREADS`` or
+    ``MKL_NUM_THREADS`` is left alone, and there are never more threads than torch had before.
+
+    Args:
+        every: Seconds over which the use of the cores is measured again.
+    """
+
+    def __init__(self, every: float = 20.0) -> None:
+        self.every = positive("every", every)
+        self._before = (0, 0)
+        self._since: Usage | None = None
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._before = (torch.get_num_threads(), cv2.getNumThreads())
+        self._since = None
+        given = next((name for name in SETTINGS if name in os.environ), None)
+        if given or trainer.num_devices > 1:  # several processes would measure each other
+            rank_zero_info(f"{count(self._before[0])} per process{f', as {given} says' if given else ''}")
+            return
+        began = Usage.now()
+        time.sleep(_LOOK)
+        self._since = Usage.now()
+        # The load average remembers a minute, in which this program may have worked itself; a moment may be unlucky.
+        taken = min(self._since.taken_since(began), os.getloadavg()[0]) if began and self._since else 0.0
+        cores = available_cores()
+        self._use(free(cores, taken))
+        others = f", of which other programs use {taken:.1f}" if taken >= 0.1 else ""
+        said = f"{count(torch.get_num_threads())}: this process may use {cores} cores{others}"
+        rank_zero_info(f"{said}; OMP_NUM_THREADS sets another number")
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        since = self._since
+        if since is None or time.monotonic() - since.moment < self.every:
+            return
+        self._since = Usage.now()
+        if self._since is not None:
+            self._use(free(available_cores(), self._since.taken_since(since)))
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Give the process back the threads that it had."""
+        if self._before[0]:
+            torch.set_num_threads(self._before[0])
+            cv2.setNumThreads(self._before[1])
+
+    def _use(self, wanted: int) -> None:
+        threads, own = (max(1, min(wanted, most)) for most in self._before)
+        if threads != torch.get_num_threads():
+            torch.set_num_threads(threads)
+        if own != cv2.getNumThreads():
+            cv2.setNumThreads(own)
+
+
+def count(threads: int) -> str:
+    return f"computing with {threads} thread{'s' * (threads > 1)}"
 
 
 def sentence(loading: Loading, trainer: Trainer) -> str:

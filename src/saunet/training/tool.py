@@ -54,6 +54,7 @@ CALLBACKS: Mapping[str, tuple[str, dict[str, str]]] = {
     "non_finite": ("monitors.NonFinite", {"folder": "nonfinite"}),
     "health": ("monitors.HealthMonitor", {}),
     "loader": ("monitors.LoaderMonitor", {}),
+    "threads": ("monitors.Threads", {}),
     "pictures": ("callbacks.PicturePanel", {"folder": "pictures"}),
 }
 """The usual callbacks by name, with the folders that they are given, below the run's own."""

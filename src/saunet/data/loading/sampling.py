@@ -6,7 +6,6 @@ A sampler yields lists of items, one list a batch, to a loader with ``batch_size
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -18,6 +17,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from saunet.data.loading.windows import Item
 from saunet.errors import ConfigError, SaunetError
+from saunet.threads import available_cores
 
 AHEAD = 4  # batches that each loader process keeps ready: enough that one slow file, or a validation, is not felt
 
@@ -96,12 +96,6 @@ def share(batch_size: int, world_size: int) -> int:
             f"and must be a positive multiple of their number, such as {nearest}"
         )
     return batch_size // world_size
-
-
-def available_cores() -> int:
-    """Return how many cores this process may use: fewer than the machine has, under a scheduler or in a container."""
-    allowed = getattr(os, "sched_getaffinity", None)  # Linux only
-    return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
 def processes(wanted: int) -> dict[str, Any]:

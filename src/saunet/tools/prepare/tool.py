@@ -11,11 +11,11 @@ from saunet.data.drive import Drive
 from saunet.data.kitti import splits
 from saunet.data.kitti.raw import CAMERAS, DepthKind, KittiRaw
 from saunet.data.loading.module import DepthDataModule
-from saunet.data.loading.sampling import available_cores
 from saunet.data.loading.stored import DENSE_KINDS, CacheSettings
 from saunet.data.loading.windows import other_view
 from saunet.errors import ConfigError, DataError, checked, one_of, positive, suggest, usable_device
 from saunet.registry import Spec
+from saunet.threads import available_cores
 from saunet.tools.prepare.cache import CacheReport, build_cache
 from saunet.tools.prepare.pool import Done, OnError
 from saunet.tools.prepare.targets import DenseKind, FileTeacher, ModelTeacher, Recording, Values, densify, teach
