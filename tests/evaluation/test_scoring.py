@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import pytest
 import torch
 from torch import nn
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation import NetworkPredictor, score
-from saunet.evaluation.scoring import Buckets
+from saunet.evaluation import NetworkPredictor, score, write_results
+from saunet.evaluation.scoring import Buckets, Shapes
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.functional import ERROR_NAMES, flip_blend
 from saunet.metrics.protocols import protocol
+from saunet.reporting.inputs import read_evaluation
+from saunet.reporting.tables import detail_tables
+from saunet.runs.folder import Run
 from saunet.types import DepthPyramid
 
 PROTOCOLS = [protocol("eigen_camera_z"), protocol("metric")]
@@ -184,3 +188,35 @@ def test_factor_protocol_runs_beside_the_named_one():
     result = score({"m": NetworkPredictor(Pyramid())}, batches(), [protocol("metric"), factor], progress=False)
     first, second = result.summaries()
     assert first.scale == pytest.approx(2 * second.scale)
+
+
+def test_shapes_of_a_perfect_and_of_a_far_prediction(tmp_path):
+    depth = torch.full((1, 1, 20, 40), 30.0)
+    depth[..., 15:] = 10.0
+    K = torch.tensor([[[20.0, 0.0, 9.5], [0.0, 20.0, 4.5], [0.0, 0.0, 1.0]]])
+    batch = {"target": torch.rand(1, 3, 10, 20), "K": K, "name": ["a 0"], "depth": depth}
+    batch["depth_size"] = torch.tensor([[20, 40]])
+    predictors = {"same": lambda batch: 1 / batch["depth"], "far": lambda batch: 0.9 / batch["depth"].roll(2, -1)}
+    rules = [dataclasses.replace(protocol("synthetic"), alignment="none")]
+    shapes = Shapes(boundaries=True, cloud=0.1)
+    result = score(predictors, iter([batch]), rules, ground_truth="exact", shapes=shapes, progress=False)
+    same, far = result.shapes
+    assert (same.edge_accuracy, same.edge_completeness, same.precision, same.recall, same.f_score) == (0, 0, 1, 1, 1)
+    assert far.edge_accuracy == pytest.approx(2, abs=0.3)
+    assert far.f_score == 0
+    first = result.shape_summaries()[0]
+    assert (first.f_score, first.edge_images, first.cloud_images) == (1, 1, 1)
+    titles = [table.title for table in result.tables()]
+    assert titles[1:] == ["synthetic: depth edges", "synthetic: point clouds"]
+    files = write_results(result, tmp_path)
+    assert files["shapes.csv"].read_text().splitlines()[1] == "same,synthetic,a 0,0.0,0.0,1.0,1.0,1.0"
+    assert json.loads(files["metrics.json"].read_text())["settings"] == {"cloud": 0.1}
+    assert not detail_tables({"mine": Run(tmp_path, details=read_evaluation(tmp_path).details)})  # no model among them
+    renamed = {("model" if name == "same" else name): each for name, each in predictors.items()}
+    result = score(
+        renamed, iter([batch]), rules, ground_truth="exact", shapes=shapes, progress=False, buckets=Buckets()
+    )
+    write_results(result, tmp_path)
+    buckets, edges = detail_tables({"mine": Run(tmp_path, details=read_evaluation(tmp_path).details)})
+    assert "at depth edges" in buckets.csv()
+    assert edges.rows[0].cells == ("mine", 0, 0, 1, 1, 1)

@@ -53,6 +53,24 @@ class BucketRow:
 
 
 @dataclass(frozen=True, slots=True)
+class ShapeRow:
+    """How well one predictor keeps the shapes of one image under one protocol; NaN for what was not measured."""
+
+    predictor: str
+    protocol: str
+    name: str
+    edge_accuracy: float
+    """Pixels from predicted depth edges to true ones; see `saunet.metrics.shapes.boundary_scores`."""
+    edge_completeness: float
+    """Pixels from true depth edges to predicted ones."""
+    precision: float
+    """Fraction of predicted points near true ones; see `saunet.metrics.shapes.cloud_scores`."""
+    recall: float
+    """Fraction of true points near predicted ones."""
+    f_score: float
+
+
+@dataclass(frozen=True, slots=True)
 class ViewRow:
     """How well a prediction explains the neighboring frames of one image, where no depth is known."""
 
@@ -96,6 +114,23 @@ class ViewSummary:
     unwarped: float
     explained: float
     visible: float
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeSummary:
+    """Means of `ShapeRow` of one predictor under one protocol, over the images that have each number."""
+
+    protocol: str
+    predictor: str
+    edge_accuracy: float
+    edge_completeness: float
+    precision: float
+    recall: float
+    f_score: float
+    edge_images: int
+    """Images whose ground truth is dense and has edges."""
+    cloud_images: int
+    """Images whose point clouds were compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +207,8 @@ class EvaluationResult:
     rows: tuple[ImageRow, ...]
     buckets: tuple[BucketRow, ...] = ()
     """Errors by distance, region and edges, where they were asked for."""
+    shapes: tuple[ShapeRow, ...] = ()
+    """Scores of edges and point clouds, where they were asked for."""
     views: tuple[ViewRow, ...] = ()
     """Rows under protocols that need no ground truth."""
     spreads: tuple[Spread, ...] = ()
@@ -210,7 +247,8 @@ class EvaluationResult:
         known = scored | {row.protocol for row in views}
         protocols = tuple(rules for rules in self.protocols if rules.name in known)
         rows = tuple(row for row in mine if row.protocol in scored)
-        return EvaluationResult(protocols, self.predictors, rows, views=views, settings=self.settings)
+        shapes = tuple(row for row in self.shapes if row.name.startswith(start) and row.protocol in scored)
+        return EvaluationResult(protocols, self.predictors, rows, shapes=shapes, views=views, settings=self.settings)
 
     def fingerprint(self, protocol: str) -> str:
         """Return the SHA-256 of the names of the images under one protocol, those without ground truth included.
@@ -243,6 +281,18 @@ class EvaluationResult:
                 rows = [row for row in mine if condition in ("all", row.condition)]
                 numbers = np.mean([(row.warped, row.unwarped, row.explained, row.visible) for row in rows], axis=0)
                 found.append(ViewSummary(protocol, predictor, condition, len(rows), *numbers.tolist()))
+        return tuple(found)
+
+    def shape_summaries(self) -> tuple[ShapeSummary, ...]:
+        """Return the means over the images that have each number, one summary for each protocol and predictor."""
+        found = []
+        for protocol, predictor in dict.fromkeys((row.protocol, row.predictor) for row in self.shapes):
+            mine = [row for row in self.shapes if (row.protocol, row.predictor) == (protocol, predictor)]
+            values = np.array([astuple(row)[3:] for row in mine])
+            known = ~np.isnan(values)
+            means = (values[known[:, place], place] for place in range(values.shape[1]))
+            numbers = (float(each.mean()) if each.size else math.nan for each in means)
+            found.append(ShapeSummary(protocol, predictor, *numbers, *known[:, [0, 2]].sum(0).tolist()))
         return tuple(found)
 
     @property
@@ -279,6 +329,7 @@ class EvaluationResult:
             predictors=tuple(dict.fromkeys((*self.predictors, *other.predictors))),
             rows=(*self.rows, *other.rows),
             buckets=(*self.buckets, *other.buckets),
+            shapes=(*self.shapes, *other.shapes),
             views=(*self.views, *other.views),
             spreads=(*self.spreads, *other.spreads),
             comparisons=(*self.comparisons, *other.comparisons),
@@ -298,6 +349,7 @@ class EvaluationResult:
             place = (protocol.name, self.predictors[0])
             if rows := [row for row in self.buckets if (row.protocol, row.predictor) == place]:
                 found.append(_bucket_table(rows))
+        found += _shape_tables(self.protocols, self.shape_summaries(), self.settings.get("cloud"))
         return found + [comparison.table() for comparison in self.comparisons]
 
     @property
@@ -357,6 +409,24 @@ def _bucket_table(rows: Sequence[BucketRow]) -> Table:
     return Table("buckets", title, headings, cells, ("over pixels, not images",), bold_best=False)
 
 
+def _shape_tables(protocols: Sequence[Protocol], shapes: Sequence[ShapeSummary], cloud: object) -> list[Table]:
+    """Return the scores of edges and of point clouds under each protocol, as far as they were measured."""
+    found = []
+    for protocol in protocols:
+        mine = [shape for shape in shapes if shape.protocol == protocol.name]
+        if edges := [shape for shape in mine if shape.edge_images]:
+            rows = [Row((s.predictor, s.edge_accuracy, s.edge_completeness, s.edge_images)) for s in edges]
+            headings = columns("predictor", "accuracy px ↓|.2f", "completeness px ↓|.2f", "images")
+            note = "pixels from predicted depth edges to true ones, and back"
+            found.append(Table("edges", f"{protocol.name}: depth edges", headings, tuple(rows), (note,)))
+        if clouds := [shape for shape in mine if shape.cloud_images]:
+            rows = [Row((s.predictor, s.f_score, s.precision, s.recall, s.cloud_images)) for s in clouds]
+            headings = columns("predictor", "F-score ↑|.3f", "precision ↑|.3f", "recall ↑|.3f", "images")
+            note = f"fractions of points with one of the other cloud within {cloud} m"
+            found.append(Table("cloud", f"{protocol.name}: point clouds", headings, tuple(rows), (note,)))
+    return found
+
+
 def markdown(result: EvaluationResult) -> str:
     """Return all tables as Markdown, intervals as ranges."""
     return "\n\n".join([*(table.markdown() for table in result.tables(ranges=True)), *result.warnings]) + "\n"
@@ -365,7 +435,8 @@ def markdown(result: EvaluationResult) -> str:
 def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
     """Write ``metrics.json``, ``metrics.csv``, ``metrics.md`` and ``per_image.csv``, each whole or not at all.
 
-    What else the result holds goes to ``buckets.csv``, ``views.csv`` (an image a line) and ``comparison.csv``.
+    What else the result holds goes to ``buckets.csv``, ``shapes.csv`` and ``views.csv`` (an image a line) and
+    ``comparison.csv``.
     """
     summaries = [_summary(summary, result.spreads) for summary in result.summaries()]
     header = [*_names(Summary), *(f"{name}_{end}" for end in ("low", "high") for name in ERROR_NAMES)]
@@ -375,6 +446,8 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
     }
     if result.buckets:
         texts["buckets.csv"] = _csv(BucketRow, result.buckets)
+    if result.shapes:
+        texts["shapes.csv"] = _csv(ShapeRow, result.shapes)
     if result.views:
         texts["views.csv"] = _csv(ViewRow, result.views)
     if result.comparisons:
@@ -404,6 +477,7 @@ def as_json(result: EvaluationResult) -> dict[str, object]:
         content["intervals"] = {"level": spread.level, "by": spread.by, "groups": spread.groups}
     rest = {
         "buckets": [_plain(row) for row in result.buckets],
+        "shapes": [_plain(shape) for shape in result.shape_summaries()],
         "views": [_plain(view) for view in result.view_summaries()],
         "comparisons": [asdict(comparison) for comparison in result.comparisons],
         "warnings": list(result.warnings),

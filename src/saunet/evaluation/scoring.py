@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,21 +14,29 @@ from torch.nn.functional import max_pool2d, pad
 
 from saunet.errors import ConfigError, DataError, one_of, positive
 from saunet.evaluation.predictors import Motion, Predictor, truths_of
-from saunet.evaluation.result import BucketRow, EvaluationResult, ImageRow, ViewRow
+from saunet.evaluation.result import BucketRow, EvaluationResult, ImageRow, ShapeRow, ViewRow
+from saunet.geometry.camera import scale_intrinsics
 from saunet.geometry.depth import disparity_to_depth
 from saunet.geometry.warp import synthesize
 from saunet.io.progress import bar
 from saunet.losses.functional import automask, combine_sources, photometric_error
 from saunet.metrics.functional import error_terms, root_terms
-from saunet.metrics.protocols import GROUND_TRUTHS, Protocol, Sample, sample_errors, sample_image
+from saunet.metrics.protocols import (
+    GROUND_TRUTHS,
+    Protocol,
+    Sample,
+    aligned_depth,
+    resize_disparity,
+    sample_errors,
+    sample_image,
+)
+from saunet.metrics.shapes import DENSE, boundary_scores, cloud_scores, points
 from saunet.types import EvalBatch
 
 _NO_IMAGE = "there is no image to evaluate; check the split and the data root"
 EDGE_RATIO = 1.25
 """Depths that differ by more than this factor make an edge, the strictest threshold of Bochkovskii et al., Depth Pro,
 2024, who compare neighboring pixels by this ratio too."""
-DENSE = 0.5
-"""Fraction of known pixels from which on a ground truth is dense enough to have depth edges between neighbors."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +65,7 @@ class Buckets:
             *(("row", f"{name} third") for name in ("top", "middle", "bottom")),
             *(("column", f"{name} third") for name in ("left", "center", "right")),
             *(("edge", name) for name in ("near an edge", "elsewhere")),
-            *(("edges", f"{side} depth edges") for side in ("at", "off")),
+            *(("edges", where) for where in ("at depth edges, on thin things", "away from depth edges")),
         )
 
     def maps(self, truth: Float[Tensor, "h w"]) -> Bool[Tensor, "k h w"]:
@@ -147,6 +156,41 @@ class BucketSums:
         )
 
 
+@dataclass(frozen=True)
+class Shapes:
+    """What to measure of shapes."""
+
+    boundaries: bool = False
+    """Accuracy and completeness of depth edges, where the ground truth is dense."""
+    cloud: float | None = None
+    """Meters within which points agree, for precision, recall and F-score of point clouds; None for no such scores."""
+
+    def __post_init__(self) -> None:
+        if self.cloud is not None:
+            positive("cloud", self.cloud)
+
+    def row(
+        self,
+        about: tuple[str, str, str],
+        disparity: Float[Tensor, "h w"],
+        truth: Float[Tensor, "hg wg"],
+        K: Float[Tensor, "3 3"],
+        sample: Sample,
+        rules: Protocol,
+    ) -> ShapeRow:
+        """Measure one image; ``about`` is predictor, protocol and name, ``K`` is in pixels of the truth."""
+        edges = cloud = (math.nan,) * 3
+        if self.boundaries and sample.target.numel():
+            resized = resize_disparity(disparity, (truth.shape[0], truth.shape[1])).double()
+            depth = aligned_depth(resized, sample.ratio, sample.shift, rules)
+            edges = boundary_scores(depth.cpu().numpy(), truth.cpu().numpy(), sample.mask.cpu().numpy())
+        if self.cloud is not None:
+            mask, matrix = sample.mask.cpu().numpy(), K.cpu().numpy()
+            predicted, true = (points(each.cpu().numpy(), mask, matrix) for each in (sample.prediction, sample.target))
+            cloud = cloud_scores(predicted, true, self.cloud)
+        return ShapeRow(*about, *edges[:2], *cloud)
+
+
 @torch.inference_mode()
 def score(
     predictors: Mapping[str, Predictor],
@@ -155,6 +199,7 @@ def score(
     *,
     ground_truth: str = "camera_z",
     buckets: Buckets | None = None,
+    shapes: Shapes | None = None,
     total: int | None = None,
     progress: bool = True,
 ) -> EvaluationResult:
@@ -166,11 +211,12 @@ def score(
     """
     _check_request(predictors, protocols, ground_truth)
     rows: list[ImageRow] = []
+    shape_rows: list[ShapeRow] = []
     sums = {(p, q.name): BucketSums(buckets) for p in predictors for q in protocols} if buckets else {}
     with bar(progress, "images", taken=True) as shown:
         task = shown.add_task("evaluate", total=total)
         for batch in batches:
-            rows += _score_batch(predictors, batch, protocols, sums, buckets)
+            rows += _score_batch(predictors, batch, protocols, sums, buckets, shapes, shape_rows)
             shown.advance(task, len(batch["name"]))
     if not rows:
         raise DataError(_NO_IMAGE)
@@ -181,7 +227,10 @@ def score(
             "protocols=[campus], which compares views and needs none"
         )
     found = tuple(row for (predictor, name), bucket in sums.items() for row in bucket.rows(predictor, name))
-    return EvaluationResult(tuple(protocols), tuple(predictors), tuple(rows), found)
+    about = {} if shapes is None or shapes.cloud is None else {"cloud": shapes.cloud}
+    return EvaluationResult(
+        tuple(protocols), tuple(predictors), tuple(rows), found, shapes=tuple(shape_rows), settings=about
+    )
 
 
 def _check_request(predictors: Mapping[str, Predictor], protocols: Sequence[Protocol], ground_truth: str) -> None:
@@ -205,6 +254,8 @@ def _score_batch(
     protocols: Sequence[Protocol],
     sums: Mapping[tuple[str, str], BucketSums],
     buckets: Buckets | None,
+    shapes: Shapes | None,
+    shape_rows: list[ShapeRow],
 ) -> list[ImageRow]:
     names = batch["name"]
     truths = truths_of(batch)
@@ -218,17 +269,26 @@ def _score_batch(
                 f"it must be ({len(names)}, 1, height, width)"
             )
         finite = disparity.isfinite().flatten(1).all(1).tolist()
-        for name, image, truth, inside, good in zip(names, disparity[:, 0], truths, maps, finite, strict=True):
-            if not good:
+        for place, (name, image, truth, inside) in enumerate(zip(names, disparity[:, 0], truths, maps, strict=True)):
+            if not finite[place]:
                 raise DataError(f"predictor '{predictor}' gives values that are not finite for image '{name}'")
             for protocol in protocols:
                 sample = sample_image(image, truth, protocol)
                 found = sample_errors(sample)
                 if inside is not None:
                     sums[predictor, protocol.name].add(sample, inside)
+                if shapes is not None:
+                    about, K = (predictor, protocol.name, name), _truth_intrinsics(batch, place, truth)
+                    shape_rows.append(shapes.row(about, image, truth, K, sample, protocol))
                 errors = tuple(found.errors.tolist())
                 rows.append(ImageRow(predictor, protocol.name, name, found.pixels, found.ratio.item(), errors))
     return rows
+
+
+def _truth_intrinsics(batch: EvalBatch, place: int, truth: Float[Tensor, "h w"]) -> Float[Tensor, "3 3"]:
+    """Return the intrinsics of an image in pixels of its ground truth."""
+    (height, width), (rows, columns) = batch["target"].shape[-2:], truth.shape
+    return scale_intrinsics(batch["K"][place].double(), columns / width, rows / height)
 
 
 @torch.inference_mode()

@@ -19,7 +19,7 @@ from saunet.data.loading.windows import measured_distance
 from saunet.errors import ConfigError, DataError, checked, one_of, usable_device
 from saunet.evaluation.predictors import ExportingPredictor, FilePredictor, NetworkPredictor, Predictor, existing
 from saunet.evaluation.result import EvaluationResult, read_rows, write_results
-from saunet.evaluation.scoring import Buckets, score, score_views
+from saunet.evaluation.scoring import Buckets, Shapes, score, score_views
 from saunet.evaluation.statistics import drive_of, with_statistics
 from saunet.io.atomic import check_folder
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
@@ -84,6 +84,8 @@ class EvaluateOptions:
         scale: How depth becomes meters.
         buckets: Also report errors by distance, image region and at depth edges.
         distances: Limits of the distance ranges in meters, ascending.
+        boundaries: Also measure how near depth edges are to true ones, in pixels, where ground truth is dense.
+        cloud: Also compare point clouds: how many points have one of the truth within this many meters, such as 0.1.
         intervals: Level of the bootstrap intervals of the means; None for none.
         compare: Folder of another evaluation of the same images, to compare with.
         truth_cache: Folder that keeps projected LiDAR ground truth.
@@ -112,6 +114,8 @@ class EvaluateOptions:
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     buckets: bool = False
     distances: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0, 50.0, 80.0)
+    boundaries: bool = False
+    cloud: float | None = None
     intervals: float | None = 0.95
     compare: str | None = None
     truth_cache: str | None = None
@@ -134,6 +138,7 @@ class EvaluateOptions:
         for name in self.protocols or ():
             protocol(name)
         Buckets(tuple(self.distances))
+        Shapes(self.boundaries, self.cloud)
         if self.predictions is not None and self.flip:
             raise ConfigError("flip=true blends two predictions of a model; leave it out with predictions=...")
         if self.predictions is not None and self.scale.method != "auto":
@@ -179,7 +184,7 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
     settings |= {"split": options.split, "post_processing": "monodepth blend of two flips" if options.flip else None}
     result, exported = _score_passes(options, passes, model, pose, device)
     sources = tuple(options.data.get("sources") or ())
-    result = replace(result, settings=settings, sources=sources, folder=folder, notes=exported)
+    result = replace(result, settings={**settings, **result.settings}, sources=sources, folder=folder, notes=exported)
     if folder is not None and earlier is not None:
         write_results(result, folder)  # an evaluation that does not compare is not lost
     result = with_statistics(result, options.intervals, earlier, options.compare)
@@ -259,6 +264,7 @@ def _score_passes(
     """Go through the images once for each ground truth; return the result, and what was exported."""
     split, name, exporter = options.split, "model" if model else "predictions", None
     buckets = Buckets(tuple(options.distances)) if options.buckets else None
+    shapes = Shapes(options.boundaries, options.cloud) if options.boundaries or options.cloud else None
     results: list[EvaluationResult] = []
     for data, rules in passes:
         _set_up(data, split)
@@ -278,7 +284,9 @@ def _score_passes(
         else:
             predictors = {name: predictor, **(trivial(data, options.truth_cache) if options.baselines else {})}
             truth = data.ground_truth
-            results.append(score(predictors, batches, rules, ground_truth=truth, buckets=buckets, total=total))
+            results.append(
+                score(predictors, batches, rules, ground_truth=truth, buckets=buckets, shapes=shapes, total=total)
+            )
     joined = functools.reduce(EvaluationResult.joined, results)
     asked = [protocol(name) for name in options.protocols or [rule.name for _, rules in passes for rule in rules]]
     return replace(joined, protocols=tuple(asked)), (str(exporter),) if exporter else ()

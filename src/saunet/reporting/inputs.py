@@ -7,12 +7,13 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from saunet.errors import CheckpointError, DataError
 from saunet.io.plain import read_torch
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.runs.folder import (
+    Detail,
     Explained,
     Run,
     Score,
@@ -28,6 +29,13 @@ from saunet.runs.sweep import read_plan
 
 _KEPT = {"lr": "initial_lr", "weight_decay": "weight_decay"}
 """Settings of a recipe that live on in an optimizer's state, and what they are called there."""
+
+
+DETAILS: Mapping[Literal["buckets", "shapes"], tuple[str, ...]] = {
+    "buckets": ("bucket", "pixels", "abs_rel", "rmse", "a1"),
+    "shapes": ("edge_accuracy", "edge_completeness", "f_score", "precision", "recall"),
+}
+"""What a report shows of the details of an evaluation."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +96,11 @@ def collect(paths: Sequence[str | Path], checkpoint: str = "best", *, strangers:
         mine = [evaluation for evaluation in evaluations.values() if belongs(evaluation, run)]
         scores = (*(score for evaluation in mine for score in evaluation.scores), *run.scores)
         explained = tuple(row for evaluation in mine for row in evaluation.explained)
-        folders = tuple(evaluation.folder for evaluation in mine)
-        return dataclasses.replace(_as_trained(run), scores=scores, explained=explained, evaluations=folders)
+        about = {
+            "details": tuple(row for evaluation in mine for row in evaluation.details),
+            "evaluations": tuple(evaluation.folder for evaluation in mine),
+        }
+        return dataclasses.replace(_as_trained(run), scores=scores, explained=explained, **about)
 
     return Inputs(
         tuple(scored(run) for run in runs.values()),
@@ -183,6 +194,7 @@ class Evaluation:
     """Settings that change the numbers, as the command line says them; empty for none."""
     scores: tuple[Score, ...]
     explained: tuple[Explained, ...]
+    details: tuple[Detail, ...]
 
     @property
     def foreign(self) -> bool:
@@ -225,8 +237,18 @@ def read_evaluation(folder: Path) -> Evaluation:
         for row in content.get("views", [])
         if row.get("predictor") == "model" and all(row.get(key) is not None for key in keys)
     )
+    details = tuple(
+        Detail(kind, cells=tuple(_cell(row.get(key)) for key in keys), **common(row))
+        for kind, keys in DETAILS.items()
+        for row in content.get(kind, [])
+        if row.get("predictor") in ("model", "predictions") and row.get("group", "edges") in ("distance", "edges")
+    )
     named = str(predictions) if predictions else None
-    return Evaluation(folder, checkpoint, named, place, how, scores, explained)
+    return Evaluation(folder, checkpoint, named, place, how, scores, explained, details)
+
+
+def _cell(value: Any) -> str | float | int | None:
+    return value if isinstance(value, str | float | int) else None
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

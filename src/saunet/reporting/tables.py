@@ -9,7 +9,7 @@ from saunet.evaluation.result import ERROR_COLUMNS
 from saunet.metrics.functional import A1, ABS_REL, RMSE
 from saunet.published import published
 from saunet.reporting.page import Missing
-from saunet.runs.folder import Explained, Run, Score
+from saunet.runs.folder import Detail, Explained, Run, Score
 from saunet.runs.sweep import RATIO, differing, ratio, values
 from saunet.tables import Cell, Column, Row, Table, columns
 
@@ -26,11 +26,11 @@ class Groups:
     The fingerprint of the images is part of a heading only where it alone tells two groups apart.
     """
 
-    def __init__(self, measured: Iterable[Score | Explained]) -> None:
+    def __init__(self, measured: Iterable[Score | Explained | Detail]) -> None:
         counts = Counter(words for words, _ in {(_words(one), one.fingerprint) for one in measured})
         self._ambiguous = {words for words, count in counts.items() if count > 1}
 
-    def __call__(self, one: Score | Explained) -> str:
+    def __call__(self, one: Score | Explained | Detail) -> str:
         words = _words(one)
         which = f"sha256 {one.fingerprint[:_DIGITS]}" if one.fingerprint else "which, it does not say"
         return f"{words} ({which})" if words in self._ambiguous else words
@@ -63,9 +63,9 @@ def _key(score: Score) -> tuple[bool, str, str, int, str, str]:
     return score.validation, score.data, score.protocol, score.images, score.fingerprint, score.how
 
 
-def _words(one: Score | Explained) -> str:
+def _words(one: Score | Explained | Detail) -> str:
     where = ", ".join(filter(None, (one.data, one.how, f"protocol {one.protocol}")))
-    if isinstance(one, Explained):
+    if not isinstance(one, Score):
         return f"Measured: {where}"
     kind = "Measured while training, best epoch" if one.validation else "Measured"
     return f"{kind}: {where}, {one.images} image{'' if one.images == 1 else 's'}"
@@ -107,6 +107,29 @@ def explained_table(runs: Mapping[str, Run]) -> Table | None:
     return (
         Table("conditions", "Data without ground truth, by condition", headings, tuple(rows), notes) if rows else None
     )
+
+
+def detail_tables(runs: Mapping[str, Run]) -> list[Table]:
+    """Return where the errors of runs are, and their scores of edges and point clouds, as far as they were measured."""
+    kinds = {
+        "buckets": ("Errors by place", columns("Where", "Pixels", "Abs Rel ↓|.3f", "RMSE ↓|.3f", "δ1 ↑|.3f")),
+        "shapes": (
+            "Depth edges and point clouds",
+            columns(
+                "Edge accuracy px ↓|.2f", "completeness px ↓|.2f", "F-score ↑|.3f", "precision ↑|.3f", "recall ↑|.3f"
+            ),
+        ),
+    }
+    found = []
+    for kind, (title, headings) in kinds.items():
+        ours = list(dict.fromkeys((name, one) for name, run in runs.items() for one in run.details if one.kind == kind))
+        group = Groups(one for _, one in ours)
+        rows = [Row((name, *one.cells), "measured", group(one)) for name, one in ours]
+        order = list(dict.fromkeys(row.group for row in rows))
+        rows.sort(key=lambda row: order.index(row.group))
+        if rows:
+            found.append(Table(kind, title, (*columns("Method"), *headings), tuple(rows), bold_best=kind == "shapes"))
+    return found
 
 
 def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table, list[Missing]]:

@@ -177,7 +177,7 @@ def build(
     explained = tables.explained_table(everyone)
     intro = "The paper’s numbers as published, and ours as measured by this installation."
     sections = [
-        Section("Accuracy", (table1, explained) if explained else (table1,), intro),
+        Section("Accuracy", (table1, *((explained,) if explained else ()), *tables.detail_tables(everyone)), intro),
         Section("Networks", (table2, table3)),
         Section("Runs", _runs(groups, draw, missing)),
     ]

@@ -283,6 +283,20 @@ class Explained:
     how: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Detail:
+    """What an evaluation of a run measured beside the errors of whole images: a line of a table."""
+
+    kind: Literal["buckets", "shapes"]
+    protocol: str
+    data: str
+    cells: tuple[str | float | int | None, ...]
+    """Of ``buckets``: where, pixels, Abs Rel, RMSE and δ1; of ``shapes``: numbers as in ``metrics.json``."""
+    fingerprint: str = ""
+    """Of the images, as in `Score`; so is ``how``."""
+    how: str = ""
+
+
 @dataclass(frozen=True)
 class Run:
     """One training; what it lacks is empty."""
@@ -304,6 +318,7 @@ class Run:
     checkpoint: Path | None = None
     scores: tuple[Score, ...] = ()
     explained: tuple[Explained, ...] = ()
+    details: tuple[Detail, ...] = ()
     evaluations: tuple[Path, ...] = ()
     """Folders of the evaluations that the scores come from."""
     job: int | None = None
