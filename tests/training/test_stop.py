@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from saunet.cli.table import config_dir
 from saunet.runs.folder import Stopped
 from saunet.training.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
-from saunet.training.resume import keep_rows
+from saunet.training.resume import keep_rows, validation_due
 from saunet.training.stopping import GracefulStop
 
 BATCHES = 6  # an epoch's, of two epochs
@@ -35,17 +35,37 @@ class Ask(Callback):
             os.kill(os.getpid(), signal.SIGTERM)
 
 
-def train(folder: Path, asked: int | None = None, resume: bool = False, **settings: Any) -> Trainer:
-    logger = CSVLogger(str(folder), name=None, version="csv")
+class KilledError(Exception):
+    pass
+
+
+class Kill(Callback):
+    """Break off during the validation after a step, or right after it."""
+
+    def __init__(self, step: int, hook: str) -> None:
+        self.step = step
+        setattr(self, hook, self._strike)
+
+    def _strike(self, trainer: Trainer, *_: Any) -> None:
+        if trainer.global_step == self.step:
+            raise KilledError
+
+
+def train(
+    folder: Path, asked: int | None = None, resume: bool = False, *more: Callback, every: int = 1000, **settings: Any
+) -> Trainer:
+    logger = CSVLogger(str(folder), name=None, version="csv", flush_logs_every_n_steps=1)
     last = folder / "last.ckpt"
     if resume:
-        keep_rows(logger, torch.load(last, weights_only=True)["global_step"])
+        stored = torch.load(last, weights_only=True)
+        keep_rows(logger, stored["global_step"], validation_due(stored))
     callbacks = [
         Ask(asked),
         BestCheckpoint(str(folder)),
-        LastCheckpoint(str(folder)),
+        LastCheckpoint(str(folder), every),
         GracefulStop(str(folder)),
         PicturePanel(str(folder / "pictures")),
+        *more,
     ]
     trainer = tiny.tiny_trainer(
         folder, max_epochs=2, callbacks=callbacks, logger=logger, log_every_n_steps=1, **settings
@@ -125,3 +145,30 @@ def test_a_validation_in_the_midst_of_an_epoch_is_made_before(every: int, after:
     if every > 1:
         train(stopped, resume=True, val_check_interval=every)
         same(whole, stopped)
+
+
+@pytest.mark.parametrize("hook", ["on_validation_batch_end", "on_validation_end"])
+@pytest.mark.parametrize(
+    ("step", "settings"),
+    [(BATCHES, {}), (2 * BATCHES, {}), (3, {"val_check_interval": 3}), (BATCHES, {"val_check_interval": 3})],
+)
+def test_a_validation_that_a_kill_cut_short_is_made_up_for(
+    hook: str, step: int, settings: dict[str, Any], tmp_path: Path
+) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    train(whole, every=1, **settings)
+    with pytest.raises(KilledError):
+        train(killed, None, False, Kill(step, hook), every=1, **settings)
+    with pytest.raises(KilledError):  # and once more
+        train(killed, None, True, Kill(step, hook), every=1, **settings)
+    train(killed, None, True, every=1, **settings)
+    same(whole, killed)
+    train(killed, None, True, every=1, **settings)  # a finished one stays as it is
+    same(whole, killed)
+
+
+def test_a_kill_after_a_warning_loses_no_validation_either(whole: Path, tmp_path: Path) -> None:
+    with pytest.raises(KilledError):
+        train(tmp_path, BATCHES, False, Kill(BATCHES, "on_validation_batch_end"))
+    train(tmp_path, resume=True)
+    same(whole, tmp_path)

@@ -24,7 +24,7 @@ from saunet.metrics.depth import DepthMetrics
 from saunet.runs.folder import RunRecord
 from saunet.training.monitors import health
 from saunet.training.optim import MovingAverage, Recipe
-from saunet.training.resume import continuation
+from saunet.training.resume import continuation, owe_validation, validation_due
 from saunet.training.speed import Speed
 from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
 
@@ -73,6 +73,7 @@ class SelfSupervisedDepth(LightningModule):
         """The run's ``run.json``, where there is one."""
         self.average = MovingAverage(self.recipe.ema) if self.recipe.ema > 0 else None
         self._prepared = False
+        self._owed = False  # a validation that a killed run did not finish
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> DepthPyramid:
         """Return the depth of images in [0, 1]."""
@@ -162,6 +163,12 @@ class SelfSupervisedDepth(LightningModule):
             nothing = torch.zeros(count, 2, dtype=torch.int64, device=disparity.device)
             self.metrics.update(disparity, disparity.new_zeros(count, 1, 1, 1), nothing)
 
+    def on_validation_start(self) -> None:
+        """Count anew the batches of a validation that was owed."""
+        if self._owed and not self.trainer.sanity_checking:
+            self._owed = False
+            self.trainer.fit_loop.epoch_loop.val_loop.batch_progress.total.reset()
+
     def on_validation_epoch_end(self) -> None:
         """Log the metrics over the whole validation set, exact over any number of processes."""
         result = self.metrics.compute()
@@ -242,6 +249,9 @@ class SelfSupervisedDepth(LightningModule):
             return
         for sentence in continuation(checkpoint, self, getattr(self.trainer, "datamodule", None)):
             rank_zero_info(sentence)
+        self._owed = validation_due(checkpoint)
+        if self._owed:
+            owe_validation(checkpoint["loops"]["fit_loop"])
         if self.average is None and "current_model_state" in checkpoint:  # it is averaged no longer
             checkpoint["state_dict"] = checkpoint["current_model_state"]
 
@@ -254,4 +264,13 @@ class SelfSupervisedDepth(LightningModule):
             settings["batch_size"] = data.batch_size
         if "train" in getattr(data, "datasets", {}):
             settings["train_split"] = data.datasets["train"].fingerprint()
-        return {"recipe": self.recipe.to_plain(), "settings": settings}
+        return {"recipe": self.recipe.to_plain(), "settings": settings, "validation_due": self._validation_due()}
+
+    def _validation_due(self) -> bool:
+        """Return whether a step is done and the validation after it is not, which a kill would lose otherwise."""
+        trainer = self._trainer
+        if trainer is None or trainer.state.fn != TrainerFn.FITTING or not trainer.training:
+            return False
+        loop, fetcher = trainer.fit_loop.epoch_loop, trainer.fit_loop._data_fetcher
+        done = loop.batch_progress.current
+        return fetcher is not None and done.completed < done.processed and loop._should_check_val_fx(fetcher)

@@ -120,11 +120,29 @@ def _differences(before: Any, now: Any, name: str) -> Iterator[str]:
             yield f"{name} {now} (it was {before})"
 
 
+def validation_due(checkpoint: Mapping[str, Any]) -> bool:
+    """Return whether a checkpoint was saved before a validation that followed its last step."""
+    return bool(checkpoint.get("saunet_training", {}).get("validation_due"))
+
+
+def owe_validation(loops: dict[str, Any]) -> None:
+    """Change the recorded state of Lightning's loops to that of a run which was stopped in its validation.
+
+    Lightning saves after a step as if no validation followed, and would resume with the next step.
+    """
+    step, validation = loops["epoch_loop.batch_progress"], loops["epoch_loop.val_loop.batch_progress"]
+    for counts in (step["total"], step["current"]):
+        counts["completed"] = counts["processed"]
+    nothing = dict.fromkeys(validation["total"], 0)
+    validation |= {"total": {**nothing, "ready": 1, "started": 1}, "current": nothing, "is_last_batch": False}
+
+
 @rank_zero_only
-def keep_rows(logger: Logger, steps: int) -> None:
+def keep_rows(logger: Logger, steps: int, due: bool = False) -> None:
     """Keep what a resumed run logged as CSV before; Lightning's logger would begin the file afresh.
 
-    Rows after the ``steps`` done by the checkpoint are dropped, as they will be logged again.
+    Rows after the ``steps`` done by the checkpoint are dropped, as they will be logged again; so is the validation
+    after the last of them if it is still due.
     """
     if not isinstance(logger, CSVLogger):
         return
@@ -137,7 +155,9 @@ def keep_rows(logger: Logger, steps: int) -> None:
         warnings.filterwarnings("ignore", message=".*will be deleted when the new ones are saved.*")
         writer = logger.experiment
     whole = (row for row in rows if row.get("step", "").isdecimal())  # a kill can cut the last one
-    writer.metrics.extend(row for row in whole if int(row["step"]) < steps)
+    kept = [row for row in whole if int(row["step"]) < steps]
+    again = [row for row in kept if due and int(row["step"]) == steps - 1 and any(key[:4] == "val/" for key in row)]
+    writer.metrics.extend(row for row in kept if row not in again)
     writer.save()
 
 

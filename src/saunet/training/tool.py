@@ -29,7 +29,7 @@ from saunet.runs.record import ModelRecord, Scale
 from saunet.training.callbacks import AtomicCheckpointIO, BestCheckpoint
 from saunet.training.module import SelfSupervisedDepth
 from saunet.training.optim import Recipe
-from saunet.training.resume import check_resume, check_unused, keep_rows, resume_path, warm_start
+from saunet.training.resume import check_resume, check_unused, keep_rows, resume_path, validation_due, warm_start
 from saunet.training.speed import Speed
 from saunet.training.stopping import way_on
 
@@ -231,6 +231,7 @@ def train(
     data.setup("fit")
     data.train_dataloader()  # knows whether there are enough samples
     steps = check_resume(model, checkpoint, data) if checkpoint else 0
+    due = checkpoint is not None and validation_due(checkpoint.rest)
     del checkpoint  # as large as the model and its moments
     started = warm_start(model, options.init_from) if options.init_from and not resume else None
     known = {
@@ -248,7 +249,7 @@ def train(
         with recording(folder, options.name, describe, **known) as record:
             model.run_record = record
             for logger in loggers if resume else ():
-                keep_rows(logger, steps)
+                keep_rows(logger, steps, due)
             if resume or started:
                 print(f"resuming from {resume}" if resume else started)
             try:
