@@ -340,7 +340,7 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
         if path.times is None:
             notes.append(f"{drive.name}: the times of its frames are unknown, so no TUM files are written")
         if folder is not None:
-            place = folder / file_stem(drive.name)
+            place = check_folder(folder / file_stem(drive.name))
             write_path(path, place)
             if drawn:
                 draw_path(path, place / "path.png", mine)

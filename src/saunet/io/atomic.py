@@ -93,7 +93,10 @@ class Session:
 
 
 def check_folder(folder: str | Path, error: type[SaunetError] = DataError) -> Path:
-    """Return a folder, which need not exist, once it is sure that files can be written to it."""
+    """Return a folder, which need not exist, once it is sure that files can be written to it.
+
+    What killed processes left incomplete there, not below, is removed.
+    """
     place = Path(folder).absolute()
     while not os.path.lexists(place):
         place = place.parent
@@ -101,6 +104,7 @@ def check_folder(folder: str | Path, error: type[SaunetError] = DataError) -> Pa
         raise error(f"cannot write to {folder}: {place} is not a folder; choose another one")
     if not os.access(place, os.W_OK | os.X_OK):
         raise error(f"cannot write to {folder}: no right to write to {place}; change the rights, or choose another one")
+    remove_partial_files(folder, ".*.partial*")
     return Path(folder)
 
 

@@ -168,7 +168,7 @@ def _decode(
     numbers: list[int] = []
     times: list[float | None] = []
     try:
-        remove_partial_files(folder.parent, ".*.partial")
+        remove_partial_files(folder.parent, ".*.partial*")
         partial.mkdir(parents=True, exist_ok=True)
         reader = VideoReader(video, rate)
         for frame in reader.frames(fps):
@@ -328,6 +328,7 @@ def measure(
             before = after
         advance()
     if file:
+        remove_partial_files(file.parent, ".*.partial*")
         rounded = {
             key: [None if np.isnan(value) else round(value, 4) for value in values.tolist()]
             for key, values in (("flow", flow), ("change", change))

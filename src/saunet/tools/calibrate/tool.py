@@ -11,6 +11,7 @@ from saunet.data.video.calibrations import EXPORTS, SUFFIXES, export_camera, spl
 from saunet.data.video.camera import Lens, read_camera, write_camera
 from saunet.data.video.lens_models import WIDEST
 from saunet.errors import ConfigError, checked, in_range, one_of, positive
+from saunet.io.atomic import check_folder
 from saunet.io.images import write_image
 from saunet.io.progress import bar
 from saunet.tools.calibrate.solve import Board, Calibration, check_picture, solve
@@ -135,6 +136,7 @@ def calibrate(
         how = "print it, glue it to something flat, and measure a square"
         return CalibrateResult(Path(options.print_board), f"{board}: {options.print_board}; {how}")
     assert options.input is not None
+    check_folder(Path(options.output).parent)
     result = None
     if split_name(options.input)[0].suffix.lower() in SUFFIXES:
         camera = read_camera(options.input)

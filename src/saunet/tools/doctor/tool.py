@@ -8,6 +8,7 @@ from pathlib import Path
 
 from saunet.data.loading.selecting import Manifest, write_manifest
 from saunet.errors import ConfigError, checked, one_of, positive
+from saunet.io.atomic import check_folder
 from saunet.io.images import write_image
 from saunet.io.progress import bar
 from saunet.registry import Spec
@@ -101,13 +102,13 @@ def doctor(options: DoctorOptions, *, advance: Callable[[int, int], None] | None
         >>> diagnosis.usable
         True
     """
+    folder = check_folder(options.output_dir)
     data = options.data.build()
     with bar() as shown:
         task = shown.add_task("reading frames", total=None)
         progress = advance or (lambda done, total: shown.update(task, completed=done, total=total))
         found = survey(data, options.splits, options.frames, progress)
     findings = diagnose(found)
-    folder = Path(options.output_dir)
     manifest = manifest_of(found, findings, folder / "manifest.json")
     title = f"saunet doctor: {type(data).__name__}{f' at {data.root}' if data.root else ''}"
     sheet = folder / "doctor.png"

@@ -21,9 +21,9 @@ from saunet.data.checks import check_frame
 from saunet.data.drive import Drive
 from saunet.data.loading.stored import FRAMES, SETTINGS, CacheSettings, ImageCache
 from saunet.errors import DataError
-from saunet.io.atomic import write_bytes, write_json
+from saunet.io.atomic import remove_partial_files, write_bytes, write_json
 from saunet.io.images import resize
-from saunet.tools.prepare.pool import OnError, Work, remove_partial
+from saunet.tools.prepare.pool import OnError, Work
 
 Entry = tuple[int, str, tuple[int, int], list[int] | None]
 """Bytes and SHA-256 of a copy; (height, width) of its original, and the `_state` of the original's file."""
@@ -104,7 +104,7 @@ def build_cache(
     cache = _open(Path(folder).expanduser(), settings)
     drives = tuple(drive for drive, _ in recordings)
     for drive in drives:
-        remove_partial(cache.home(drive))
+        remove_partial_files(cache.home(drive), ".*.partial*")
     known = tuple(cache.frames(drive) for drive in drives)
     for drive, frames in zip(drives, known, strict=True):
         if frames:
@@ -130,7 +130,7 @@ def build_cache(
 def _open(folder: Path, settings: CacheSettings) -> ImageCache:
     """Claim a folder for a cache of these settings, or take up the one that is there."""
     path = folder / SETTINGS
-    remove_partial(folder)
+    remove_partial_files(folder, ".*.partial*")
     if not path.is_file():
         if folder.is_dir() and any(folder.iterdir()):
             raise DataError(f"{folder} is not empty and not a cache; set folder to a new one")

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
 import cv2
@@ -40,13 +39,6 @@ class Done:
     def __str__(self) -> str:
         scans = "" if self.without is None else f" {self.without} have no scan,"
         return f"{self.made} frames made, {self.before} were there,{scans} {len(self.failures)} skipped"
-
-
-def remove_partial(folder: Path) -> None:
-    """Remove the temporary files of writers that were killed; only one run may write into a folder at a time."""
-    if folder.is_dir():
-        for path in folder.glob(".*.partial*"):
-            path.unlink(missing_ok=True)
 
 
 class Work(Generic[Item, Result]):

@@ -18,11 +18,12 @@ from saunet.data.kitti.raw import KittiDrive
 from saunet.data.loading.stored import DepthMaps
 from saunet.data.loading.windows import sample_name
 from saunet.errors import DataError
+from saunet.io.atomic import remove_partial_files
 from saunet.io.colormaps import depth_to_png16
 from saunet.io.images import read_depth, resize, write_image
 from saunet.io.plain import read_array
 from saunet.tools.prepare.colorization import colorize
-from saunet.tools.prepare.pool import Done, OnError, Work, remove_partial
+from saunet.tools.prepare.pool import Done, OnError, Work
 
 Recording = tuple[KittiDrive, list[int]]
 """A recording and the frames of it that are wanted."""
@@ -88,7 +89,7 @@ def densify(
             continue
         for each in maps:
             each.claim(drive, {"depth": drive.depth_kind})
-            remove_partial(each.home(drive))
+            remove_partial_files(each.home(drive), ".*.partial*")
         there = set.intersection(*(each.frames(drive) for each in maps))
         before += len(there.intersection(scanned))
         items += [(position, frame) for frame in scanned if frame not in there]
@@ -191,7 +192,7 @@ def teach(
     maps = DepthMaps("teacher", folder)
     items, before = [], 0
     for position, (drive, frames) in enumerate(recordings):
-        remove_partial(maps.home(drive))
+        remove_partial_files(maps.home(drive), ".*.partial*")
         if (maps.home(drive) / "maps.json").exists():
             maps.claim(drive, source.made_from())
         there = maps.frames(drive)
