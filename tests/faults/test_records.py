@@ -14,11 +14,10 @@ import pytest
 import torch
 from tiny_checkpoint import write_checkpoint
 
-from saunet.errors import CheckpointError
+from saunet.errors import CheckpointError, ConfigError
 from saunet.registry import decoders, encoders, poses
-from saunet.runs import record as records
 from saunet.runs.checkpoint import atomic_save, read_checkpoint
-from saunet.runs.record import MAX_NUMBER, ModelRecord
+from saunet.runs.record import LIMIT_FACTOR, MAX_NUMBER, ModelRecord
 from saunet.training.callbacks import BestCheckpoint, LastCheckpoint
 from saunet.weights.files import read_model
 
@@ -36,15 +35,22 @@ def changed(content: dict[str, Any], slot: str, **changes: Any) -> dict[str, Any
 
 def test_more_pixels_than_any_network_needs(content: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     plain = {**content["saunet"], "height": 1 << 13, "width": 1 << 12}
-    with pytest.raises(CheckpointError, match=r"8192x4096.*MAX_PIXELS"):
+    with pytest.raises(CheckpointError, match=rf"8192x4096.*16,777,216 pixels.*{LIMIT_FACTOR}"):
         ModelRecord.from_plain(plain)
-    monkeypatch.setattr(records, "MAX_PIXELS", 1 << 26)
+    monkeypatch.setenv(LIMIT_FACTOR, "2")
     assert ModelRecord.from_plain(plain).height == 8192
+
+
+@pytest.mark.parametrize("text", ["much", "0", "-1", "nan", "inf"])
+def test_a_factor_that_is_none(text: str, content: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(LIMIT_FACTOR, text)
+    with pytest.raises(ConfigError, match=LIMIT_FACTOR):
+        ModelRecord.from_plain(content["saunet"])
 
 
 @pytest.mark.parametrize("value", [MAX_NUMBER + 1, -(10**9), [2, [10**6]], {"deep": 10**12}])
 def test_numbers_out_of_proportion(content: dict[str, Any], value: Any) -> None:
-    with pytest.raises(CheckpointError, match=r"encoder asks for .*MAX_NUMBER"):
+    with pytest.raises(CheckpointError, match=rf"encoder asks for .*{LIMIT_FACTOR}"):
         ModelRecord.from_plain(changed(content, "encoder", depth=value))
 
 
@@ -76,7 +82,7 @@ def test_a_network_is_no_larger_than_the_weights_of_its_file(content: dict[str, 
     plain["model"]["encoder"] = {**node, "depths": [2, 2, 6, 2], "heads": [1, 2, 4, 8]}
     atomic_save({**content, "saunet": plain}, tmp_path / "large.ckpt")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(CheckpointError, match=r"large.ckpt: .*more than .* numbers .*what the file holds"):
+    with pytest.raises(CheckpointError, match=r"large.ckpt: .*more than .* numbers.*what the file holds"):
         read_checkpoint(tmp_path / "large.ckpt").networks()
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300 * 1024
     exported = tmp_path / "exported"
@@ -87,6 +93,33 @@ def test_a_network_is_no_larger_than_the_weights_of_its_file(content: dict[str, 
     (exported / "config.json").write_text(json.dumps(plain))
     with pytest.raises(CheckpointError, match="what the file holds"):
         read_model(exported).networks()
+
+
+@pytest.mark.parametrize("changes", [{"depths": [2, 1, 1, 20_000]}, {"window": [8000, 4, 4, 4]}])
+def test_neither_many_small_layers_nor_tables_fill_memory(
+    changes: dict[str, Any], content: dict[str, Any], tmp_path: Path
+) -> None:
+    """Layers take memory without weights, and a table is filled before it becomes a parameter."""
+    node = {"_target_": "saunet.models.encoders.stratified.StratifiedTransformer", "dim": 8, "heads": [1, 1, 2, 2]}
+    plain = changed(content, "encoder")
+    plain["model"]["encoder"] = {**node, "depths": [2, 1, 1, 1], "window": [4, 4, 4, 4], **changes}
+    atomic_save({**content, "saunet": plain}, tmp_path / "x.ckpt")
+    before, begin = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    with pytest.raises(CheckpointError, match="what the file holds"):
+        read_checkpoint(tmp_path / "x.ckpt").networks()
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300 * 1024
+    assert time.process_time() - begin < 10
+
+
+def test_whoever_trusts_a_file_allows_a_larger_network(
+    content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    atomic_save(content, tmp_path / "x.ckpt")
+    monkeypatch.setenv(LIMIT_FACTOR, "0.02")
+    with pytest.raises(CheckpointError, match=f"several times what the file holds.*{LIMIT_FACTOR}"):
+        read_checkpoint(tmp_path / "x.ckpt").networks()
+    monkeypatch.setenv(LIMIT_FACTOR, "1")
+    read_checkpoint(tmp_path / "x.ckpt").networks()
 
 
 def test_a_tensor_that_claims_more_than_it_stores_counts_for_what_it_stores(

@@ -6,6 +6,7 @@ It is read with ``weights_only=True``, and only registered components are ever b
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,13 +15,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn.modules import module as hooks
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from saunet.errors import CheckpointError, ConfigError
 from saunet.io.atomic import replacing
 from saunet.io.plain import read_torch
 from saunet.models.depth import DepthNet
 from saunet.registry import instantiate
-from saunet.runs.record import ModelRecord, Scale
+from saunet.runs.record import LIMIT_FACTOR, ModelRecord, Scale, limit_factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +52,7 @@ class Checkpoint:
             min(each.numel(), each.untyped_storage().nbytes() // each.element_size()) for each in self.state.values()
         )
         try:
-            with _at_most(4 * held + _ROOM):
+            with _at_most(int((4 * held + _ROOM) * limit_factor())):
                 depth, pose = build_networks(self.record)
             load_weights(depth, self.weights("depth"), "depth network")
             if pose is not None:
@@ -63,31 +65,41 @@ class Checkpoint:
 _ROOM = 1 << 24
 """Numbers that a network may hold beyond those of its file: buffers that are not stored, and weights that are missing,
 which `load_weights` names."""
+_MODULE = 1000
+"""Numbers that take as much memory as one module without any: a list of a hundred thousand layers is large too."""
+
+
+class _Counted(TorchDispatchMode):
+    """Refuses to make tensors of more numbers together than it was given, before memory is asked for."""
+
+    def __init__(self, numbers: int) -> None:
+        super().__init__()
+        self.numbers = self.left = numbers
+
+    def count(self, numbers: int) -> None:
+        self.left -= numbers
+        if self.left < 0:
+            raise CheckpointError(
+                f"the record asks for a network of more than {self.numbers:,} numbers, several times what the file "
+                f"holds; it is damaged or was edited, or allow more with {LIMIT_FACTOR}"
+            )
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if args and isinstance(args[0], list | tuple) and all(isinstance(side, int) for side in args[0]):
+            self.count(math.prod(args[0]))  # what begins with a size makes a tensor
+        return func(*args, **(kwargs or {}))
 
 
 @contextlib.contextmanager
 def _at_most(numbers: int) -> Iterator[None]:
     """Refuse a network that is being built as soon as it has more numbers and modules, before they fill memory."""
-    left = numbers
-
-    def count(_: nn.Module, name: str, value: object) -> None:
-        nonlocal left
-        left -= value.numel() if isinstance(value, Tensor) else 1
-        if left < 0:
-            raise CheckpointError(
-                f"the record asks for a network of more than {numbers:,} numbers (at '{name}'), several times what the "
-                "file holds; it is damaged or was edited"
-            )
-
-    registered = (
-        hooks.register_module_parameter_registration_hook,
-        hooks.register_module_buffer_registration_hook,
-        hooks.register_module_module_registration_hook,
-    )
-    with contextlib.ExitStack() as stack:
-        for register in registered:
-            stack.callback(register(count).remove)
-        yield
+    counted = _Counted(numbers)
+    handle = hooks.register_module_module_registration_hook(lambda *_: counted.count(_MODULE))
+    try:
+        with counted:
+            yield
+    finally:
+        handle.remove()
 
 
 def build_networks(record: ModelRecord, pretrained: bool = False) -> tuple[DepthNet, nn.Module | None]:

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from saunet import __version__, plugins
-from saunet.errors import CheckpointError
+from saunet.errors import CheckpointError, ConfigError, positive
 from saunet.registry import find
 
 FORMAT = 1
@@ -22,9 +23,20 @@ MAX_PIXELS = 1 << 24
 """Largest input of a network (4K video has 8.3 million pixels): a file cannot ask for more, and no training either."""
 MAX_NUMBER = 1 << 16
 """Largest whole number among the settings of networks; registered ones reach a few thousand."""
+LIMIT_FACTOR = "SAUNET_LIMIT_FACTOR"
+"""Environment variable with a factor by which these limits, and that of a network's size, are multiplied."""
 _VALUES, _DEPTH, _TEXT = 100_000, 64, 10_000
 _SLOTS = ("encoder", "decoder", "pose")
 _NESTED = (*_SLOTS, "attention")
+
+
+def limit_factor() -> float:
+    """Return the factor by which whoever trusts the files multiplies what a record may ask for; 1 by default."""
+    text = os.environ.get(LIMIT_FACTOR, "1")
+    try:
+        return positive(LIMIT_FACTOR, float(text))
+    except ValueError as reason:
+        raise ConfigError(f"{LIMIT_FACTOR} is '{text[:60]}'; it must be a number greater than 0") from reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +81,11 @@ class ModelRecord:
             )
         if self.height < 1 or self.width < 1:
             raise CheckpointError(f"the model record's size is {self.height}x{self.width}; both must be above 0")
-        if self.height * self.width > MAX_PIXELS:
+        most = int(MAX_PIXELS * limit_factor())
+        if self.height * self.width > most:
             raise CheckpointError(
-                f"the model record's size is {self.height}x{self.width}; at most {MAX_PIXELS:,} pixels are allowed, "
-                "which saunet.runs.record.MAX_PIXELS sets"
+                f"the model record's size is {self.height}x{self.width}; at most {most:,} pixels are allowed, "
+                f"or more with {LIMIT_FACTOR}"
             )
 
     def to_plain(self) -> dict[str, Any]:
@@ -175,10 +188,10 @@ def _check_numbers(slot: str, node: Any) -> None:
     if isinstance(node, Mapping | list | tuple):
         for value in node.values() if isinstance(node, Mapping) else node:
             _check_numbers(slot, value)
-    elif isinstance(node, int) and abs(node) > MAX_NUMBER:
+    elif isinstance(node, int) and abs(node) > (most := int(MAX_NUMBER * limit_factor())):
         raise CheckpointError(
-            f"the recorded {slot} asks for {node:,}; whole numbers up to {MAX_NUMBER:,} are allowed, which "
-            "saunet.runs.record.MAX_NUMBER sets"
+            f"the recorded {slot} asks for {node:,}; whole numbers up to {most:,} are allowed, "
+            f"or more with {LIMIT_FACTOR}"
         )
 
 
