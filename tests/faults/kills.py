@@ -9,9 +9,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import importlib
 import itertools
 import json
 import os
+import pkgutil
 import random
 import shutil
 import signal
@@ -35,7 +37,8 @@ from prepare_tree import make_tree
 from safetensors.torch import load_file
 from tiny_checkpoint import write_checkpoint
 
-from saunet.cli import app
+import saunet
+from saunet.cli import app, compose
 from saunet.io.video import VideoReader, VideoWriter
 from saunet.runs.checkpoint import read_checkpoint
 
@@ -59,6 +62,8 @@ class Job:
     """The folder that it writes into."""
     same: Callable[[Path], object]
     """What of a finished run equals that of a run that nobody killed."""
+    share: float = 1.0
+    """Of the kills that are asked for: less for tools that take long."""
 
 
 @dataclass
@@ -79,6 +84,14 @@ class Tally:
 # ---------------------------------------------------------------------------------------------- children
 
 
+def preload() -> None:
+    """Import all that tools import when they are called, so that their children need not."""
+    for module in pkgutil.walk_packages(saunet.__path__, "saunet."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    compose.register_configs()
+
+
 def start(words: Sequence[str], folder: Path, moment: int | None = None) -> int:
     """Run ``saunet WORDS`` in a child, which kills itself at a moment of writing if one is given; return its number."""
     pid = os.fork()
@@ -86,6 +99,7 @@ def start(words: Sequence[str], folder: Path, moment: int | None = None) -> int:
         return pid
     code = 99
     try:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.setsid()
         log = os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(log, 1)
@@ -229,6 +243,7 @@ def jobs(data: Path) -> Iterator[Job]:
         ),
         "out",
         training,
+        0.5,
     )
     yield Job(
         "predict",
@@ -257,15 +272,17 @@ def jobs(data: Path) -> Iterator[Job]:
         "out",
         scores,
     )
-    yield Job(
-        "export",
-        (
-            *("export", f"checkpoint={data / 'model.ckpt'}", "output=out", "formats=[safetensors,program]"),
-            *("overwrite=true", "hydra.run.dir=hydra"),
-        ),
-        "out",
-        contents(".safetensors", "config.json"),
-    )
+    for formats, share in (("safetensors", 1.0), ("program", 0.2)):
+        yield Job(
+            f"export {formats}",
+            (
+                *("export", f"checkpoint={data / 'model.ckpt'}", "output=out", f"formats=[{formats}]"),
+                *("overwrite=true", "hydra.run.dir=hydra"),
+            ),
+            "out",
+            contents(".safetensors", "config.json"),
+            share,
+        )
     yield Job(
         "prepare cache",
         ("prepare", "cache", "data=video", *video, "folder=out", "height=40", "width=64", "workers=0"),
@@ -365,16 +382,15 @@ def check(job: Job, results: Path, before: set[str], steps: int, tally: Tally) -
     return now, trained
 
 
-def torture(job: Job, top: Path, kills: int, dice: random.Random, most: int = 6) -> Tally:
+def torture(job: Job, top: Path, kills: int, dice: random.Random, tally: Tally, most: int = 6) -> None:
     """Kill a tool so many times, in rounds that end with an undisturbed run, which has to end like one never killed."""
-    tally = Tally()
     whole = top / job.name / "whole"
     whole.mkdir(parents=True)
     undisturbed(job, whole, tally)
     moments = int((whole / "moments").read_text())
     lasts = undisturbed(job, _fresh(top / job.name / "timed"), tally)  # the first one warms caches up
     if tally.wrong:
-        return tally
+        return
     wanted, files = job.same(whole / job.results), named(whole / job.results)
     for number in itertools.count():
         if tally.kills >= kills or tally.too_late > 3 * kills + 20:
@@ -397,7 +413,6 @@ def torture(job: Job, top: Path, kills: int, dice: random.Random, most: int = 6)
             print("\n".join(tally.wrong), file=sys.stderr, flush=True)
         else:
             shutil.rmtree(folder)
-    return tally
 
 
 def _fresh(folder: Path) -> Path:
@@ -407,7 +422,7 @@ def _fresh(folder: Path) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=20, help="of each tool")
+    parser.add_argument("--kills", type=int, default=20, help="of each tool, fewer of those that take long")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="tools whose names begin so")
     parser.add_argument("--keep", help="a folder for what is wrong; by default one that is removed")
@@ -417,15 +432,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     top = Path(tempfile.mkdtemp(dir=given.keep))
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # what was counted until then is printed
+    preload()
     make_data(_fresh(top / "data"))
     wrong = 0
     for job in jobs(top / "data"):
         if not job.name.startswith(given.only):
             continue
-        begin = time.monotonic()
-        tally = torture(job, top, given.kills, random.Random(f"{given.seed} {job.name}"))
+        begin, used = time.monotonic(), sum(os.times()[:4])
+        tally = Tally()
+        try:
+            torture(job, top, round(given.kills * job.share), random.Random(f"{given.seed} {job.name}"), tally)
+        finally:
+            spent = {"seconds": round(time.monotonic() - begin), "of CPU": round(sum(os.times()[:4]) - used)}
+            print(json.dumps({"tool": job.name, **spent, **vars(tally)}), flush=True)
         wrong += len(tally.wrong)
-        print(json.dumps({"tool": job.name, "seconds": round(time.monotonic() - begin), **vars(tally)}), flush=True)
     if given.keep is None:
         shutil.rmtree(top, ignore_errors=True)
     return int(wrong > 0)
