@@ -53,6 +53,17 @@ def slow(session: nox.Session) -> None:
 
 
 @nox.session
+def old_runtime(session: nox.Session) -> None:
+    """Run exported files in onnxruntime 1.14, which needs Python 3.10 or older and NumPy 1."""
+    install(session, "-e", ".[dev]")
+    old = Path(session.create_tmp()) / "old"
+    session.run("python3.10", "-m", "venv", str(old), external=True)
+    session.run(str(old / "bin" / "pip"), "install", "onnxruntime==1.14.1", "numpy==1.26.4", external=True)
+    tests = ("-m", "not gpu", "tests/exporting/test_old_runtime.py")
+    session.run("pytest", *tests, *session.posargs, env={"SAUNET_OLD_RUNTIME": str(old / "bin" / "python")})
+
+
+@nox.session
 def ddp(session: nox.Session) -> None:
     """Run the tests that start several processes."""
     install(session, "-e", ".[dev]")

@@ -4,11 +4,29 @@ from __future__ import annotations
 
 import io
 import pickle
+from typing import Any
 
 import torch
 from torch import nn
 
+from saunet.models.depth import DepthNet
 from saunet.models.encoders.resnet import BasicBlock, Bottleneck
+from saunet.registry import decoders, encoders
+
+TINY: dict[str, dict[str, Any]] = {
+    "StratifiedTransformer": {"dim": 8, "depths": (2, 1, 1, 1), "heads": (1, 1, 2, 2), "window": (4, 4, 4, 4)},
+    "SwinTransformer": {"dim": 8, "depths": (2, 1, 1, 1), "heads": (1, 1, 2, 2), "window": (4, 4, 4, 4)},
+    "ResNet": {"blocks": (1, 1, 1, 1)},
+    "PackNetEncoder": {"channels": (16, 16, 16, 16, 16), "blocks": (1, 1, 1, 1)},
+    "LiteMonoEncoder": {"dims": (8, 16, 16), "depths": (2, 2, 2), "rates": (2,), "last_rates": (2,), "heads": 2},
+}
+"""What makes an encoder of each kind small; its layers stay the same."""
+
+
+def small_network(encoder: str, decoder: str) -> DepthNet:
+    """Return the depth network of two registered parts, small, for evaluation."""
+    tiny = TINY.get(encoders.entry(encoder).target.__name__, {})
+    return DepthNet(encoders.build(encoder, **tiny), decoders.partial(decoder)).eval()
 
 
 def assert_all_have_gradients(module: nn.Module) -> None:

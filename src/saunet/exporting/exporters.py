@@ -30,9 +30,9 @@ from saunet.runs.record import ModelRecord
 BATCHES: tuple[str, ...] = ("auto", "any", "one")
 """``any``: any number of images at once. ``one``: exactly one. ``auto``: any where the network allows it, else one."""
 Batch = Literal["any", "one"]
-OPSETS: tuple[int, ...] = (18, 20)
-"""Of ONNX: 20 by default; 18 for older runtimes (TensorRT before 10, JetPack before 6.1, onnxruntime from 1.14)."""
-_IR_VERSIONS = {18: 8, 20: 10}
+OPSETS: tuple[int, ...] = (17, 18, 20)
+"""Of ONNX: 20 by default; 18 and 17 for older runtimes (JetPack before 6.1, TensorRT 8, onnxruntime from 1.14)."""
+_IR_VERSIONS = {17: 8, 18: 8, 20: 10}
 """The file format's version that runtimes of an opset's time read."""
 
 _LARGEST_BATCH = 256
@@ -62,12 +62,13 @@ def export_onnx(
         program, takes = _program(network, record, batch)
     try:
         with _quiet():
+            written = max(opset, 18)  # the exporter knows none before
             exported: Any = torch.onnx.export(
-                program, input_names=[INPUT], output_names=[OUTPUT], opset_version=opset, dynamo=True, verbose=False
+                program, input_names=[INPUT], output_names=[OUTPUT], opset_version=written, dynamo=True, verbose=False
             )
     except torch.onnx.OnnxExporterError as reason:
         raise ConfigError(f"{_name(network)} cannot be exported to ONNX; export the format 'program'") from reason
-    if exported.model.opset_imports[""] != opset:
+    if exported.model.opset_imports[""] != written or (opset == 17 and not _lower_to_17(exported.model)):
         raise ConfigError(
             f"{_name(network)} has operations that opset {opset} does not have; export with opset={OPSETS[-1]}"
         )
@@ -75,6 +76,38 @@ def export_onnx(
     exported.model.metadata_props[METADATA] = json.dumps(record.to_plain())
     exported.save(str(path))
     return takes
+
+
+def _lower_to_17(model: Any) -> bool:
+    """Rewrite a model of opset 18 for opset 17; return whether it uses nothing that only 18 has.
+
+    Of the operations that changed, Pad, Split and Resize only gained settings. Reductions take their axes as an
+    attribute before. Others have no counterpart.
+    """
+    import onnx
+    import onnx_ir
+
+    new = {"Resize": {"antialias": 0, "keep_aspect_ratio_policy": "stretch"}, "Reduce": {"noop_with_empty_axes": 0}}
+    for node in model.graph.all_nodes():
+        kind = node.op_type
+        if node.domain or onnx.defs.get_schema(kind, 18).since_version < 18:
+            continue
+        for name, default in new.get("Reduce" if kind.startswith("Reduce") else kind, {}).items():
+            if name in node.attributes and node.attributes.pop(name).value != default:
+                return False
+        if kind.startswith("Reduce"):
+            if len(node.inputs) > 1 and node.inputs[1] is not None:
+                if (axes := node.inputs[1].const_value) is None:
+                    return False
+                node.attributes.add(onnx_ir.AttrInt64s("axes", axes.numpy().tolist()))
+            node.resize_inputs(1)
+        elif kind == "Pad":
+            if len(node.inputs) > 3:  # axes
+                return False
+        elif kind not in ("Split", "Resize") or {"axes", "num_outputs"} & set(node.attributes):
+            return False
+    model.opset_imports[""] = 17
+    return True
 
 
 def export_program(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> Batch:

@@ -58,7 +58,7 @@ class ExportOptions:
         images: Real images to compare on, besides random ones: a file, a folder or a pattern, in Python also several;
             at most eight are taken, evenly.
         batch: How many images the files take at once: ``any``, ``one``, or ``auto``: any where the network allows it.
-        opset: Of ONNX: 20, or 18 for older runtimes.
+        opset: Of ONNX: 20, or 18 or 17 for older runtimes.
         evaluation: A ``metrics.json`` of an evaluation, or the folder that holds it; goes into the model card.
         overwrite: Replace what an earlier export left in the folder.
 
