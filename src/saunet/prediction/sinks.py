@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -126,18 +127,30 @@ class ImageFilesSink(Sink):
         self._style, self._manifest, self._overwrite = style, manifest, overwrite
 
     def wanted(self, frame: Frame) -> Sequence[str]:
-        """Return the outputs that are not there yet, or older than their image; files appear only when complete."""
+        """Return the outputs that are not there yet, or of another version of their image.
+
+        Files appear only when complete, and have the time stamp of their image: whatever a clock does, a changed image
+        has another one.
+        """
         if self._overwrite:
             return self.outputs
-        changed = frame.image.stat().st_mtime if frame.image.exists() else 0.0
+        changed = frame.image.stat().st_mtime if frame.image.exists() else None
         paths = {output: self.paths[0] / f"{frame.stem}{ENDINGS[output]}" for output in self.outputs}
-        return [output for output, path in paths.items() if not path.is_file() or path.stat().st_mtime < changed]
+        return [output for output, path in paths.items() if not path.is_file() or not _made_from(path, changed)]
 
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
         for output in self.wanted(frame):
-            self.written.append(write_output(output, self.paths[0] / frame.stem, result, self._style))
+            path = write_output(output, self.paths[0] / frame.stem, result, self._style)
+            self.written.append(path)
+            if frame.image.exists():
+                changed = frame.image.stat()
+                os.utime(path, ns=(changed.st_atime_ns, changed.st_mtime_ns))
             if not self._manifest.written:  # only now: a run that writes nothing leaves nothing
                 self._manifest.write()
+
+
+def _made_from(path: Path, changed: float | None) -> bool:
+    return changed is None or abs(path.stat().st_mtime - changed) < 1e-4  # file systems round
 
 
 class FrameFilesSink(Sink):

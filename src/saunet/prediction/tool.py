@@ -238,6 +238,7 @@ def _predict_images(
     frames = (recording.images or [])[: options.max_frames]
     smoothing, batch = float(options.range_smoothing), options.batch_size
     look = {"fps": recording.fps, "layout": options.layout, "range_smoothing": smoothing, "codec": options.codec}
+    state = _state(frames)
     manifest = sinks.Manifest(folder, predictor, style, again)
     todo, finished = list[Sink](), list[Sink]()
     for sink in clips:
@@ -246,7 +247,7 @@ def _predict_images(
         ours = look.items() <= made.items()
         if not ours:
             _refuse_existing(sink, again)
-        whole = ours and made.get("images") == len(frames) and _newer(sink, frames)
+        whole = ours and made.get("images") == state and all(path.is_file() for path in sink.paths)
         (finished if whole else todo).append(sink)
     files = sinks.ImageFilesSink(folder, outputs, style, manifest, again)
     unfinished = [frame for frame in frames if files.wanted(frame)]
@@ -259,15 +260,15 @@ def _predict_images(
         if failures and todo:
             names = ", ".join(path.name for sink in todo for path in sink.paths)
             raise DataError(f"{failures[0]}; {names} would lack it, so nothing but single images was written")
-        if todo:  # a run that is killed before it notes how many images they show may replace them
-            manifest.write({sink.paths[0].name: {"images": 0, **look} for sink in todo})
+        if todo:  # a run that is killed before it notes which images they show may replace them
+            manifest.write({sink.paths[0].name: {"images": None, **look} for sink in todo})
 
     count, wanted, into = 0, frames if todo else unfinished, [files, *todo]
     if wanted:
         tolerated = failures if outputs else None
         count = sinks.fill(predictor, wanted, into, smoothing, batch, len(wanted), failures=tolerated, check=check)
     if todo:
-        manifest.write({sink.paths[0].name: {"images": len(frames), **look} for sink in todo})
+        manifest.write({sink.paths[0].name: {"images": state, **look} for sink in todo})
     return PredictResult(
         output=folder,
         unit=predictor.unit,
@@ -296,10 +297,11 @@ def _clip_sinks(
     return found
 
 
-def _newer(sink: Sink, frames: Sequence[Frame]) -> bool:
-    """Return whether all files of a sink are there, and none older than an image that it is made of."""
-    newest = max(frame.image.stat().st_mtime for frame in frames)
-    return all(path.is_file() and path.stat().st_mtime >= newest for path in sink.paths)
+def _state(frames: Sequence[Frame]) -> str:
+    """Return what changes when an image does, or joins or leaves, whatever the clock says."""
+    found = [(frame.stem, frame.image.stat() if frame.image.exists() else None) for frame in frames]
+    text = "\n".join(f"{stem} {now and (now.st_size, now.st_mtime_ns)}" for stem, now in found)
+    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:16]
 
 
 def _refuse_existing(sink: Sink, overwrite: bool) -> None:
