@@ -115,6 +115,29 @@ def test_a_sweep_does_not_write_its_jobs_over_each_other(tool: Tool, tmp_path: P
     assert "sweep: 2 of 2 jobs finished" in outcome.out
 
 
+def test_a_second_sweep_in_a_folder_is_refused(tool: Tool, tmp_path: Path) -> None:
+    hold = (
+        "import time\nfrom saunet.runs.folder import locked\nwith locked('sweep'): print(1, flush=True), time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", hold], stdout=subprocess.PIPE, cwd=tmp_path) as first:
+        assert first.stdout is not None
+        first.stdout.readline()
+        before = set(tmp_path.rglob("*"))
+        outcome = tool("train", "--multirun", *QUICK, "seed=1,2", "hydra.sweep.dir=sweep")
+        first.kill()
+    assert outcome.code == 1
+    assert "another run is writing to" in outcome.err
+    assert set(tmp_path.rglob("*")) == before
+
+
+def test_a_job_that_another_process_is_at_work_on_is_not_marked(tmp_path: Path) -> None:
+    RunRecord(tmp_path / "0", "x", pid=os.getppid()).start()
+    text, finished = summary(tmp_path)
+    assert not finished
+    assert "running" in text
+    assert record(tmp_path / "0")["status"] == "running"
+
+
 def test_a_sweep_without_a_job_has_not_finished(tmp_path: Path) -> None:
     text, finished = summary(tmp_path)
     assert not finished

@@ -9,7 +9,7 @@ from made_runs import make_run
 
 from saunet.reporting.inputs import collect
 from saunet.runs.folder import read_run
-from saunet.runs.sweep import differing, labels, ratio, sweeps_ratio, write_plan
+from saunet.runs.sweep import differing, labels, ratio, sweeps_ratio, values, write_plan
 
 
 def test_a_component_of_another_name_is_one_difference(tmp_path: Path) -> None:
@@ -22,6 +22,17 @@ def test_other_keys_are_named_by_their_last_part(tmp_path: Path) -> None:
     runs = [read_run(make_run(tmp_path / str(beta), beta=beta)) for beta in (0.1, 0.2)]
     assert differing(runs) == ["objective.beta"]
     assert labels([runs]) == [["beta = 0.1", "beta = 0.2"]]
+
+
+def test_numbers_are_shown_alike_however_they_were_typed(tmp_path: Path) -> None:
+    runs = [read_run(make_run(tmp_path / str(beta), beta=beta)) for beta in (0.0002, 0.0003)]
+    typed = dataclasses.replace(
+        runs[0], overrides={"objective.beta": "2e-4", "name": "2011_09", "x": "1.50", "y": "1e3"}
+    )
+    assert values(typed, ["objective.beta", "name", "x", "y"]) == ["0.0002", "2011_09", "1.5", "1000"]
+    assert values(runs[1], ["objective.beta"]) == ["0.0003"]
+    same = dataclasses.replace(runs[1], overrides={"objective.beta": "0.00020"})
+    assert differing([typed, same], by_overrides=True) == ["name", "x", "y"]
 
 
 def test_a_key_that_older_versions_lack_is_no_difference_while_it_is_off(tmp_path: Path) -> None:

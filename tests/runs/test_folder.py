@@ -185,7 +185,7 @@ def test_a_second_run_in_a_folder_is_refused_until_the_first_ends_or_dies(tmp_pa
             assert first.stdin is not None
             assert first.stdout.readline() == "held\n"
             with (
-                pytest.raises(ConfigError, match=rf"another run \(process {first.pid} on .*output_dir"),
+                pytest.raises(ConfigError, match=rf"another run \(process {first.pid} on .*another folder"),
                 locked(tmp_path),
             ):
                 pass

@@ -275,7 +275,7 @@ def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[bool, D
 
     A job's task is given whether it raises what goes wrong, as a search wants it, and its configuration.
     """
-    from saunet.runs.folder import FILE
+    from saunet.runs.folder import FILE, locked
     from saunet.runs.sweep import PLAN, summary, write_plan
 
     # Each job names itself instead.
@@ -285,15 +285,16 @@ def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[bool, D
     folder = Path(str(OmegaConf.select(cfg, "hydra.sweep.dir"))).absolute()
     planned = _planned(cfg)
     HydraConfig.instance().cfg = None
-    if planned:
-        write_plan(folder, planned)
     ended: BaseException | None = None
-    try:
-        returned = hydra.multirun(name, functools.partial(task, not planned), overrides)
-        jobs = [job for batch in returned for job in batch] if planned else []
-        code = 1 if any(isinstance(job.return_value, Failed) for job in jobs) else 0
-    except (Exception, KeyboardInterrupt, SystemExit) as error:
-        ended, code = error, 130 if isinstance(error, KeyboardInterrupt) else 1
+    with locked(folder):
+        if planned:
+            write_plan(folder, planned)
+        try:
+            returned = hydra.multirun(name, functools.partial(task, not planned), overrides)
+            jobs = [job for batch in returned for job in batch] if planned else []
+            code = 1 if any(isinstance(job.return_value, Failed) for job in jobs) else 0
+        except (Exception, KeyboardInterrupt, SystemExit) as error:
+            ended, code = error, 130 if isinstance(error, KeyboardInterrupt) else 1
     if isinstance(ended, Exception) and not any(folder.glob("**/.hydra")):  # no job was started
         for file in (PLAN, "multirun.yaml"):
             (folder / file).unlink(missing_ok=True)

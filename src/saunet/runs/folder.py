@@ -159,7 +159,7 @@ def locked(folder: str | Path) -> Iterator[None]:
             other = read(folder)
             of = f" (process {other['pid']} on {other.get('host')})" if other.get("pid") else ""
             raise ConfigError(
-                f"another run{of} is writing to {folder}; wait until it ends, or choose another output_dir"
+                f"another run{of} is writing to {folder}; wait until it ends, or choose another folder"
             ) from reason
         except OSError:  # a file system without locks
             break
@@ -331,7 +331,8 @@ class Run:
             began, ended = (datetime.fromisoformat(self.record[key]) for key in ("started", "ended"))
         except (KeyError, TypeError, ValueError):
             return None
-        return (ended - began).total_seconds()
+        seconds = (ended - began).total_seconds()
+        return seconds if seconds >= 0 else None  # the clock was set back
 
     def component(self, slot: str) -> str:
         """Return the registered name of what fills ``model/encoder``, ``objective`` and so on; its class if unknown."""
@@ -411,6 +412,12 @@ def _state(folder: Path, record: Mapping[str, Any]) -> tuple[Status, str | None]
     if _alive(folder, record):
         return "running", None
     return "unfinished", f"it was never ended: {_LOST}"
+
+
+def alive_elsewhere(folder: Path) -> bool:
+    """Return whether another process is at work on a run."""
+    record = read(folder)
+    return record.get("pid") != os.getpid() and _alive(folder, record)
 
 
 def _alive(folder: Path, record: Mapping[str, Any]) -> bool:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from saunet.io.atomic import write_json
-from saunet.runs.folder import FILE, Run, mark_lost, read, read_file, read_mapping
+from saunet.runs.folder import FILE, Run, alive_elsewhere, mark_lost, read, read_file, read_mapping
 
 PLAN = "sweep.json"
 """In a sweep's folder: the jobs that it was to have."""
@@ -36,7 +37,7 @@ def differing(runs: Sequence[Run], *, by_overrides: bool = False) -> list[str]:
     Parameters of components of different names are left out: they say nothing beyond the names. ``by_overrides``
     compares what the command lines said; for the jobs of one sweep that is what was swept.
     """
-    tables = [dict(run.overrides) if by_overrides else settings(run) for run in runs]
+    tables = [_typed(run) if by_overrides else settings(run) for run in runs]
     tables = [table for table in tables if table]  # a job that left nothing says nothing
     keys = dict.fromkeys(key for table in tables for key in table)
     # Older versions lack keys that newer ones leave off.
@@ -48,8 +49,19 @@ def differing(runs: Sequence[Run], *, by_overrides: bool = False) -> list[str]:
 
 def values(run: Run, keys: Sequence[str]) -> list[str]:
     """Return a run's values of these keys; empty where it has none."""
-    table = settings(run) | dict(run.overrides)
+    table = settings(run) | _typed(run)
     return [table.get(key, "") for key in keys]
+
+
+def _typed(run: Run) -> dict[str, str]:
+    """Return what a command line said, numbers as the settings show them: 0.0002 for 2e-4."""
+    return {key: _number(text) for key, text in run.overrides.items()}
+
+
+def _number(text: str) -> str:
+    if not re.fullmatch(r"-?(0|[1-9]\d*)?(\.\d+)?([eE][-+]?\d+)?", text) or not re.search(r"\d", text):
+        return text
+    return json.dumps(float(text)).removesuffix(".0") if re.search(r"[.eE]", text) else text
 
 
 def ratio(run: Run) -> float | None:
@@ -118,7 +130,7 @@ def _flatten(prefix: str, node: Any, found: dict[str, str]) -> None:
         if isinstance(value, Mapping):
             _flatten(f"{path}.", value, found)
         else:
-            found[path] = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+            found[path] = _number(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))
 
 
 def write_plan(folder: Path, jobs: Sequence[Sequence[str]]) -> None:
@@ -146,7 +158,8 @@ def summary(folder: Path, planned: Sequence[Sequence[str]] | None = None) -> tup
     jobs = [path.parent for path in sorted(folder.glob(f"**/{FILE}"), key=in_order)]
     lines, finished = [], 0
     for job in jobs:
-        mark_lost(job)
+        if not alive_elsewhere(job):
+            mark_lost(job)
         content = read(job)
         if content.get("status") == "finished":
             finished += 1
