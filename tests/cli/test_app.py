@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest import mock
@@ -174,7 +177,7 @@ def test_plain_words_are_the_input(echo: Said, tmp_path: Path) -> None:
         ("data=synthetic +data.wrokers=3", ("unknown key 'data.wrokers'", "did you mean 'data.workers'?")),
         ("data=synthetic data.wrokers=3", ("unknown key 'data.wrokers'", "did you mean 'workers'?")),
         ("data=sinthetic", ("unknown data 'sinthetic'", "did you mean 'synthetic'?")),
-        ("count=many", ("count", "'many'", "nteger")),
+        ("count=many", ("count is 'many'; it must be int",)),
         ("count=1,2", ("count=1,2 has several values", "-m", "count=[1,2]")),
         ("count=-1", ("count is -1; it must be at least 0",)),
         ("--count 3", ("no option --count", "count=3")),
@@ -272,3 +275,29 @@ def test_help_says_where_results_go(tool: str, capsys: pytest.CaptureFixture[str
     app.main([tool, "--help"])
     said = capsys.readouterr().out
     assert f" = outputs/{'NAME' if tool == 'train' else tool}/DATE_TIME" in said
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_signal_ends_any_tool_with_a_word(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    number, tidied = signal.Signals[name], list[bool]()
+
+    def work(*_: object) -> int:
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(10)
+        finally:
+            tidied.append(True)
+        return 0
+
+    monkeypatch.setattr(app, "_run", work)
+    before = signal.signal(number, signal.SIG_DFL)
+    try:
+        with pytest.raises(SystemExit) as stop:
+            app.run("prepare", ["cache"])
+    finally:
+        assert signal.signal(number, before) == signal.SIG_DFL
+    assert stop.value.code == 128 + number
+    assert f"saunet prepare: stopped by {name}" in capsys.readouterr().err
+    assert tidied

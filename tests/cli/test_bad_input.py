@@ -49,7 +49,7 @@ KITTI = (
     [
         ("model.encoder.dephts=[2,2]", ("unknown key 'model.encoder.dephts'", "did you mean 'depths'?")),
         ("sead=3", ("unknown key 'sead'", "did you mean 'seed'?")),
-        ("objective.alpha=much", ("objective.alpha", "'much'", "Float")),
+        ("objective.alpha=much", ("objective.alpha is 'much'; it must be float",)),
         ("model/encoder=resnet19", ("unknown model/encoder 'resnet19'", "did you mean 'resnet18'?", "stratified_tiny")),
         ("experiment=nope", ("unknown experiment 'nope'", "available: demo")),
         ("data=kitti data.root=/nowhere/at/all", ("no data root at /nowhere/at/all", "set data.root")),

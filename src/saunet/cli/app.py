@@ -7,13 +7,16 @@ hold text or a list are quoted or put into a list first.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import fnmatch
 import functools
 import inspect
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, Protocol, cast, runtime_checkable
@@ -107,7 +110,8 @@ def run(name: str, argv: Sequence[str]) -> None:
     """
     wait_briefly()
     try:
-        code = _run(name, argv)
+        with _ended_by_signals():
+            code = _run(name, argv)
     except KeyboardInterrupt:
         code = _say(name, "interrupted", 130)
     except SystemExit as stop:  # a run that was asked to stop says how to resume
@@ -125,6 +129,25 @@ def run(name: str, argv: Sequence[str]) -> None:
         code = _say(name, said, 1)
     if code:
         raise SystemExit(code)
+
+
+@contextlib.contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end a tool as Ctrl-C does, tidily and with a word; a training saves first."""
+
+    def stop(number: int, _: object) -> NoReturn:
+        from saunet.runs.folder import Stopped
+
+        raise Stopped(f"stopped by {signal.Signals(number).name}; what is complete stays", 128 + number)
+
+    main = threading.current_thread() is threading.main_thread()
+    wanted = [getattr(signal, each) for each in ("SIGTERM", "SIGHUP") if main and hasattr(signal, each)]
+    before = {each: signal.signal(each, stop) for each in wanted if signal.getsignal(each) == signal.SIG_DFL}
+    try:
+        yield
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
 
 
 def _say(name: str, message: str, code: int) -> int:

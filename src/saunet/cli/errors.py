@@ -7,6 +7,9 @@ import re
 from saunet.cli.table import HIDDEN, Table
 from saunet.errors import SaunetError, suggest
 
+_TYPES = {"Float": "float", "Integer": "int", "Boolean": "bool (true or false)"}
+"""OmegaConf's words for what an annotation asks for."""
+
 
 def sentence(error: BaseException, table: Table | None = None) -> str | None:
     """Return one sentence; None for a defect of the program. The table has the keys that are allowed."""
@@ -58,6 +61,9 @@ def _of_hydra(unread: str, text: str, table: Table | None) -> str:
         return f"unknown key '{key}'{said or ';'} allowed: {', '.join(allowed)}" if allowed else f"unknown key '{key}'"
     if there := re.search(r"Could not append to config\. An item is already at '([^']+)'", text):
         return f"+{there[1]}=... adds a key and there is one already; leave out the plus sign: {there[1]}=..."
+    typed = re.search(r"Value ('.*') of type '\w+' could not be converted to (\w+)", text)
+    if typed and full_key:  # as the components say it
+        return f"{full_key[1]} is {typed[1]}; it must be {_TYPES.get(typed[2], typed[2])}"
     wrong = re.search(r"Value '.*' of type .*|Cannot (?:assign|convert) .*|Invalid value .*", text)
     if wrong and full_key:
         return f"{full_key[1]}: {wrong[0][0].lower()}{wrong[0][1:]}"
