@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import replace
 
@@ -97,6 +98,23 @@ def test_bad_frames_are_found_and_left_out(tmp_path):
     data.setup("fit")
     kept = {data.datasets["train"].windows[place][1] for place in range(len(data.datasets["train"]))}
     assert not kept & {3, 8, 9, 11, 12, 13}
+
+
+@pytest.mark.parametrize("hole", ["zeros", "cut"])
+def test_a_picture_with_a_hole_and_a_whole_end_is_noticed(tmp_path, capfd, hole):
+    folder = make_clip(tmp_path / "r", "a", frames(10, 1), suffix=".jpg")
+    assert "damaged inside" not in look(campus(tmp_path / "r"))[2]
+    file = folder / "frame_4.jpg"
+    data = bytearray(file.read_bytes())
+    middle = len(data) * 2 // 3
+    data[middle : middle + 200] = bytes(200) if hole == "zeros" else b""
+    file.write_bytes(data)
+    found, _, text = look(campus(tmp_path / "r"))
+    assert "warning: 1 frames are damaged inside, such as 4 of" in text
+    assert "Corrupt JPEG data" in text
+    assert [frame.index for frame in found.frames if frame.damage] == [4]
+    os.write(2, b"as before\n")
+    assert "as before" in capfd.readouterr().err
 
 
 def test_cameras_that_cannot_be_right_are_named(tmp_path):

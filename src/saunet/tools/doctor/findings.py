@@ -91,6 +91,11 @@ def _unreadable(survey: Survey) -> Iterator[Finding]:
     if broken:
         text = f"{len(broken)} of {len(survey.frames)} frames cannot be read; the first: {broken[0].problem}"
         yield Finding("error", text, f"copy them again, or {_USE_MANIFEST} or data.on_error=skip")
+    damaged = [frame for frame in survey.frames if frame.damage]
+    if damaged:
+        first = damaged[0]
+        text = f"{len(damaged)} frames are damaged inside, such as {first.index} of '{first.drive}' ({first.damage})"
+        yield Finding("warning", text, "look at them, and copy them again if parts are gray or shifted")
 
 
 def _sizes(survey: Survey) -> Iterator[Finding]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -53,6 +55,8 @@ class FrameFacts:
     """Mean motion of each horizontal band, from top to bottom."""
     problem: str | None = None
     """Why it cannot be read."""
+    damage: str | None = None
+    """What its decoder made up for, where it says so."""
 
 
 @dataclass(frozen=True)
@@ -230,18 +234,21 @@ def _read_frames(
         elif neighbor in existing[name]:
             with suppress(DataError):  # it is reported when its own turn comes
                 before = shrink(drive.image(neighbor))
-        start = time.perf_counter()
+        complaints: list[str] = []
         try:
-            image = drive.image(index)
+            with _complaints(complaints):
+                start = time.perf_counter()
+                image = drive.image(index)
+                seconds = time.perf_counter() - start
         except DataError as error:
             found.frames.append(FrameFacts(name, index, problem=str(error)))
             continue
-        seconds = time.perf_counter() - start
         small, size, path = shrink(image), None, drive.path(index)
         with suppress(OSError):
             size = path.stat().st_size if path else None
         light, contrast = float(small.mean()) / 255, float(small.mean(axis=2).std()) / 255
         facts = FrameFacts(name, index, (image.shape[0], image.shape[1]), seconds, size, light, contrast)
+        facts = replace(facts, damage=next(iter(complaints), None))
         if before is not None and before.shape == small.shape:
             lengths = np.linalg.norm(optical_flow(before, small), axis=-1)
             bands = np.array([band.mean() for band in np.array_split(lengths, BANDS)], dtype=np.float64)
@@ -252,6 +259,25 @@ def _read_frames(
             found.pictures.append((f"{name} {index}", small))
         last = ((name, index), small)
         advance(place + 1, len(plan))
+
+
+@contextmanager
+def _complaints(found: list[str]) -> Iterator[None]:
+    """Collect what libjpeg says on standard error of data that it makes up for, as OpenCV does not pass it on."""
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            file.seek(0)
+            for line in file:
+                if line.startswith((b"Corrupt JPEG data", b"Premature end of JPEG")):
+                    found.append(line.decode(errors="replace").strip())
+                else:
+                    os.write(2, line)
 
 
 def _look_at_camera(found: Survey, name: str, drive: Drive, index: int) -> None:
