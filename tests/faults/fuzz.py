@@ -232,9 +232,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60, help="of CPU time, for all parsers together")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="parsers whose names begin so")
+    parser.add_argument("--only", default=[""], nargs="+", help="parsers whose names begin so")
     given_ = parser.parse_args()
-    chosen, wrong = [name for name in PARSERS if name.startswith(given_.only)], 0
+    chosen, wrong = [name for name in PARSERS if name.startswith(tuple(given_.only))], 0
     for name in chosen:
         with tempfile.TemporaryDirectory() as folder:
             fuzz, end, number = (

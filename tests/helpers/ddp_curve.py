@@ -24,13 +24,14 @@ from saunet.training.stopping import GracefulStop, ProcessWatch
 
 
 class Curve(Callback):
-    def __init__(self, rank: int | None, number: int) -> None:
-        self.rank, self.number = rank, number
+    def __init__(self, folder: Path, rank: int | None, number: int) -> None:
+        self.folder, self.rank, self.number = folder, rank, number
         self.losses: list[float] = []
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any) -> None:
         self.losses.append(float(trainer.callback_metrics["train/loss"]))  # as it is logged
         if trainer.global_rank == self.rank and trainer.global_step == 4:
+            (self.folder / "struck").touch()
             os.kill(os.getpid(), self.number)
 
 
@@ -45,7 +46,7 @@ def main(folder: Path, processes: int, epochs: int, rank: int | None = None, num
         assert photometric.reduction == "masked"
         photometric.noise = 0.0
         model.depth.encoder[1] = torch.nn.Identity()  # type: ignore[union-attr, index, operator]
-        curve = Curve(rank, number)
+        curve = Curve(folder, rank, number)
         watch = [
             GracefulStop(str(folder / "c")),
             ProcessWatch(str(folder), str(folder / "c")),

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +130,7 @@ def test_two_processes_have_the_loss_curve_of_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize("victim", [0, 1])
 def test_a_killed_process_ends_the_run_with_a_sentence_and_a_checkpoint(victim: int, tmp_path: Path) -> None:
     done = _train(tmp_path, 2, 500, victim, signal.SIGKILL)
+    assert time.time() - (tmp_path / "struck").stat().st_mtime < 10
     assert done.returncode != 0
     named = "process 1 of 2 was killed (signal 9)" if victim == 1 else "the first process of the run is gone"
     assert f"saunet train: {named}" in done.stderr
