@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from saunet.data.kitti.files import lidar_depth, read_calibration, read_scan
+from saunet.data.kitti.files import lidar_depth, read_calibration
+from saunet.data.lidar import read_scan
 from saunet.errors import ConfigError, DataError
 
 

@@ -28,8 +28,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 from prepare_tree import CALIBRATION, SCANNER
 from tiny_checkpoint import write_checkpoint
 
-from saunet.data.kitti.files import oxts_speed, read_calibration, read_scan, read_times, read_timestamps
+from saunet.data.kitti.files import oxts_speed, read_calibration, read_times, read_timestamps
 from saunet.data.kitti.splits import read_split
+from saunet.data.lidar import read_scan
 from saunet.data.loading.selecting import read_manifest
 from saunet.data.video.camera import read_camera
 from saunet.errors import SaunetError

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from saunet.errors import CheckpointError, UnreadableError
 from saunet.io import plain
-from saunet.io.plain import parse_json, read_array, read_arrays, read_json, read_text, read_yaml
+from saunet.io.plain import iterate_json, parse_json, read_array, read_arrays, read_json, read_text, read_yaml
 
 ALIASED = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]\n" for old, new in zip("abcdefgh", "bcdefghi", strict=True)
@@ -181,3 +181,31 @@ def test_damaged_archives(data: bytes) -> None:
     whole = stream.getvalue()
     damaged = io.BytesIO(whole[: len(data)] + data + whole[2 * len(data) :])
     assert _one_sentence(read_arrays, damaged)
+
+
+@pytest.mark.parametrize("part", [200, 211, 1 << 20])
+def test_a_long_list_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int) -> None:
+    rows = [{"token": f"a{{]{number}\\", "at": [number / 3, None, {"deep": [True]}], "é": "ü"} for number in range(50)]
+    monkeypatch.setattr(plain, "_PART", part)
+    for text in (json.dumps(rows), json.dumps(rows, indent=2, ensure_ascii=False), "\n[ \n" + json.dumps(rows)[1:]):
+        (tmp_path / "rows.json").write_text(text, encoding="utf-8")
+        assert list(iterate_json(tmp_path / "rows.json")) == rows
+    (tmp_path / "rows.json").write_text("[]")
+    assert list(iterate_json(tmp_path / "rows.json")) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "its end is missing"),
+        ('[{"a": 1}, {"b": 2}', "its end is missing"),
+        ('[{"a": 1}, {"b": ', "end is missing"),
+        ('{"a": 1}', "a list of objects is expected, and '{' found"),
+        ("[1, 2]", "a list of objects is expected, and '1' found"),
+        ('[{"a": NaN}]', "NaN is no number"),
+        ('[{"a": ' + "9" * 40 + "}]", "40 digits"),
+        ('[{"a" 1}' + " " * (3 << 20), "delimiter"),
+    ],
+)
+def test_a_long_list_that_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    assert words in refused(lambda path: list(iterate_json(path)), tmp_path / "rows.json", text.encode())

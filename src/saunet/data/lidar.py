@@ -1,24 +1,40 @@
-"""Depth maps from points of a laser scanner, whatever the data set."""
+"""Points of a laser scanner and depth maps from them, whatever the data set."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from saunet.data.loading.windows import nearest_map
+from saunet.errors import DataError
+from saunet.io.images import read_bytes
 
-Array = Float[ndarray, "..."]
+
+def read_scan(path: Path, columns: int = 4) -> Float32[ndarray, "n 3"]:
+    """Return the x, y, z of a scan's points, meters, from a file of so many 32-bit numbers for each."""
+    data = read_bytes(path)
+    if data.size % (4 * columns):
+        raise DataError(
+            f"{path} has {data.size} bytes, not a multiple of the {4 * columns} bytes of a point; copy the file again"
+        )
+    points: Float32[ndarray, "n 3"] = data.view(np.float32).reshape(-1, columns)[:, :3]
+    known = np.isfinite(points).all(axis=1)
+    if not known.any():
+        raise DataError(f"{path} contains only points that are not finite numbers; copy the file again")
+    if not known.all():
+        lost = len(points) - int(known.sum())
+        warnings.warn(f"{path}: {lost} of {len(points)} points are not finite numbers and are left out", stacklevel=2)
+    return points[known]
 
 
 def points_to_depth(
     points: Float[ndarray, "n 3"],
     K: Float[ndarray, "3 3"],
     size: tuple[int, int],
-    *,
-    pixels: Callable[[Array], Array] | None = None,
 ) -> Float32[ndarray, "h w"]:
     """Project points in front of a camera; where several share a pixel the nearest stays.
 
@@ -26,17 +42,14 @@ def points_to_depth(
         points: In the camera's frame (x right, y down, z forward), meters.
         K: Intrinsics in pixels whose centers are integers.
         size: (height, width) of the map.
-        pixels: Gives the pixels, n x 2, of points, n x 3, for a lens that is no pinhole; NaN where it shows none.
 
     Returns:
         Depth along the camera's z, meters, 0 where no point falls.
     """
     points = np.asarray(points, np.float64)
     points = points[points[:, 2] > 0]
-    at = (points @ K.T)[:, :2] / points[:, 2:] if pixels is None else pixels(points)
-    seen = np.isfinite(at).all(1)
-    columns, rows = np.round(at[seen]).T
-    return scatter(rows, columns, points[seen, 2], size)
+    columns, rows = np.round((points @ K.T)[:, :2] / points[:, 2:]).T
+    return scatter(rows, columns, points[:, 2], size)
 
 
 def scatter(

@@ -16,7 +16,7 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,8 @@ DIGITS = 30
 ALIASES = 16
 """References to one place of a YAML file from another; some dozens can stand for more values than fit in memory."""
 _EXCERPT = 160
+_PART = 1 << 20
+"""Characters of a long list that are read at a time; no object of it may have twice as many."""
 
 
 class _LimitError(ValueError): ...
@@ -78,6 +80,35 @@ def parse_json(text: str | bytes, source: str, error: type[SaunetError] = Unread
     except ValueError as reason:
         raise error(f"{source} cannot be read as JSON ({_excerpt(reason)})") from reason
     return plain
+
+
+def iterate_json(path: str | Path, error: type[SaunetError] = UnreadableError) -> Iterator[Any]:
+    """Yield the items of a JSON file that is one list of objects, of any length: a part is in memory at a time."""
+    decoder, text, at, opened = json.JSONDecoder(parse_int=_integer, parse_constant=_constant), "", 0, False
+    try:
+        with Path(path).open(encoding="utf-8-sig") as stream:
+            while more := stream.read(_PART):
+                text, at = text[at:] + more, 0
+                while at < len(text):
+                    if text[at] in ", \t\r\n":
+                        at += 1
+                    elif opened and text[at] == "]":
+                        return
+                    elif text[at] != ("{" if opened else "["):
+                        raise _LimitError(f"a list of objects is expected, and '{text[at]}' found")
+                    elif not opened:
+                        opened, at = True, at + 1
+                    else:
+                        try:
+                            item, at = decoder.raw_decode(text, at)
+                        except json.JSONDecodeError:
+                            if len(text) - at > 2 * _PART:
+                                raise
+                            break  # the rest of the object follows
+                        yield item
+        raise _LimitError("its end is missing")
+    except (RecursionError, ValueError) as reason:
+        raise error(f"{path} cannot be read as a JSON list ({_excerpt(reason)})") from reason
 
 
 def read_yaml(path: str | Path, error: type[SaunetError] = UnreadableError) -> Any:

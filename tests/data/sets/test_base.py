@@ -46,8 +46,6 @@ def test_points_become_depth_at_pixel_centers() -> None:
     assert depth[10, 31] == 10  # u = 30.95
     assert depth[0, 0] == 10
     assert np.count_nonzero(depth) == 3
-    half = points_to_depth(points, K, (20, 60), pixels=lambda each: each[:, :2] / np.where(each[:, 2:] > 9, 1, np.nan))
-    assert np.argwhere(half).tolist() == [[0, 0]]  # a lens that shows points at 0, 0 only, and none nearer than 9 m
 
 
 def test_a_root_is_found_around_the_folder_given(tmp_path) -> None:

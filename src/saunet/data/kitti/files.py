@@ -7,7 +7,6 @@ Everywhere else integer coordinates are pixel centers counted from zero; `zero_b
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 from saunet.data.checks import check_intrinsics, check_rotation
 from saunet.data.lidar import scatter
 from saunet.errors import DataError, one_of
-from saunet.io.images import read_bytes
 
 Array = NDArray[np.float64]
 
@@ -34,7 +32,7 @@ def read_matrices(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except FileNotFoundError as reason:
-        raise DataError(f"no calibration at {path}; KITTI's files belong into the folder of the date") from reason
+        raise DataError(f"no calibration at {path}; copy the calibration, a download of its own, there") from reason
     except OSError as reason:
         raise DataError(f"cannot read calibration {path}: {reason.strerror or reason}") from reason
     found: dict[str, Array] = {}
@@ -140,21 +138,6 @@ def _read_scanner(folder: Path) -> Array | None:
     T_cam_velo = np.eye(4)
     T_cam_velo[:3, :3], T_cam_velo[:3, 3] = found["R"], found["T"]
     return T_cam_velo
-
-
-def read_scan(path: Path) -> NDArray[np.float32]:
-    """Return the points of a Velodyne scan, n x 3: x forward, y left, z up, in meters."""
-    data = read_bytes(path)
-    if data.size % 16:
-        raise DataError(f"{path} has {data.size} bytes, not a multiple of the 16 bytes of a point; copy the file again")
-    points = data.view(np.float32).reshape(-1, 4)[:, :3]
-    known = np.isfinite(points).all(axis=1)
-    if not known.any():
-        raise DataError(f"{path} contains only points that are not finite numbers; copy the file again")
-    if not known.all():
-        lost = len(points) - int(known.sum())
-        warnings.warn(f"{path}: {lost} of {len(points)} points are not finite numbers and are left out", stacklevel=2)
-    return points[known]
 
 
 def lidar_depth(

@@ -21,9 +21,9 @@ from saunet.data.kitti.files import (
     lidar_depth,
     oxts_speed,
     read_calibration,
-    read_scan,
     read_timestamps,
 )
+from saunet.data.lidar import read_scan
 from saunet.errors import DataError, one_of
 from saunet.io.images import read_depth, read_image
 

@@ -14,7 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
-from saunet.data.loading.selecting import Frame, Parts, hold_out_drives, hold_out_random
+from saunet.data.loading.selecting import Frame, Parts, hold_out_drives, hold_out_random, parse_ranges
 from saunet.errors import DataError, one_of
 
 VAL_DRIVES = (
@@ -46,16 +46,6 @@ def eigen_table() -> Mapping[str, list[Row]]:
             kind, drive, count, ranges = [*line.split("\t"), ""][:4]
             rows.setdefault(kind, []).append(Row(f"{drive[:10]}/{drive}", int(count), parse_ranges(ranges)))
     return rows
-
-
-def parse_ranges(text: str) -> list[int]:
-    """Return the numbers of ``"0-6/3,9"``: 0, 3, 6, 9 (a-b/s is a, a+s, ... up to and with b)."""
-    numbers: list[int] = []
-    for part in filter(None, text.strip().split(",")):
-        first, dash, rest = part.partition("-")
-        last, _, step = rest.partition("/")
-        numbers += range(int(first), int(last) + 1, int(step or 1)) if dash else [int(first)]
-    return numbers
 
 
 def eigen_test() -> list[Frame]:

@@ -46,6 +46,16 @@ Parts = tuple[list[Frame], list[Frame]]
 """Training and validation frames."""
 
 
+def parse_ranges(text: str) -> list[int]:
+    """Return the numbers of ``"0-6/3,9"``: 0, 3, 6, 9 (a-b/s is a, a+s, ... up to and with b)."""
+    numbers: list[int] = []
+    for part in filter(None, text.strip().split(",")):
+        first, dash, rest = part.partition("-")
+        last, _, step = rest.partition("/")
+        numbers += range(int(first), int(last) + 1, int(step or 1)) if dash else [int(first)]
+    return numbers
+
+
 def hold_out_drives(frames: Sequence[Frame], drives: Iterable[str]) -> Parts:
     """Put the frames of the named drives into validation; a name may be the end of ``<date>/<drive>``."""
     held, known = set(), sorted({frame.drive for frame in frames})

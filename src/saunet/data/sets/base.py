@@ -19,10 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from saunet.data.checks import check_intrinsics, common_size, scaled
 from saunet.data.drive import Drive
+from saunet.data.lidar import points_to_depth
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.selecting import with_poses, with_truth
 from saunet.data.loading.windows import Selection
-from saunet.errors import DataError, SaunetError
+from saunet.errors import ConfigError, DataError, SaunetError, one_of
 from saunet.io.images import read_image
 
 Array = NDArray[np.float64]
@@ -129,6 +130,48 @@ class FilesDrive(Drive):
         return self._condition
 
 
+class ScannedDrive(FilesDrive):
+    """A recording with a laser scanner: depth from its points, moved from the moment of the scan to the image's.
+
+    Args:
+        *args: As for `FilesDrive`.
+        scans: Frame number -> file of points, and T_world_lidar when it was taken.
+        **kwargs: As for `FilesDrive`; frames with a scan need a pose.
+    """
+
+    def __init__(self, *args: Any, scans: Mapping[int, tuple[Path, Array]], **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._scans = scans
+
+    def points(self, scan: Path) -> NDArray[np.float32]:
+        """Return the points of a file in the scanner's frame, n x 3, meters; each data set stores them its own way."""
+        raise NotImplementedError(f"{type(self).__name__} does not say how its points are stored")
+
+    def has_depth(self, index: int) -> bool:
+        return index in self._scans and self._scans[index][0].is_file()
+
+    def depth(self, index: int) -> NDArray[np.float32] | None:
+        if not self.has_depth(index):
+            return None
+        T = self._T_cam_lidar(index)
+        points = self.points(self._scans[index][0]) @ T[:3, :3].T + T[:3, 3]
+        return points_to_depth(points, self.depth_K, self.native_size)
+
+    def depth_key(self, index: int) -> str | None:
+        if not self.has_depth(index):
+            return None
+        return file_key(self._scans[index][0], self._T_cam_lidar(index), self.depth_K, self.native_size)
+
+    @property
+    def depth_K(self) -> Array:  # noqa: N802 (matrices in names)
+        """K of depth maps, which have the `native_size`."""
+        return self.calibrated_K
+
+    def _T_cam_lidar(self, index: int) -> Array:  # noqa: N802 (frames in names)
+        T: Array = np.linalg.inv(self._poses[index]) @ self._scans[index][1]
+        return T
+
+
 class FilesDataModule(DepthDataModule):
     """A data set whose splits are lists of recordings; a subclass implements `drives` in place of `select`."""
 
@@ -200,11 +243,13 @@ def transform(
 
 @contextlib.contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Turn what plain data of another shape raise into one sentence; ``what`` says what the file should be."""
+    """Turn what a file that is missing or of another shape raises into one sentence; ``what`` it should be."""
     try:
         yield
     except SaunetError:
         raise
+    except OSError as reason:
+        raise DataError(f"cannot read {reason.filename or path}, {what}: {reason.strerror or reason}") from reason
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as reason:
         lacks = f"lacks {reason}" if isinstance(reason, KeyError) else str(reason)
         raise DataError(f"{path} is not {what} as published ({lacks}); copy it again") from reason
@@ -243,7 +288,7 @@ def associate(first: Float[ndarray, " n"], second: Float[ndarray, " m"], most: f
 
     ``most`` are the seconds that the two times of a pair may differ; pairs are sorted by the first place.
     """
-    low, high = (np.searchsorted(second, first + sign * most, side) for sign, side in ((-1, "left"), (1, "right")))
+    low, high = np.searchsorted(second, first - most, "left"), np.searchsorted(second, first + most, "right")
     close = [(abs(first[i] - second[j]), i, j) for i in range(len(first)) for j in range(low[i], high[i])]
     pairs: dict[int, int] = {}
     taken: set[int] = set()
@@ -252,6 +297,13 @@ def associate(first: Float[ndarray, " n"], second: Float[ndarray, " m"], most: f
             pairs[i] = j
             taken.add(j)
     return sorted(pairs.items())
+
+
+def chosen(key: str, names: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of a setting ``key``, each checked, at least one."""
+    if not names:
+        raise ConfigError(f"{key} is empty; name at least one of {', '.join(known)}")
+    return tuple(one_of(key, name, known) for name in names)
 
 
 def file_key(path: Path, *facts: Any) -> str:
