@@ -7,6 +7,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -109,6 +110,60 @@ def hold_out(frames: Sequence[Frame], share: float, gap: int, seed: int) -> Part
             held.append(names[place])
             total += counts[names[place]]
     return hold_out_drives(frames, held)
+
+
+class Division(NamedTuple):
+    """The frames of recordings, divided into splits."""
+
+    train: list[Frame]
+    val: list[Frame]
+    test: list[Frame]  # those of ``val`` where no recordings are named for it
+    unused: int  # between training and validation
+
+    def of(self, split: str) -> dict[str, list[int]]:
+        """Return recording -> frame numbers of ``train``, ``val``, ``test`` or ``predict``."""
+        numbers: dict[str, list[int]] = {}
+        for frame in {"train": self.train, "val": self.val}.get(split, self.test):
+            numbers.setdefault(frame.drive, []).append(frame.number)
+        return numbers
+
+
+def divide(
+    frames: Mapping[str, Sequence[int]], held: Mapping[str, Sequence[str]], share: float, gap: int, seed: int
+) -> Division:
+    """Divide recordings: into those named for validation and test, or by holding out a share; see `hold_out`.
+
+    Args:
+        frames: Recording -> frame numbers.
+        held: What the setting that names recordings for validation is called, then that for test -> names or patterns.
+        share: To hold out where none are named for validation.
+        gap: Frames left out before a held-out tail.
+        seed: Decides what is drawn.
+    """
+    (val_setting, val_names), (test_setting, test_names) = held.items()
+    test = matching(test_names, list(frames), test_setting)
+    named = matching(val_names, [name for name in frames if name not in test], val_setting)
+
+    def listed(names: Iterable[str]) -> list[Frame]:
+        return [Frame(name, number, "l") for name in names for number in frames[name]]
+
+    rest = listed(name for name in frames if name not in test and name not in named)
+    train, val = (rest, listed(named)) if named else hold_out(rest, share, gap, seed)
+    return Division(train, val, listed(test) if test else val, 0 if named else len(rest) - len(train) - len(val))
+
+
+def matching(patterns: Sequence[str], names: Sequence[str], setting: str) -> list[str]:
+    """Return the names that fit any of the patterns, such as ``night_*``; one that fits none is an error."""
+    found: list[str] = []
+    for pattern in patterns:
+        fitting = [name for name in names if name == pattern or fnmatchcase(name, pattern)]
+        if not fitting:
+            what = setting.rpartition("_")[2]
+            raise ConfigError(
+                f"{setting} names '{pattern}', which fits no {what[:-1]}; {what}: {', '.join(names[:20]) or 'none'}"
+            )
+        found += (name for name in fitting if name not in found)
+    return found
 
 
 @dataclass(frozen=True)

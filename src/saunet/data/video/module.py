@@ -6,8 +6,7 @@ import functools
 import itertools
 import math
 import warnings
-from collections.abc import Mapping, Sequence
-from fnmatch import fnmatchcase
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +19,7 @@ from saunet.data.checks import common_size
 from saunet.data.drive import GAP, Drive
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
-from saunet.data.loading.selecting import Frame, hold_out
+from saunet.data.loading.selecting import divide
 from saunet.data.loading.windows import Selection, reach
 from saunet.data.video.camera import Lens, check_crop
 from saunet.data.video.clips import (
@@ -274,24 +273,15 @@ class VideoDataModule(DepthDataModule):
         if not any(drive.indices for drive in drives.values()):
             example = next(iter(drives), None) or self._broken[0]
             raise DataError(f"the clips below {self.root} hold no usable frame, such as {example}")
-        test = _matching(self.test_clips, list(drives), "test_clips")
-        named = _matching(self.val_clips, [name for name in drives if name not in test], "val_clips")
-        frames = _listed(drives, [name for name in drives if name not in test and name not in named])
-        if named:
-            train, val, unused = frames, _listed(drives, named), 0
-        else:
-            train, val = hold_out(frames, self.val_share, reach(self.offsets), self.seed)
-            unused = len(frames) - len(train) - len(val)
-        chosen = {"train": train, "val": val}.get(split, _listed(drives, test) if test else val)
-        numbers: dict[str, list[int]] = {}
-        for frame in chosen:
-            numbers.setdefault(frame.drive, []).append(frame.number)
+        frames = {name: drive.indices for name, drive in drives.items()}
+        held = {"val_clips": self.val_clips, "test_clips": self.test_clips}
+        division = divide(frames, held, self.val_share, reach(self.offsets), self.seed)
         selections = []
-        for place, (name, wanted) in enumerate(numbers.items()):
+        for place, (name, wanted) in enumerate(division.of(split).items()):
             drive = drives[name]
             left_out = {} if split == "val" else dict(drive.left_out)
             if split == "train" and place == 0:
-                left_out["between training and validation"] = unused
+                left_out["between training and validation"] = division.unused
                 left_out["clips that cannot be read"] = len(self._broken)
             if self.static == "drop" and split in ("train", "val"):
                 static = drive.static()
@@ -340,17 +330,3 @@ class VideoDataModule(DepthDataModule):
             shown.update(task, visible=False)
         settings = f"fps={self.fps} parallax={self.parallax} static={self.static}"
         return ClipDrive(clip, recording, self.crop, motion, self.parallax, settings, self._height)
-
-
-def _listed(drives: Mapping[str, ClipDrive], names: Sequence[str]) -> list[Frame]:
-    return [Frame(name, index, "l") for name in names for index in drives[name].indices]
-
-
-def _matching(patterns: Sequence[str], names: Sequence[str], what: str) -> list[str]:
-    found: list[str] = []
-    for pattern in patterns:
-        fitting = [name for name in names if name == pattern or fnmatchcase(name, pattern)]
-        if not fitting:
-            raise ConfigError(f"{what} names '{pattern}', which fits no clip; clips: {', '.join(names[:20]) or 'none'}")
-        found += (name for name in fitting if name not in found)
-    return found
