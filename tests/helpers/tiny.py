@@ -29,7 +29,7 @@ from saunet.training.module import SelfSupervisedDepth
 from saunet.training.optim import Recipe
 from saunet.training.speed import Speed
 from saunet.training.stopping import GracefulStop
-from saunet.types import DepthPyramid
+from saunet.types import DepthPyramid, TrainBatch
 
 
 class Wall(Drive):
@@ -111,6 +111,18 @@ def tiny_model(recipe: Recipe | None = None, speed: Speed | None = None, dropout
     torch.manual_seed(0)
     recipe = recipe or Recipe(lr=1e-2, schedule="cosine", warmup=0.2)
     return SelfSupervisedDepth(TinyDepth(dropout), TinyPose(), objectives.build("saunet"), recipe, speed=speed)
+
+
+def train_on(batch: TrainBatch) -> None:
+    """Learn from one batch: the loss must be finite and move the weights."""
+    model = tiny_model()
+    before = model.depth.decoder.weight.detach().clone()  # type: ignore[union-attr]
+    loss = model.step(batch)[3].total
+    loss.backward()
+    torch.optim.SGD(model.parameters(), lr=1.0).step()
+    assert loss.isfinite()
+    assert loss > 0
+    assert not torch.equal(model.depth.decoder.weight, before)  # type: ignore[union-attr]
 
 
 def tiny_trainer(folder: Path, **kwargs: Any) -> Trainer:

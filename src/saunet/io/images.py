@@ -91,14 +91,19 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     return as_rgb_bytes(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), str(path), bits)
 
 
-def read_depth(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """Return a depth map stored as KITTI does: 16-bit PNG, 256 a meter, 0 where unknown."""
-    stored = _decode(path, cv2.IMREAD_UNCHANGED)
+def read_depth(path: str | Path, steps: float | int = 256) -> Float32[np.ndarray, "h w"]:
+    """Return a depth map stored as 16-bit PNG, 0 where unknown, with so many steps a meter (KITTI's 256)."""
+    stored = read_unchanged(path)
     if stored.dtype != np.uint16 or stored.ndim != 2:
         raise DataError(
             f"{path} holds {stored.dtype} of shape {stored.shape}; a depth map is one channel of 16-bit numbers"
         )
-    return np.asarray(stored / np.float32(256), dtype=np.float32)
+    return np.asarray(stored / np.float32(steps), dtype=np.float32)
+
+
+def read_unchanged(path: str | Path) -> NDArray[Any]:
+    """Return the numbers of an image file as stored: h x w, or h x w x channels in OpenCV's order (BGR, BGRA)."""
+    return _decode(path, cv2.IMREAD_UNCHANGED)
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
