@@ -23,6 +23,7 @@ from saunet.io.video import CameraReader, VideoFrame, VideoReader, VideoWriter
 from saunet.prediction.odometer import Odometer
 from saunet.prediction.pointcloud import ViewerWriter
 from saunet.prediction.predictor import Predictor
+from saunet.runs.record import Scale
 
 Picture = NDArray[np.uint8]
 ALL = ("mp4", "color", "png16", "npy", "ply", "html", "trajectory")
@@ -56,6 +57,20 @@ def odometer() -> Odometer:
 
 def names(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_pairs_of_a_clip_lie_in_its_folder_and_older_ones_go(predictor: Predictor, video: Path, tmp_path: Path) -> None:
+    predictor.scale = Scale(20.0, "camera height")
+    out = tmp_path / "out"
+    for count in (3, 1):
+        run(predictor, video, out, ["pairs"], camera=[90.0], max_frames=count, overwrite=True)
+        files = [
+            f"drive/{kind}/{index:06d}.{end}"
+            for kind, end in (("images", "png"), ("depth", "npy"))
+            for index in range(count)
+        ]
+        assert names(out) == sorted([*files, "camera.yaml"])
+    assert "fps: 12" in (out / "camera.yaml").read_text()
 
 
 def test_everything_at_once(predictor: Predictor, video: Path, tmp_path: Path, odometer: Odometer) -> None:

@@ -49,6 +49,36 @@ def test_folder_with_all_outputs(predictor: Predictor, folder: Path, tmp_path: P
     assert read_image(tmp_path / "out" / "a_disparity.png").shape == (40, 90, 3)
 
 
+def test_pairs_are_read_back_as_training_data(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
+    from saunet.data.loading.module import DepthDataModule
+    from saunet.registry import datamodules
+    from saunet.runs.record import Scale
+
+    out = tmp_path / "out"
+    with pytest.raises(ConfigError, match=r"'pairs', whose depth is in meters.*relative; set scale\.method"):
+        run(predictor, folder, out, ("pairs",))
+    assert not out.exists()
+    predictor.scale = Scale(20.0, "camera height 1.65 m")
+    summary = run(predictor, folder, out, ("pairs",), camera=[60, 60, 44.5, 19.5])
+    stems = ("a", "b", "deep/c")
+    files = [each for stem in stems for each in (f"images/{stem}.png", f"depth/{stem}.npy")]
+    assert names(out) == sorted([*files, MANIFEST, "camera.yaml"])
+    assert len(summary.written) == 6
+    again = run(predictor, folder, out, ("pairs",), camera=[60, 60, 44.5, 19.5])
+    assert (again.written, again.skipped) == ((), 3)
+    (out / "depth" / "b.npy").unlink()
+    assert len(run(predictor, folder, out, ("pairs",), camera=[60, 60, 44.5, 19.5]).written) == 2
+    data = datamodules.build("pairs", root=str(out), height=32, width=64, batch_size=1, workers=0, val_drives=["*"])
+    assert isinstance(data, DepthDataModule)
+    data.setup("test")
+    drives = {drive.name: drive for drive in data.datasets["test"].drives}
+    assert list(drives) == ["images", "images/deep"]
+    depth = drives["images/deep"].depth(0)
+    assert np.array_equal(depth, predictor.predict(folder / "deep" / "c.png").depth)
+    assert np.array_equal(drives["images"].image(0), read_image(folder / "a.png"))
+    assert drives["images"].intrinsics(0)[0, 0] == 60
+
+
 def test_second_run_skips_and_third_goes_on(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     run(predictor, folder, out)

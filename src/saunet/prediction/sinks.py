@@ -35,8 +35,9 @@ if TYPE_CHECKING:
     from saunet.prediction.odometer import Odometer
 
 ENDINGS = {"color": "_disparity.png", "png16": "_depth.png", "npy": "_depth.npy", "ply": "_points.ply"}
-OUTPUTS: tuple[str, ...] = tuple(ENDINGS)
-"""What can be written for each image: disparity in colors, depth as 16-bit PNG (x 256) or float32 array, points."""
+OUTPUTS: tuple[str, ...] = (*ENDINGS, "pairs")
+"""What can be written for each image: disparity in colors, depth as 16-bit PNG (x 256) or float32 array, points; image
+and depth as a pair to train on, which Ultralytics and ``data=pairs`` read."""
 LAYOUTS: tuple[str, ...] = ("auto", "stacked", "beside")
 """Depth below the image, beside it, or whichever comes nearer to a screen's shape."""
 MANIFEST = "predictions.json"
@@ -93,19 +94,39 @@ class Manifest:
         self.written = True
 
 
-def write_output(output: str, stem: Path, result: Prediction, style: Style) -> Path:
-    """Write one of `OUTPUTS` of a prediction, whole or not at all, and return its path."""
-    path = stem.with_name(f"{stem.name}{ENDINGS[output]}")
+def output_paths(output: str, folder: Path, stem: str) -> tuple[Path, ...]:
+    """Return the files of one of `OUTPUTS` of an image."""
+    if output == "pairs":
+        return folder / "images" / f"{stem}.png", folder / "depth" / f"{stem}.npy"
+    return (folder / f"{stem}{ENDINGS[output]}",)
+
+
+def write_output(output: str, folder: Path, stem: str, result: Prediction, style: Style) -> tuple[Path, ...]:
+    """Write one of `OUTPUTS` of a prediction, each file whole or not at all, and return their paths."""
+    paths = output_paths(output, folder, stem)
     if output == "color":
-        write_image(path, result.color(style.limits, style.colormap))
+        write_image(paths[0], result.color(style.limits, style.colormap))
     elif output == "png16":
-        write_image(path, depth_to_png16(result.depth))
+        write_image(paths[0], depth_to_png16(result.depth))
     elif output == "npy":
-        result.save(path)
+        result.save(paths[0])
+    elif output == "pairs":
+        write_image(paths[0], result.image)
+        result.save(paths[1])
     else:
         assert style.camera is not None  # the options have asked for it
-        write_ply(path, point_cloud(result, style.camera, max_depth=style.max_depth))
-    return path
+        write_ply(paths[0], point_cloud(result, style.camera, max_depth=style.max_depth))
+    return paths
+
+
+def write_pairs_camera(folder: Path, camera: Camera, fps: float | None) -> None:
+    """Write the ``camera.yaml`` of pairs, so that training on them knows K."""
+    from saunet.data.video.camera import FILE_NAME, CameraFile, write_camera
+
+    path, size = folder / FILE_NAME, (camera.height, camera.width)
+    write_camera(
+        path, CameraFile(path, camera.K.astype(np.float64), size, fps=fps), "of the images and depth maps here"
+    )
 
 
 class Sink(Session, abc.ABC):
@@ -135,16 +156,21 @@ class ImageFilesSink(Sink):
         if self._overwrite:
             return self.outputs
         changed = frame.image.stat().st_mtime if frame.image.exists() else None
-        paths = {output: self.paths[0] / f"{frame.stem}{ENDINGS[output]}" for output in self.outputs}
-        return [output for output, path in paths.items() if not path.is_file() or not _made_from(path, changed)]
+        paths = {output: output_paths(output, self.paths[0], frame.stem) for output in self.outputs}
+        return [
+            output
+            for output, files in paths.items()
+            if not all(path.is_file() and _made_from(path, changed) for path in files)
+        ]
 
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
         for output in self.wanted(frame):
-            path = write_output(output, self.paths[0] / frame.stem, result, self._style)
-            self.written.append(path)
+            paths = write_output(output, self.paths[0], frame.stem, result, self._style)
+            self.written += paths
             if frame.image.exists():
                 changed = frame.image.stat()
-                os.utime(path, ns=(changed.st_atime_ns, changed.st_mtime_ns))
+                for path in paths:
+                    os.utime(path, ns=(changed.st_atime_ns, changed.st_mtime_ns))
             if not self._manifest.written:  # only now: a run that writes nothing leaves nothing
                 self._manifest.write()
 
@@ -166,12 +192,15 @@ class FrameFilesSink(Sink):
         for path in self.paths[0].glob("[0-9][0-9][0-9][0-9][0-9][0-9]_*"):
             if path.name[6:] in ENDINGS.values():
                 path.unlink()
+        for kind, ending in (("images", "png"), ("depth", "npy")):
+            for path in self.paths[0].glob(f"{kind}/[0-9][0-9][0-9][0-9][0-9][0-9].{ending}"):
+                path.unlink()
         yield
 
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
         style = dataclasses.replace(self._style, limits=limits)
         for output in self._outputs:
-            write_output(output, self.paths[0] / Path(frame.stem).name, result, style)
+            write_output(output, self.paths[0], Path(frame.stem).name, result, style)
 
 
 class VideoSink(Sink):

@@ -43,10 +43,10 @@ class PredictOptions:
         input: An image, a folder (with everything below), a pattern (``frames/*.png``), a video, or a camera's number;
             in Python also several images, or RGB arrays h x w x 3.
         output: The folder of the results, made if missing; names follow the inputs.
-        outputs: ``color`` (disparity in colors), ``png16`` (depth x 256), ``npy`` (depth in float32), ``ply`` (points)
-            for each image; ``mp4`` (image and disparity), ``html`` (points to orbit) and ``trajectory`` (from above,
-            as KITTI poses, and where times are known for TUM's tools) for the whole. By default color and png16 of
-            images, mp4 of videos.
+        outputs: ``color`` (disparity in colors), ``png16`` (depth x 256), ``npy`` (depth in float32), ``ply`` (points),
+            ``pairs`` (images and depth in meters, to train on) for each image; ``mp4`` (image and disparity), ``html``
+            (points to orbit) and ``trajectory`` (from above, as KITTI poses, and where times are known for TUM's tools)
+            for the whole. By default color and png16 of images, mp4 of videos.
         colormap: magma, inferno, viridis, turbo or gray.
         camera: True intrinsics, which ``ply`` and ``html`` need: a camera.yaml; fx, fy, cx, cy in pixels of the first
             image; the nine numbers of K; or one number, the horizontal field of view in degrees.
@@ -196,6 +196,11 @@ def predict(
         camera, height = _camera(options, recording, predictor)
         apply_scale(options.scale, predictor, options.input, camera, folder, options.checkpoint, height)
         print(f"depth is {predictor.unit}")
+        if "pairs" in outputs and predictor.scale is None:
+            raise ConfigError(
+                "outputs has 'pairs', whose depth is in meters, and this model's is relative; set scale.method "
+                "(docs/scale.md), or write outputs=[npy]"
+            )
         remove_partial_files(folder)
         if "trajectory" in outputs and odometer is None:
             from saunet.prediction.odometer import Odometer
@@ -206,23 +211,27 @@ def predict(
         clips = _clip_sinks(options, outputs, recording, style, odometer)
         files = tuple(output for output in outputs if output in OUTPUTS)
         if recording.images is not None:
-            return _predict_images(options, predictor, recording, files, clips, style)
-        if files:
-            clips.append(sinks.FrameFilesSink(folder / recording.title, files, style))
-        for sink in clips:
-            _refuse_existing(sink, options.overwrite)
-        frames = itertools.islice(recording, options.max_frames)
-        total = options.max_frames or recording.declared
-        smoothing, batch = options.range_smoothing, options.batch_size
-        count = sinks.fill(predictor, frames, clips, smoothing, batch, total, live=recording.live)
-        return PredictResult(
-            output=folder,
-            unit=predictor.unit,
-            frames=count,
-            clips=tuple(path for sink in clips for path in sink.paths),
-            missing=recording.missing,
-            failures=tuple(recording.problems),
-        )
+            result = _predict_images(options, predictor, recording, files, clips, style)
+        else:
+            if files:
+                clips.append(sinks.FrameFilesSink(folder / recording.title, files, style))
+            for sink in clips:
+                _refuse_existing(sink, options.overwrite)
+            frames = itertools.islice(recording, options.max_frames)
+            total = options.max_frames or recording.declared
+            smoothing, batch = options.range_smoothing, options.batch_size
+            count = sinks.fill(predictor, frames, clips, smoothing, batch, total, live=recording.live)
+            result = PredictResult(
+                output=folder,
+                unit=predictor.unit,
+                frames=count,
+                clips=tuple(path for sink in clips for path in sink.paths),
+                missing=recording.missing,
+                failures=tuple(recording.problems),
+            )
+        if "pairs" in outputs and camera is not None:
+            sinks.write_pairs_camera(folder, camera, recording.fps if recording.images is None else None)
+        return result
 
 
 def _predict_images(
