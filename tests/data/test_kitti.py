@@ -9,6 +9,8 @@ from kitti_tree import DATE, make_drive, name
 
 from saunet.data.drive import Drive
 from saunet.data.kitti.raw import KittiRaw
+from saunet.data.kitti.splits import read_split
+from saunet.data.loading.selecting import Frame
 from saunet.errors import ConfigError, DataError
 
 
@@ -59,6 +61,49 @@ def test_depth_kinds(tmp_path):
     truth.mkdir(parents=True)
     cv2.imwrite(str(truth / "0000000000.png"), np.full((20, 60), 512, np.uint16))
     assert (raw.drive(name(1), depth_kind="improved").depth(0) == 2).all()
+
+
+@pytest.mark.parametrize("where", ["raw", "raw/data_depth_annotated", "depth", "."])
+def test_annotated_depth_is_found_in_its_archives_layout(tmp_path, where):
+    for number, split in ((1, "train"), (2, "val")):
+        make_drive(tmp_path / "raw", number, scans=False)
+        folder = tmp_path / where / split / name(number).split("/")[1] / "proj_depth" / "groundtruth" / "image_03"
+        folder.mkdir(parents=True)
+        cv2.imwrite(str(folder / "0000000005.png"), np.full((20, 60), 256 * number, np.uint16))
+    raw = KittiRaw(tmp_path / "raw")
+    for number in (1, 2):
+        drive = raw.drive(name(number), "right", "improved")
+        assert [drive.has_depth(index) for index in (4, 5)] == [False, True]
+        assert (drive.depth(5) == number).all()
+        assert drive.stereo().depth(5) is None
+        assert pickle.loads(pickle.dumps(drive)).has_depth(5)
+
+
+def test_annotated_depth_may_lie_anywhere_and_is_named_if_it_does_not(tmp_path):
+    make_drive(tmp_path / "a" / "raw", 1, scans=False)
+    folder = tmp_path / "b" / "train" / name(1).split("/")[1] / "proj_depth" / "groundtruth" / "image_02"
+    folder.mkdir(parents=True)
+    cv2.imwrite(str(folder / "0000000003.png"), np.full((20, 60), 512, np.uint16))
+    assert KittiRaw(tmp_path / "a" / "raw").drive(name(1), depth_kind="improved").depth(3) is None
+    assert (KittiRaw(tmp_path / "a" / "raw", tmp_path / "b").drive(name(1), depth_kind="improved").depth(3) == 2).all()
+    with pytest.raises(DataError, match=r"no annotated depth maps at .*data_depth_annotated\.zip"):
+        KittiRaw(tmp_path / "a" / "raw", tmp_path / "a").drive(name(1), depth_kind="improved")
+
+
+def test_files_with_a_byte_order_mark_are_read(tmp_path):
+    drive = make_drive(tmp_path / "raw", 1)
+    (drive / "oxts" / "data").mkdir(parents=True)
+    (drive / "oxts" / "data" / "0000000000.txt").write_text(" ".join(["1"] * 8 + ["3", "4", "0"] + ["1"] * 19))
+    (drive / "image_02" / "timestamps.txt").write_text("2011-09-26 13:02:25.5\n2011-09-26 13:02:25.6\n")
+    (tmp_path / "list.txt").write_text(f"{name(1)} 0000000002 l\n")
+    calibration = drive.parent / "calib_cam_to_cam.txt"
+    calibration.write_text(calibration.read_text().partition("\n")[2].partition("\n")[2])  # S_rect_00 comes first
+    for path in (*drive.rglob("*.txt"), calibration, tmp_path / "list.txt"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    read = KittiRaw(tmp_path / "raw").drive(name(1))
+    assert (read.speed(0), read.time(1) - read.time(0)) == (5, pytest.approx(0.1))
+    assert set(read.calibration.sizes) == {0, 2, 3}
+    assert read_split(tmp_path / "list.txt") == [Frame(name(1), 2, "l")]
 
 
 def test_missing_scans_and_scanner_are_no_depth(tmp_path):

@@ -198,6 +198,24 @@ def test_resized_copies_have_a_k_of_their_size_and_cropped_ones_are_refused(root
         OdometrySequence(root, "00")
 
 
+def test_copies_of_every_camera_and_real_size_scale_k_alike(root):
+    folder = root / "sequences" / "00"
+    for center, size in (
+        ((607.1928, 185.2157), (376, 1241)),
+        ((609.5593, 172.854), (375, 1242)),
+        ((601.8873, 183.1104), (370, 1226)),
+    ):
+        real = f"700 0 {center[0]} 0 0 700 {center[1]} 0 0 0 1 0"
+        (folder / "calib.txt").write_bytes(b"\xef\xbb\xbf" + f"P0: {real}\nP2: {real}\n".encode())  # with a BOM
+        for camera in (0, 2):
+            for path in (folder / f"image_{camera}").iterdir():
+                cv2.imwrite(str(path), np.zeros((192, 640), np.uint8))
+        for camera in ("gray_left", "color_left"):
+            K = OdometrySequence(root, "00", camera).intrinsics(0)
+            assert K[0].tolist() == pytest.approx([700 * 640 / size[1], 0, (center[0] - 0.5) * 640 / size[1] - 0.5])
+            assert K[1].tolist() == pytest.approx([0, 700 * 192 / size[0], (center[1] - 0.5) * 192 / size[0] - 0.5])
+
+
 def test_broken_times_are_named_with_their_line(root):
     (root / "sequences" / "00" / "times.txt").write_text("0.0\n0.1\nnan\n")
     with pytest.raises(DataError, match=r"times\.txt, line 3: expected seconds"):

@@ -37,7 +37,7 @@ def read_kitti(path: Path) -> Float64[ndarray, "n 4 4"]:
     """Read camera-to-world poses from a KITTI pose file."""
     expected = "12 finite numbers (a 3 x 4 pose, row by row)"
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"cannot read {path} as text ({error}); expected lines of {expected}") from error
     rows = []

@@ -30,7 +30,7 @@ _LIDAR_KEYS = {"R": (3, 3), "T": (3,)}
 def read_matrices(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
     """Read the lines ``KEY: numbers`` of a calibration file as matrices of the shapes that are asked for."""
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     except FileNotFoundError as reason:
         raise DataError(f"no calibration at {path}; copy the calibration, a download of its own, there") from reason
     except OSError as reason:
@@ -170,7 +170,7 @@ def lidar_depth(
 def oxts_speed(path: Path) -> float:
     """Return the speed in m/s of a record of KITTI's inertial unit: the length of (vf, vl, vu)."""
     try:
-        words = path.read_text(encoding="utf-8", errors="replace").split()
+        words = path.read_text(encoding="utf-8-sig", errors="replace").split()
     except OSError as reason:
         raise DataError(f"cannot read {path}: {reason.strerror or reason}") from reason
     velocity = np.array([_number(word) for word in words[8:11]])
@@ -184,7 +184,7 @@ def read_timestamps(path: Path) -> Array | None:
     if not path.is_file():
         return None
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").rstrip().split("\n")
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").rstrip().split("\n")
     except OSError as reason:
         raise DataError(f"cannot read {path}: {reason.strerror or reason}") from reason
     times = np.empty(len(lines) if any(lines) else 0)
@@ -203,7 +203,7 @@ def read_times(path: Path) -> Array:
     """Read the ``times.txt`` of a KITTI odometry sequence: seconds, one per frame; empty if there is none."""
     if not path.is_file():
         return np.empty(0)
-    words = path.read_text(encoding="utf-8", errors="replace").split()
+    words = path.read_text(encoding="utf-8-sig", errors="replace").split()
     times = np.array([_number(word) for word in words])
     for line in np.flatnonzero(~np.isfinite(times)).tolist():
         got = f"got the non-numeric value '{words[line][:40]}'"

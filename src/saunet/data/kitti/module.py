@@ -42,6 +42,8 @@ class KittiDataModule(DepthDataModule):
             under 0.5 m/s (without OXTS, by flow); or drop those whose median optical ``flow`` to the frame before is
             under half a pixel at 320 pixels width. Flow reads every frame once at set-up.
         depth: Ground truth: LiDAR depth as ``camera_z`` or ``lidar_x`` (evaluation only), or ``improved``.
+        annotated: Folder of the unpacked data_depth_annotated archive, for ``improved``; by default the maps are looked
+            for in the drives' folders, and in the archive's layout below the folder of the dates and the one above.
         dense: Dense depth maps as that target in place of the sparse scan: ``linear`` or ``colorization``, made
             beforehand by ``saunet prepare densify``; ``none`` uses the scan.
         teacher: Batches carry another model's depth, made beforehand by ``saunet prepare teacher``.
@@ -68,6 +70,7 @@ class KittiDataModule(DepthDataModule):
         cameras: Sequence[str] = ("left", "right"),
         static: Literal["keep", "speed", "flow"] = "keep",
         depth: Literal["camera_z", "lidar_x", "improved"] = "camera_z",
+        annotated: str | None = None,
         target_depth: bool = False,
         dense: Literal["none", "linear", "colorization"] = "none",
         teacher: bool = False,
@@ -90,6 +93,7 @@ class KittiDataModule(DepthDataModule):
         self.ground_truth = one_of("depth", depth, DEPTH_KINDS)
         self.protocol = _PROTOCOLS[depth]
         self._depth: DepthKind = depth
+        self.annotated = annotated
         self._raw: KittiRaw | None = None
         one_of("dense", dense, ("none", *DENSE_KINDS))
         if dense != "none":
@@ -99,7 +103,7 @@ class KittiDataModule(DepthDataModule):
         self.odometer = measured_distance if with_speed else None
 
     def select(self, split: str) -> Sequence[Selection]:
-        raw = self._raw = self._raw or KittiRaw(self.root)
+        raw = self._raw = self._raw or KittiRaw(self.root, self.annotated)
         skip = self.on_error == "skip"
         between: Counter[tuple[str, str]] = Counter()
         if split in ("train", "val"):
@@ -157,7 +161,7 @@ class KittiDataModule(DepthDataModule):
         """Return the names of all images that a split lists, in its order, also those that the root lacks."""
         if split != "test":
             return super().listed(split)
-        return [str(frame) for frame in self._test(self._raw or KittiRaw(self.root))]
+        return [str(frame) for frame in self._test(self._raw or KittiRaw(self.root, self.annotated))]
 
     def _training(self, raw: KittiRaw) -> tuple[list[Frame], list[Frame], set[Frame]]:
         """Return training and validation frames, and those between them, which are in neither."""

@@ -45,12 +45,18 @@ class KittiDrive(Drive):
     camera_height = CAMERA_HEIGHT
 
     def __init__(
-        self, folder: Path, calibration: KittiCalibration, camera: str = "left", depth_kind: DepthKind = "camera_z"
+        self,
+        folder: Path,
+        calibration: KittiCalibration,
+        camera: str = "left",
+        depth_kind: DepthKind = "camera_z",
+        annotated: Path | None = None,
     ) -> None:
         self.number, side = CAMERAS[one_of("camera", camera, CAMERAS)]
         one_of("depth kind", depth_kind, DEPTH_KINDS)
         self.depth_kind: DepthKind = depth_kind
         self._folder, self._side, self.calibration = folder, side, calibration
+        self._annotated = annotated  # the drive's folder in the archive of annotated depth maps, if that lies apart
         self._clock = folder / f"image_{self.number:02d}" / "timestamps.txt"
         self._files = frame_files(folder / f"image_{self.number:02d}" / "data")
         self._indices = sorted(self._files)
@@ -163,7 +169,7 @@ class KittiDrive(Drive):
     @functools.cached_property
     def _stereo(self) -> KittiDrive:
         other = "right" if self.number == CAMERAS["left"][0] else "left"
-        return KittiDrive(self.folder, self.calibration, other, self.depth_kind)
+        return KittiDrive(self.folder, self.calibration, other, self.depth_kind, self._annotated)
 
     @functools.cached_property
     def T_stereo_cam(self) -> NDArray[np.float64]:  # noqa: N802 (frames in names)
@@ -171,14 +177,19 @@ class KittiDrive(Drive):
 
     def depth_file(self, index: int) -> Path:
         if self.depth_kind == "improved":
-            return self.folder / "proj_depth" / "groundtruth" / f"image_{self.number:02d}" / f"{index:010d}.png"
+            home = self._annotated or self.folder
+            return home / "proj_depth" / "groundtruth" / f"image_{self.number:02d}" / f"{index:010d}.png"
         return self.folder / "velodyne_points" / "data" / f"{index:010d}.bin"
 
 
 class KittiRaw:
-    """The KITTI raw recordings below a folder."""
+    """The KITTI raw recordings below a folder.
 
-    def __init__(self, root: str | Path) -> None:
+    ``annotated`` is the folder of the unpacked data_depth_annotated archive; by default it is looked for below the
+    folder that holds the dates, and below the one above it.
+    """
+
+    def __init__(self, root: str | Path, annotated: str | Path | None = None) -> None:
         self.root = Path(root).expanduser()
         if not self.root.is_dir():
             raise DataError(f"no data root at {self.root.absolute()}; set data.root to the folder of KITTI recordings")
@@ -190,16 +201,38 @@ class KittiRaw:
             )
         self._dates = {path.parent.name: path.parent for path in self.drives.values()}
         self._calibrations: dict[str, KittiCalibration] = {}
+        self._given_annotated = None if annotated is None else Path(annotated).expanduser()
+
+    @functools.cached_property
+    def annotated(self) -> dict[str, Path]:
+        """Folders of annotated depth maps in the archive's own layout (``train`` and ``val``), by name of the drive."""
+        given, home = self._given_annotated, next(iter(self._dates.values())).parent
+        bases = (home, home.parent) if given is None else (given,)
+        found = [
+            path
+            for base in bases
+            for split in ("train", "val")
+            for path in (*base.glob(f"{split}/*_sync"), *base.glob(f"*/{split}/*_sync"))
+            if (path / "proj_depth").is_dir()
+        ]
+        if given is not None and not found:
+            raise DataError(
+                f"no annotated depth maps at {given.absolute()}; expected train/2011_09_26_drive_0001_sync/proj_depth "
+                "there or one level below, as data_depth_annotated.zip unpacks"
+            )
+        return {path.name: path for path in reversed(found)}
 
     def drive(self, name: str, camera: str = "left", depth_kind: DepthKind = "camera_z") -> KittiDrive:
         """Return a drive by its name ``<date>/<drive>``; one that is not on disk has no frames."""
-        date = name.partition("/")[0]
+        date, annotated = name.partition("/")[0], None
         folder = self.drives.get(name, self._dates.get(date, self.root / date) / name.rpartition("/")[2])
+        if depth_kind == "improved" and not (folder / "proj_depth").is_dir():
+            annotated = self.annotated.get(folder.name)
         if date not in self._dates:
             return KittiDrive(folder, KittiCalibration(Path(), {}, {}, np.eye(3), None), camera, depth_kind)
         if date not in self._calibrations:
             self._calibrations[date] = read_calibration(self._dates[date])
-        return KittiDrive(folder, self._calibrations[date], camera, depth_kind)
+        return KittiDrive(folder, self._calibrations[date], camera, depth_kind, annotated)
 
 
 @functools.cache

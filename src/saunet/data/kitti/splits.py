@@ -99,7 +99,7 @@ _LINE = "'<date>/<drive> <frame number> <l or r>'"
 def read_split(path: Path) -> list[Frame]:
     """Read a list in Monodepth2's format: a line ``<date>/<drive> <frame> <l or r>`` each."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as reason:
         raise DataError(f"cannot read split file {path}: {reason}") from reason
     frames = []
