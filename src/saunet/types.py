@@ -23,6 +23,8 @@ class _Sample(TypedDict):
     """Depth of the target in meters at the size of the images, 0 where unknown; for losses that use LiDAR."""
     target_teacher: NotRequired[Float[Tensor, "b 1 h w"]]
     """Depth of the target as another model predicts it, at the size of the images, up to scale, 0 where unknown."""
+    target_mask: NotRequired[Float[Tensor, "b 1 h w"]]
+    """1 where the target shows the scene, 0 where it shows the vehicle that carries the camera."""
     T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
     """True motion, where the data set knows it: a target point times it is a source point, in meters."""
     T_stereo_tgt: NotRequired[Float[Tensor, "b 4 4"]]

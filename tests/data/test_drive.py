@@ -36,9 +36,10 @@ def test_four_members_are_enough_and_the_rest_is_unknown():
     drive = Bare()
     unknown = {drive.depth(0), drive.pose(0), drive.time(0), drive.timestamps, drive.fps, drive.speed(0)}
     unknown |= {drive.distance(0, 2), drive.stereo(), drive.T_stereo_cam, drive.path(0), drive.folder}
-    unknown |= {drive.frame_size, drive.camera_height, drive.condition, drive.depth_key(0)}
+    unknown |= {drive.frame_size, drive.camera_height, drive.condition, drive.depth_key(0), drive.scene_mask}
     assert unknown == {None}
     assert (drive.has_depth(0), drive.recorded(2), drive.numbering, drive.origin) == (False, 2, "", "")
+    assert not drive.has_scene_mask
 
 
 @pytest.mark.parametrize("missing", ["name", "indices", "image", "intrinsics"])

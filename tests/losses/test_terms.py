@@ -160,3 +160,18 @@ def test_views_are_what_they_say(make_inputs: Make) -> None:
     inputs = make_inputs(scales=3)
     assert len(inputs.views) == 3
     assert all(isinstance(view, View) and view.image.shape == (2, 2, 3, 16, 24) for view in inputs.views)
+
+
+@pytest.mark.parametrize("options", [{}, {"automask": False}, {"reduction": "all"}])
+def test_pixels_of_the_own_vehicle_do_not_teach(options: dict[str, Any], make_inputs: Make) -> None:
+    inputs, term = make_inputs(), build("photometric", options).eval()
+    rest, middle = (inputs.pyramid, inputs.poses, inputs.views), inputs.batch["loss_target"].shape[-2] // 2
+    shown = torch.ones_like(inputs.batch["target_depth"])
+    value = term({**inputs.batch, "target_mask": shown}, *rest).value
+    torch.testing.assert_close(value, term(*inputs).value, rtol=0, atol=0)
+    shown[..., middle:, :] = 0
+    target = inputs.batch["loss_target"].clone().requires_grad_()
+    term({**inputs.batch, "target_mask": shown, "loss_target": target}, *rest).value.backward()
+    assert target.grad is not None
+    assert (target.grad[..., middle + 1 :, :] == 0).all()  # SSIM looks one pixel around
+    assert target.grad[..., :middle, :].abs().max() > 0

@@ -147,6 +147,16 @@ class Drive(ABC):
         return ""
 
     @property
+    def scene_mask(self) -> NDArray[np.bool_] | None:
+        """Where frames show the scene and not the own vehicle, h x w; None if everywhere."""
+        return None
+
+    @property
+    def has_scene_mask(self) -> bool:
+        """Whether `scene_mask` gives one; override it where that is known without reading one."""
+        return self.scene_mask is not None
+
+    @property
     def origin(self) -> str:
         """Whatever beside the image files decides the pixels of a frame (camera, crop), as text; empty if nothing."""
         return ""

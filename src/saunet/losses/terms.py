@@ -37,8 +37,9 @@ _TARGETS = {
 class Photometric(Term):
     """Minimum reprojection error times auto-mask, SAU-Net eqs. (8)-(12), averaged over scales.
 
-    A pixel that no source sees has no error: it is left out of the mean (with ``reduction: all`` and the auto-mask, it
-    counts with its unwarped error, like every pixel that does not teach). If no pixel is left, the loss is 0.
+    A pixel that no source sees, or that shows the own vehicle (the batch's ``target_mask``), has no error: it is left
+    out of the mean (with ``reduction: all`` and the auto-mask, it counts with its unwarped error, like every pixel that
+    does not teach). If no pixel is left, the loss is 0.
     Its maps are ``photometric_error``, and ``automask`` or, without one, ``visible``.
 
     Args:
@@ -79,6 +80,8 @@ class Photometric(Term):
         for view in views:
             errors = photometric_error(view.image, target, self.ssim_weight)
             error, known = combine_sources(errors, view.valid if self.use_validity else None, self.sources)
+            if "target_mask" in batch:
+                known = known & (batch["target_mask"] > 0.5)
             value, mask = self._reduce(error, known, identity)
             values.append(value)
             if not maps:

@@ -67,7 +67,7 @@ def test_depth_is_that_of_the_moment_of_the_image(root):
 
 def test_masks_hide_the_own_car(root, tmp_path):
     mask = np.full((20, 32), 255, np.uint8)
-    mask[:, :8] = 0  # an eighth of the width, of a mask half as large
+    mask[:, :8] = 0  # a quarter of the width, of a mask half as large
     for name in ("CAMERA_05_mask.png", "000150/CAMERA_05_mask.png", "CAMERA_05/000150/mask.png"):
         masks = tmp_path / name.replace("/", "_")
         (masks / name).parent.mkdir(parents=True)
@@ -78,6 +78,15 @@ def test_masks_hide_the_own_car(root, tmp_path):
         assert np.argwhere(hidden.depth(0)).tolist() == [[21, 31]]
         assert np.count_nonzero(front.depth(0)) == 2
         assert hidden.depth_key(0) != front.depth_key(0)
+    everywhere = str(tmp_path / "CAMERA_05_mask.png")
+    data = module(root, masks=everywhere, cameras=["camera_01", "camera_05"], flip_prob=1.0, crop_margin=0.0)
+    data.setup("fit")
+    assert data.datasets["val"].with_mask is False  # the front camera alone
+    batch = data.on_after_batch_transfer(next(iter(data.train_dataloader())), 0)
+    assert batch["target_mask"].shape == (2, 1, 40, 64)
+    for name, shown in zip(batch["name"], batch["target_mask"], strict=True):
+        columns = shown[0].mean(0).tolist()  # mirrored, so that the car is at the right
+        assert columns == [1.0] * 48 + [0.0 if "camera_05" in name else 1.0] * 16
     with pytest.raises(DataError, match=r"no mask of CAMERA_05 in scene 000150"):
         module(root, masks=str(tmp_path), test_cameras=["camera_05"]).setup("test")
 

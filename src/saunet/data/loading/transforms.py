@@ -22,8 +22,9 @@ from saunet.errors import DataError
 from saunet.geometry.camera import crop_intrinsics, flip_intrinsics
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
 
-TARGETS: tuple[Literal["target_depth", "target_teacher"], ...] = ("target_depth", "target_teacher")
-"""Depth maps at the size of the frames, which follow crops and flips."""
+Target = Literal["target_depth", "target_teacher", "target_mask"]
+TARGETS: tuple[Target, ...] = ("target_depth", "target_teacher", "target_mask")
+"""Maps at the size of the frames, which follow crops and flips."""
 JITTER = 0.2  # factors of brightness, contrast and saturation are drawn from 1 ± this
 HUE = 0.1  # part of the color circle by which hue turns at most
 

@@ -132,6 +132,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         self.size = (height + margin[0], width + margin[1])
         self.with_depth, self.with_target_depth, self.with_pose = with_depth, with_target_depth, with_pose
         self.stereo, self.odometer, self.maps = stereo, odometer, dict(maps)
+        self.with_mask = any(drive.has_scene_mask for drive in drives)
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -182,8 +183,10 @@ class WindowDataset(Dataset[dict[str, Any]]):
             sample["depth"] = torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32))[None]
         for key, maps in self.maps.items():
             sample[key] = self._sized(maps.read(drive, frame))
-        if self.stereo:
-            sample["T_stereo_tgt"] = torch.from_numpy(np.asarray(T_stereo_tgt, np.float64)).float()
+        if self.with_mask:
+            mask = np.ones(self.size) if drive.scene_mask is None else drive.scene_mask.astype(np.float32)
+            mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+            sample["target_mask"] = torch.from_numpy(np.asarray(mask, np.float32))[None]
         if self.with_pose:
             motion = self._motion(drive, frame)
             motion = np.concatenate([motion, T_stereo_tgt[None]]) if self.stereo else motion

@@ -87,19 +87,22 @@ class DdadDrive(ScannedDrive):
     def depth(self, index: int) -> NDArray[np.float32] | None:
         depth = super().depth(index)
         if depth is not None:
-            depth[(depth > MAX_RANGE) | self._hidden] = 0
+            depth[depth > MAX_RANGE] = 0
+            if self.scene_mask is not None:
+                depth[~self.scene_mask] = 0
         return depth
 
     def depth_key(self, index: int) -> str | None:
         key = super().depth_key(index)
         return (key and self._mask and f"{file_key(self._mask)[:32]}{key[:32]}") or key
 
-    @functools.cached_property
-    def _hidden(self) -> NDArray[np.bool_]:
-        """Where the camera sees its own car, which is black in the mask."""
-        if self._mask is None:
-            return np.zeros(self.native_size, np.bool_)
-        return resize(read_image(self._mask)[..., 0], *self.native_size) < 128
+    @property
+    def has_scene_mask(self) -> bool:
+        return self._mask is not None
+
+    @property
+    def scene_mask(self) -> NDArray[np.bool_] | None:
+        return None if self._mask is None else _read_mask(self._mask, self.native_size)
 
 
 @datamodules.register("ddad")
@@ -111,8 +114,8 @@ class DdadDataModule(FilesDataModule):
         cameras: Cameras to train on, of ``camera_01`` (front), ``camera_05`` to ``camera_09``.
         test_cameras: Cameras to validate and test on.
         masks: Folder of masks, black where a camera sees its own car, as ``CAMERA_05/<scene>/mask.png``,
-            ``<scene>/CAMERA_05_mask.png`` or ``CAMERA_05_mask.png`` for all scenes; there is no depth where they are
-            black. None uses all points.
+            ``<scene>/CAMERA_05_mask.png`` or ``CAMERA_05_mask.png`` for all scenes. What is black has no depth and no
+            photometric loss. None uses everything.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
@@ -151,6 +154,11 @@ class DdadDataModule(FilesDataModule):
     def targets(self, split: str, drive: Drive) -> Sequence[int]:
         assert isinstance(drive, DdadDrive)
         return drive.wanted
+
+
+@functools.lru_cache(maxsize=16)
+def _read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    return resize(read_image(path)[..., 0], *size) >= 128
 
 
 def _find_mask(masks: Path, scene: str, camera: str) -> Path | None:
