@@ -184,9 +184,9 @@ class WindowDataset(Dataset[dict[str, Any]]):
         for key, maps in self.maps.items():
             sample[key] = self._sized(maps.read(drive, frame))
         if self.with_mask:
-            mask = np.ones(self.size) if drive.scene_mask is None else drive.scene_mask.astype(np.float32)
-            mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-            sample["target_mask"] = torch.from_numpy(np.asarray(mask, np.float32))[None]
+            mask = np.ones(self.size, np.bool_) if drive.scene_mask is None else drive.scene_mask
+            shown = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+            sample["target_mask"] = torch.from_numpy(shown)[None]
         if self.with_pose:
             motion = self._motion(drive, frame)
             motion = np.concatenate([motion, T_stereo_tgt[None]]) if self.stereo else motion

@@ -59,16 +59,10 @@ class FilesDrive(Drive):
         condition: str | None = None,
         folder: Path | None = None,
     ) -> None:
-        self._name, self.paths, self.calibrated_K, self.calibration, self._given_size = (
-            name,
-            paths,
-            K,
-            calibration,
-            size,
-        )
+        self._name, self.paths, self._indices = name, paths, sorted(paths)
+        self.calibrated_K, self.calibration, self._given_size = K, calibration, size
         self._times, self._poses = times or {}, poses or {}
         self._camera_height, self._condition, self._folder = camera_height, condition, folder
-        self._indices = sorted(paths)
 
     @property
     def name(self) -> str:

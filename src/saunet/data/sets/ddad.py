@@ -42,7 +42,10 @@ class DdadDrive(ScannedDrive):
     """One camera of one scene; depth from the scanner's points, moved from their moment to the image's."""
 
     def __init__(self, scene: Path, plain: Any, camera: str, masks: Path | None, there: Listing) -> None:
-        folder, paths, poses, times, sizes = scene.parent, {}, {}, {}, set()
+        folder, sizes = scene.parent, set[tuple[int, int]]()
+        paths: dict[int, Path] = {}
+        poses: dict[int, Array] = {}
+        times: dict[int, float] = {}
         scans: dict[int, tuple[Path, Array]] = {}
         with reading(scene, "a scene of DDAD"):
             data = {datum["key"]: datum for datum in plain["data"]}
@@ -170,8 +173,8 @@ def _find_mask(masks: Path, scene: str, camera: str) -> Path | None:
 
 
 def _transform(plain: Any, where: str) -> Array:
-    rotation = [plain["rotation"][key] for key in ("qw", "qx", "qy", "qz")]
-    return transform(rotation, [plain["translation"][key] for key in "xyz"], "wxyz", where)
+    rotation = [plain["rotation"].get(key, 0.0) for key in ("qw", "qx", "qy", "qz")]  # protobuf may leave zeros out
+    return transform(rotation, [plain["translation"].get(key, 0.0) for key in "xyz"], "wxyz", where)
 
 
 def _read_calibration(path: Path, camera: str) -> tuple[Array, Array]:

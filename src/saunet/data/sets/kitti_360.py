@@ -75,7 +75,7 @@ class Kitti360Drive(ScannedDrive):
 
     @functools.cached_property
     def _lens(self) -> Lens | None:
-        return self._camera and Lens(self._camera, *self.recorded_size, what=str(self.folder))
+        return Lens(self._camera, *self.recorded_size, what=str(self.folder)) if self._camera else None
 
     def image(self, index: int) -> NDArray[np.uint8]:
         image, path = read_image(self.path(index)), str(self.path(index))
