@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,8 +155,8 @@ class DdadDataModule(FilesDataModule):
         return [DdadDrive(scene, plain[scene], camera, self.masks, there) for scene in present for camera in cameras]
 
     def targets(self, split: str, drive: Drive) -> Sequence[int]:
-        assert isinstance(drive, DdadDrive)
-        return drive.wanted
+        made = cast(DdadDrive, drive)  # by `drives`
+        return made.wanted
 
 
 @functools.lru_cache(maxsize=16)
