@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from browsing import browser  # noqa: F401 (a fixture)
 from hypothesis import HealthCheck, settings
 
 DATA_ROOT = Path(os.environ.get("SAUNET_TEST_DATA", Path(__file__).parents[1] / ".." / "shared")).resolve()

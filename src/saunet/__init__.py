@@ -37,10 +37,11 @@ if TYPE_CHECKING:
     from saunet.prediction.prediction import Prediction
     from saunet.prediction.predictor import Predictor
     from saunet.prediction.tool import PredictOptions, predict
+    from saunet.reporting.run import Run
     from saunet.reporting.tool import ReportOptions, report
     from saunet.tools.benchmark.tool import BenchmarkOptions, benchmark
     from saunet.tools.calibrate.tool import CalibrateOptions, calibrate
-    from saunet.tools.doctor.tool import DoctorOptions, doctor
+    from saunet.tools.doctor.tool import DoctorOptions, doctor, inspect
     from saunet.tools.prepare.tool import PrepareOptions, prepare
     from saunet.training.tool import TrainOptions, train
 
@@ -48,12 +49,13 @@ __version__ = "0.1.0"
 __all__ = [
     "BenchmarkOptions", "CalibrateOptions", "CheckpointError", "ConfigError", "DataError", "DepthDataModule",
     "DepthMetrics", "DepthNet", "DoctorOptions", "Drive", "EvaluateOptions", "ExportOptions", "ModelOptions",
-    "OdometryOptions", "PredictOptions", "Prediction", "Predictor", "PrepareOptions", "ReportOptions", "SaunetError",
-    "Spec", "TrainOptions", "__version__", "attentions", "automask", "available", "backproject", "benchmark", "build",
-    "calibrate", "combine_sources", "crop_intrinsics", "datamodules", "decoders", "disparity_to_depth", "doctor",
-    "encoders", "evaluate", "export", "flip_intrinsics", "gradient_loss", "invert_pose", "load", "objectives",
-    "odometry", "photometric_error", "pose_matrix", "poses", "predict", "prepare", "project", "report",
-    "scale_intrinsics", "sigmoid_to_disparity", "smoothness_loss", "ssim_loss", "synthesize", "terms", "train",
+    "OdometryOptions", "PredictOptions", "Prediction", "Predictor", "PrepareOptions", "ReportOptions", "Run",
+    "SaunetError", "Spec", "TrainOptions", "__version__", "attentions", "automask", "available", "backproject",
+    "benchmark", "build", "calibrate", "combine_sources", "crop_intrinsics", "datamodules", "decoders",
+    "disparity_to_depth", "doctor", "encoders", "evaluate", "export", "flip_intrinsics", "gradient_loss", "inspect",
+    "invert_pose", "load", "objectives", "odometry", "photometric_error", "pose_matrix", "poses", "predict", "prepare",
+    "project", "report", "scale_intrinsics", "sigmoid_to_disparity", "smoothness_loss", "ssim_loss", "synthesize",
+    "terms", "train",
 ]  # fmt: skip
 __getattr__ = lazily(
     __name__,
@@ -73,10 +75,11 @@ __getattr__ = lazily(
         "prediction.prediction": "Prediction",
         "prediction.predictor": "Predictor",
         "prediction.tool": "PredictOptions predict",
+        "reporting.run": "Run",
         "reporting.tool": "ReportOptions report",
         "tools.benchmark.tool": "BenchmarkOptions benchmark",
         "tools.calibrate.tool": "CalibrateOptions calibrate",
-        "tools.doctor.tool": "DoctorOptions doctor",
+        "tools.doctor.tool": "DoctorOptions doctor inspect",
         "tools.prepare.tool": "PrepareOptions prepare",
         "training.tool": "TrainOptions train",
     },

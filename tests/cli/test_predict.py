@@ -16,7 +16,7 @@ from torch import nn
 import saunet
 from saunet.io.images import read_image
 from saunet.io.video import VideoReader, VideoWriter
-from saunet.prediction.pointcloud import Camera, point_cloud, write_ply
+from saunet.prediction.pointcloud import Camera, point_cloud
 from saunet.runs.checkpoint import atomic_save, build_networks
 from saunet.runs.record import ModelRecord
 
@@ -88,7 +88,7 @@ def test_point_clouds_need_the_camera_and_get_it(
     outcome = tool("predict", *arguments, "camera=[80,80,44.5,29.5]")
     assert outcome.code == 0, outcome.err
     prediction = saunet.load(checkpoint).predict(image)
-    write_ply(tmp_path / "x.ply", point_cloud(prediction, Camera.from_numbers((80, 80, 44.5, 29.5), 60, 90)))
+    point_cloud(prediction, Camera.from_numbers((80, 80, 44.5, 29.5), 60, 90)).save(tmp_path / "x.ply")
     assert (tmp_path / "out" / "a_points.ply").read_bytes() == (tmp_path / "x.ply").read_bytes()
     assert "intrinsics have 3 numbers" in tool("predict", *arguments, "camera=[80,80,44.5]").err
     (tmp_path / "camera.yaml").write_text("image_size: [90, 60]\nK: [80, 80, 44.5, 29.5]\n")

@@ -186,3 +186,19 @@ def test_reading_rows_that_are_none(tmp_path):
     path.write_text(path.read_text().replace(",50,", ",many,"))
     with pytest.raises(DataError, match="not a row of numbers"):
         read_rows(path)
+
+
+def test_worst_images_and_a_plot():
+    found = result(blank=True)
+    worst = found.worst(2)
+    assert [row.cells[0] for row in worst.rows] == ["drive, 2", "drive, 1"]
+    assert worst.rows[0].cells[1] == pytest.approx(0.3)
+    by_a1 = found.worst(1, error="a1", predictor="constant")  # larger is better there
+    assert by_a1.rows[0].cells[0] == "drive, 0"
+    assert "'constant'" in by_a1.title
+    with pytest.raises(ConfigError, match="did you mean 'abs_rel'"):
+        found.worst(error="absrel")
+    assert found.plot()._repr_svg_().lstrip().startswith("<?xml")
+    assert "<table>" in found._repr_html_()
+    with pytest.raises(ConfigError, match="ground truth"):
+        EvaluationResult((protocol("campus"),), ("model",), ()).worst()

@@ -85,6 +85,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "export": {"options": None},
     "flip_intrinsics": {"K": K, "width": 12},
     "gradient_loss": {"prediction": image(), "target": image()},
+    "inspect": {"data": "/nowhere/clips", "frames": 1},
     "invert_pose": {"T": T},
     "load": {"source": "street"},
     "odometry": {"options": None},
@@ -121,6 +122,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "Predictor": {"depth_net": network(), "height": 64, "width": 96},
     "PrepareOptions": {"job": "densify", "root": "/nowhere"},
     "ReportOptions": {},
+    "Run": {"path": "/nowhere/run"},
     "Spec": {"node": {"_target_": "x"}},
     "TrainOptions": {},
 }

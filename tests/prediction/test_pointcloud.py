@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from saunet.errors import ConfigError
-from saunet.prediction.pointcloud import Camera, PointCloud, point_cloud, write_ply
+from saunet.prediction.pointcloud import Camera, PointCloud, point_cloud
 from saunet.prediction.prediction import Prediction
 from saunet.runs.record import Scale
 
@@ -64,7 +64,7 @@ def test_stride_and_edges() -> None:
 def test_ply_round_trip(tmp_path: Path) -> None:
     prediction, camera = ground()
     cloud = point_cloud(prediction, camera)
-    write_ply(tmp_path / "x.ply", cloud)
+    cloud.save(tmp_path / "x.ply")
     header, points, colors = read_ply(tmp_path / "x.ply")
     assert f"element vertex {len(cloud.points)}" in header
     assert "comment unit: meters (scale from construction)" in header
@@ -75,7 +75,7 @@ def test_ply_round_trip(tmp_path: Path) -> None:
 def test_empty_cloud(tmp_path: Path) -> None:
     prediction, camera = ground()
     cloud = point_cloud(prediction, camera, max_depth=0.001)
-    write_ply(tmp_path / "x.ply", cloud)
+    cloud.save(tmp_path / "x.ply")
     assert "element vertex 0" in read_ply(tmp_path / "x.ply")[0]
 
 
@@ -104,7 +104,7 @@ def test_impossible_intrinsics(numbers: tuple[float, ...], message: str) -> None
 def test_refused(tmp_path: Path) -> None:
     prediction, camera = ground()
     with pytest.raises(ConfigError, match=r"must end in \.ply"):
-        write_ply(tmp_path / "x.obj", PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "x"))
+        PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "x").save(tmp_path / "x.obj")
     for settings in ({"stride": 0}, {"max_depth": -1.0}, {"edge": -0.5}):
         with pytest.raises(ConfigError, match=next(iter(settings))):
             point_cloud(prediction, camera, **settings)  # type: ignore[arg-type]

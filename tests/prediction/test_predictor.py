@@ -41,6 +41,24 @@ def test_path_array_and_tensor_agree(predictor: Predictor, picture: Picture, tmp
     assert predictor.predict(tmp_path / "x.png").name == str(tmp_path / "x.png")
 
 
+def test_pil_images_are_read_as_their_files_are(predictor: Predictor, picture: Picture, tmp_path: Path) -> None:
+    pil = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+    rotated = pil.Exif()
+    rotated[0x0112] = 6  # a quarter turn
+    pil.fromarray(picture).save(tmp_path / "turned.png", exif=rotated)
+    deep = pil.fromarray((picture[:, :, 0].astype(np.uint16) << 8) + 255)
+    for image, expected in (
+        (pil.fromarray(picture), picture),
+        (pil.fromarray(picture).convert("P", palette=pil.Palette.ADAPTIVE).convert("RGB").convert("RGBA"), None),
+        (pil.open(tmp_path / "turned.png"), tmp_path / "turned.png"),
+        (deep, np.asarray(deep)),
+    ):
+        depth = predictor.predict(image).depth
+        assert expected is None or np.array_equal(depth, predictor.predict(expected).depth)
+    gray = pil.fromarray(picture[:, :, 0]).convert("1")
+    assert set(np.unique(predictor.predict(gray).image)) <= {0, 255}
+
+
 def test_gray_and_rgba_arrays(predictor: Predictor, picture: Picture) -> None:
     gray = picture[:, :, 0]
     expected = predictor.predict(np.repeat(gray[:, :, None], 3, axis=2)).depth

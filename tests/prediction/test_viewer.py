@@ -6,7 +6,6 @@ import base64
 import itertools
 import json
 import re
-import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -112,22 +111,6 @@ def test_refused_and_nothing_left(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         write_viewer(tmp_path / "x.html", broken(), CAMERA)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.fixture
-def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    binary = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if binary is None:
-        pytest.skip("no Chromium is installed")
-    with playwright.sync_playwright() as started:
-        flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        minutes = 5 * 60_000.0  # on a busy machine everything takes long
-        opened = started.chromium.launch(executable_path=binary, args=flags, timeout=minutes)
-        context = opened.new_context(viewport={"width": 800, "height": 400})
-        context.set_default_timeout(minutes)
-        yield context
-        opened.close()
 
 
 @pytest.mark.slow  # fast, but only the session of the slow tests installs playwright

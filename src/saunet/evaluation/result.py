@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.errors import ConfigError, DataError, one_of
+from saunet.errors import ConfigError, DataError, one_of, positive, require_matplotlib
 from saunet.fingerprint import fingerprint
 from saunet.io.atomic import write_bytes, write_json
 from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
 from saunet.metrics.protocols import Protocol
 from saunet.tables import Row, Table, columns, csv_text, show
+from saunet.tables.drawing import Drawing, colors, new_figure, svg
 
 ERROR_COLUMNS = columns(*(f"{heading}|.3f" for heading in ERROR_HEADINGS))
 
@@ -200,7 +201,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """All rows of an evaluation, with the protocols that they were computed under."""
+    """All rows of an evaluation, with the protocols that they were computed under; a notebook shows the tables."""
 
     protocols: tuple[Protocol, ...]
     predictors: tuple[str, ...]
@@ -356,6 +357,62 @@ class EvaluationResult:
     def table(self) -> Table:
         """The means under the first protocol."""
         return self.tables()[0]
+
+    def worst(self, count: int = 8, error: str = "abs_rel", predictor: str | None = None) -> Table:
+        """Return the images with the largest errors under the first protocol, the worst first.
+
+        Args:
+            count: How many.
+            error: By which, one of `saunet.metrics.functional.ERROR_NAMES`.
+            predictor: Whose errors; the first predictor's by default.
+
+        Returns:
+            A table with a row per image.
+
+        Raises:
+            ConfigError: for a word that is none of those, or if no protocol compares with ground truth.
+        """
+        column = ERROR_NAMES.index(one_of("error", error, ERROR_NAMES))
+        protocol, who = self._compared(), predictor or self.predictors[0]
+        rows = [row for row in self.select(who, protocol.name) if row.pixels]
+        rows.sort(key=lambda row: row.errors[column], reverse=ERROR_COLUMNS[column].better < 0)
+        cells = tuple(Row((row.name, *row.errors, row.pixels)) for row in rows[: int(positive("count", count))])
+        title = f"{protocol.name}: the images with the worst {ERROR_COLUMNS[column].heading} of '{who}'"
+        return Table("worst", title, (*columns("image"), *ERROR_COLUMNS, *columns("pixels")), cells, bold_best=False)
+
+    def plot(self, error: str = "abs_rel") -> Drawing:
+        """Draw the errors of all images from the smallest to the largest, a line per predictor.
+
+        Args:
+            error: Which, one of `saunet.metrics.functional.ERROR_NAMES`.
+
+        Returns:
+            What a notebook shows and `Drawing.save` writes.
+
+        Raises:
+            ConfigError: for a word that is none of those, if matplotlib is missing, or if no protocol compares with
+                ground truth.
+        """
+        column = ERROR_NAMES.index(one_of("error", error, ERROR_NAMES))
+        require_matplotlib("a plot needs", "nothing, and use .table")
+        protocol = self._compared()
+        figure, (axis,) = new_figure(1, 7.6, 3.3)
+        for predictor, tint in zip(self.predictors, colors(len(self.predictors)), strict=True):
+            values = np.sort(self.errors(predictor, protocol.name)[:, column])
+            axis.plot(np.arange(1, len(values) + 1), values, color=tint, label=predictor, drawstyle="steps-mid")
+        axis.set_title(f"{ERROR_COLUMNS[column].heading} of each image, sorted", loc="left", fontsize=10)
+        axis.set_xlabel(f"images under {protocol.name}")
+        axis.legend()
+        return Drawing(svg(figure))
+
+    def _compared(self) -> Protocol:
+        """Return the first protocol that compares with ground truth."""
+        if not self.rows:
+            raise ConfigError("nothing was compared with ground truth, so no image has errors; see .table")
+        return next(rules for rules in self.protocols if any(row.protocol == rules.name for row in self.rows))
+
+    def _repr_html_(self) -> str:
+        return "".join(table.html() for table in self.tables())
 
     def show(self) -> None:
         """Print the tables, those of each source of a mixture, the warnings, and where the files are."""

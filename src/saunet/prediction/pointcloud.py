@@ -29,6 +29,23 @@ class PointCloud:
     colors: UInt8[np.ndarray, "n 3"]
     unit: str
 
+    def save(self, path: str | Path) -> None:
+        """Write a binary PLY file, whole or not at all; MeshLab, CloudCompare and Open3D read it."""
+        if Path(path).suffix.lower() != ".ply":
+            raise ConfigError(f"the point cloud {path} must end in .ply")
+        header = (
+            "ply\nformat binary_little_endian 1.0\n"
+            "comment saunet: camera frame, x right, y down, z forward\n"
+            f"comment unit: {self.unit}\n"
+            f"element vertex {len(self.points)}\n"
+            + "".join(f"property float {axis}\n" for axis in "xyz")
+            + "".join(f"property uchar {color}\n" for color in ("red", "green", "blue"))
+            + "end_header\n"
+        )
+        vertices = np.empty(len(self.points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+        vertices["xyz"], vertices["rgb"] = self.points, self.colors
+        write_bytes(path, header.encode("ascii", "replace") + vertices.tobytes())
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
@@ -98,23 +115,21 @@ def point_cloud(
     return PointCloud(np.ascontiguousarray(points), prediction.image[rows, columns], prediction.unit)
 
 
-def write_ply(path: str | Path, cloud: PointCloud) -> None:
-    """Write a binary PLY file, whole or not at all; MeshLab, CloudCompare and Open3D read it."""
-    path = Path(path)
-    if path.suffix.lower() != ".ply":
-        raise ConfigError(f"the point cloud {path} must end in .ply")
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        "comment saunet: camera frame, x right, y down, z forward\n"
-        f"comment unit: {cloud.unit}\n"
-        f"element vertex {len(cloud.points)}\n"
-        + "".join(f"property float {axis}\n" for axis in "xyz")
-        + "".join(f"property uchar {color}\n" for color in ("red", "green", "blue"))
-        + "end_header\n"
-    )
-    vertices = np.empty(len(cloud.points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    vertices["xyz"], vertices["rgb"] = cloud.points, cloud.colors
-    write_bytes(path, header.encode("ascii", "replace") + vertices.tobytes())
+def camera_of(camera: Camera | Sequence[float | int] | float | int | str | Path, height: int, width: int) -> Camera:
+    """Return the camera of a picture of this size from what a user gives: see `Camera.from_numbers`, or a file."""
+    if isinstance(camera, Camera):
+        return camera
+    if isinstance(camera, str | Path):
+        from saunet.data.video.camera import read_camera
+
+        file = read_camera(str(camera))
+        if not file.is_straight:
+            raise ConfigError(
+                f"camera={camera} describes a lens with distortion, and points need straight images; "
+                "undistort them first, as `saunet predict undistort=FILE` does"
+            )
+        return Camera(file.intrinsics(height, width, "the images"), height, width)
+    return Camera.from_numbers([camera] if isinstance(camera, float | int) else camera, height, width)
 
 
 def jumps(disparity: Float32[np.ndarray, "h w"], fraction: float) -> Bool[np.ndarray, "h w"]:
@@ -161,8 +176,9 @@ class ViewerWriter(Session):
     def add(self, prediction: Prediction) -> None:
         if self.count == 0:
             self._rows = max(1, round(self._width * prediction.depth.shape[0] / prediction.depth.shape[1]))
-            self._page.write(self._before + _json(self._head(prediction)) + self._between)
-        self._page.write(f'<script class="frame" type="application/json">{_json(self._frame(prediction))}</script>\n')
+            self._page.write(self._before + script_json(self._head(prediction)) + self._between)
+        frame = script_json(self._frame(prediction))
+        self._page.write(f'<script class="frame" type="application/json">{frame}</script>\n')
         self.count += 1
 
     def _head(self, prediction: Prediction) -> dict[str, Any]:
@@ -187,18 +203,18 @@ class ViewerWriter(Session):
             keep &= disparity >= 1 / self._max_depth
         if self._edge:
             keep &= ~jumps(disparity, self._edge)
-        low, high = float(disparity.min()), float(disparity.max())
-        # levels 1 (low) to 65535 (high); 0 is left for points that are not shown
-        levels = 1 + np.round(np.clip((disparity - low) / (high - low if high > low else 1.0), 0, 1) * 65534)
         jpeg = encode_jpeg(resize(prediction.image, self._rows, self._width), quality=85)
-        return {
-            "image": base64.b64encode(jpeg).decode(),
-            "disparity": base64.b64encode(np.where(keep, levels, 0).astype("<u2").tobytes()).decode(),
-            "low": low,
-            "high": high,
-        }
+        return {"image": base64.b64encode(jpeg).decode(), **encoded(disparity, keep)}
 
 
-def _json(value: dict[str, Any]) -> str:
+def encoded(disparity: Float32[np.ndarray, "h w"], keep: Bool[np.ndarray, "h w"]) -> dict[str, Any]:
+    """Return disparity as a page takes it: 16-bit levels 1 (``low``) to 65535 (``high``); 0 is not shown."""
+    low, high = float(disparity.min()), float(disparity.max())
+    levels = 1 + np.round(np.clip((disparity - low) / (high - low if high > low else 1.0), 0, 1) * 65534)
+    data = np.where(keep, levels, 0).astype("<u2").tobytes()
+    return {"disparity": base64.b64encode(data).decode(), "low": low, "high": high}
+
+
+def script_json(value: dict[str, Any]) -> str:
     """Return JSON that is safe inside a script element."""
     return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")

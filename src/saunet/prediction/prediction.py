@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -17,18 +17,22 @@ from jaxtyping import Float32, UInt8
 from saunet.errors import CheckpointError, ConfigError, DataError, checked, divisible, positive
 from saunet.io.atomic import write_bytes
 from saunet.io.colormaps import colorize
+from saunet.io.display import display
 from saunet.io.images import as_rgb_bytes, network_input, read_image, write_image
 from saunet.runs.record import Scale
 from saunet.weights.locate import locate
 
+if TYPE_CHECKING:
+    from saunet.prediction.pointcloud import Camera, PointCloud
+
 ImageLike = Any
-"""A path, an h x w x 3 RGB array (bytes; gray, RGBA and 16-bit work too), or a 3 x h x w tensor (bytes or [0, 1])."""
+"""A path, an h x w x 3 RGB array (bytes; gray, RGBA and 16-bit too), a PIL image, or a 3 x h x w tensor."""
 
 
 @checked
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Depth of one image, at that image's size.
+    """Depth of one image, at that image's size; a notebook shows it as a picture beside its depth.
 
     Args:
         depth: Depth along the camera's z axis; see ``unit``.
@@ -41,6 +45,8 @@ class Prediction:
         >>> prediction = saunet.load("last.ckpt").predict("road.png")
         >>> prediction.depth.shape, prediction.color().shape
         ((96, 160), (96, 160, 3))
+        >>> prediction.save("road_depth.html")  # depth under the cursor; .png has colors, .npy the numbers
+        >>> prediction.point_cloud(90).save("road.ply")  # a camera that sees 90 degrees from left to right
     """
 
     depth: Float32[np.ndarray, "h w"]
@@ -63,19 +69,64 @@ class Prediction:
         """Return the disparity as an RGB picture, bright where it is near; see `saunet.io.colormaps.colorize`."""
         return colorize(self.disparity, limits, colormap)
 
+    @property
+    def range(self) -> tuple[float, float]:
+        """Depth that 1 % of the pixels are nearer than, and depth that 1 % are farther than."""
+        low, high = np.quantile(self.depth[np.isfinite(self.depth)], (0.01, 0.99))
+        return float(low), float(high)
+
+    def point_cloud(
+        self, camera: Camera | Sequence[float | int] | float | int | str | Path, max_depth: float | int | None = None
+    ) -> PointCloud:
+        """Return the pixels as colored points in space.
+
+        Args:
+            camera: Where rays go: a camera.yaml; fx, fy, cx, cy in pixels of this image; the nine numbers of K; or one
+                number, the horizontal field of view in degrees.
+            max_depth: Leave out points that are farther, in the unit of ``depth``.
+
+        Returns:
+            The points, n x 3; `PointCloud.save` writes them.
+
+        Raises:
+            ConfigError: if the camera cannot belong to this image.
+            DataError: if camera.yaml cannot be read.
+        """
+        from saunet.prediction.pointcloud import camera_of, point_cloud
+
+        return point_cloud(self, camera_of(camera, *self.depth.shape), max_depth=max_depth)
+
     def save(self, path: str | Path) -> None:
-        """Write the depth as float32 (``.npy``), or the disparity in colors (``.png``, ``.jpg`` and other pictures)."""
-        if Path(path).suffix.lower() == ".npy":
+        """Write depth as float32 (``.npy``), disparity in colors (``.png``, ``.jpg`` ...), or a page (``.html``).
+
+        The page shows image and disparity, and the depth under the cursor; it needs nothing but a browser.
+        """
+        suffix = Path(path).suffix.lower()
+        if suffix == ".npy":
             buffer = io.BytesIO()
             np.save(buffer, self.depth)
             write_bytes(path, buffer.getvalue())
+        elif suffix == ".html":
+            from saunet.prediction.page import depth_page
+
+            write_bytes(path, depth_page(self).encode())
         else:
             write_image(path, self.color())
 
+    def show(self) -> None:
+        """Show image and disparity in the notebook; elsewhere open the page of `save` in the browser."""
+        from saunet.prediction.page import depth_page
+
+        display(self, lambda: depth_page(self))
+
     def _repr_png_(self) -> bytes:
-        """Show image and disparity where a notebook displays the prediction."""
         pair = np.concatenate([self.image, self.color()], axis=0)
         return bytes(cv2.imencode(".png", cv2.cvtColor(pair, cv2.COLOR_RGB2BGR))[1].tobytes())
+
+    def _repr_html_(self) -> str:
+        from saunet.prediction.page import depth_figure
+
+        return depth_figure(self)
 
 
 def unit_of(scale: Scale | None) -> str:
@@ -126,7 +177,8 @@ class ImagePredictor(abc.ABC):
         """Predict the depth of one image.
 
         Args:
-            image: A path, an h x w x 3 RGB array of bytes, or a 3 x h x w tensor (bytes, or floats in [0, 1]).
+            image: A path, an h x w x 3 RGB array of bytes, a PIL image, or a 3 x h x w tensor (bytes, or floats in
+                [0, 1]).
             name: What to call it; the path by default.
 
         Raises:
@@ -175,7 +227,7 @@ class ImagePredictor(abc.ABC):
 
 
 def as_image(image: ImageLike) -> UInt8[np.ndarray, "h w 3"]:
-    """Return RGB bytes from a path, an array or a tensor."""
+    """Return RGB bytes from a path, an array, a PIL image or a tensor."""
     if isinstance(image, str | Path):
         return read_image(image)
     if isinstance(image, np.ndarray):
@@ -184,8 +236,13 @@ def as_image(image: ImageLike) -> UInt8[np.ndarray, "h w 3"]:
                 f"the image array has shape {image.shape}; arrays are h x w x 3, use image.transpose(1, 2, 0)"
             )
         return as_rgb_bytes(image, "the image array")
+    if hasattr(image, "getbands"):  # a PIL image, of which Pillow made the class
+        from PIL import ImageOps
+
+        image = ImageOps.exif_transpose(image)  # as files are read
+        return as_rgb_bytes(np.asarray(image if image.mode.startswith("I;16") else image.convert("RGB")), "the image")
     if not hasattr(image, "detach"):
-        raise DataError(f"an image is a path, an array or a tensor, got {type(image).__name__}")
+        raise DataError(f"an image is a path, an array, a PIL image or a tensor, got {type(image).__name__}")
     values = image.detach().cpu().numpy()
     if values.ndim != 3 or values.shape[0] != 3:
         raise DataError(f"the image tensor has shape {tuple(values.shape)}; tensors are 3 x h x w, one image a tensor")

@@ -27,7 +27,7 @@ from saunet.io.plain import read_json
 from saunet.io.progress import bar
 from saunet.io.video import VideoWriter
 from saunet.prediction.panel import fit, label
-from saunet.prediction.pointcloud import Camera, ViewerWriter, point_cloud, write_ply
+from saunet.prediction.pointcloud import Camera, ViewerWriter, point_cloud
 from saunet.prediction.prediction import ImagePredictor, Prediction
 from saunet.prediction.sources import Frame
 
@@ -115,7 +115,7 @@ def write_output(output: str, folder: Path, stem: str, result: Prediction, style
         result.save(paths[1])
     else:
         assert style.camera is not None  # the options have asked for it
-        write_ply(paths[0], point_cloud(result, style.camera, max_depth=style.max_depth))
+        point_cloud(result, style.camera, max_depth=style.max_depth).save(paths[0])
     return paths
 
 

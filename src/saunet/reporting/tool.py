@@ -92,6 +92,9 @@ class ReportResult:
     folder: Path | None = None
     """Where the files were written."""
 
+    def _repr_html_(self) -> str:
+        return "".join(table.html() for table in self.tables)
+
     def show(self) -> None:
         """Print a comparison, or where the page is and what it lacks."""
         if self.document is None:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from saunet.io.atomic import replacing
+from saunet.errors import ConfigError
+from saunet.io.atomic import replacing, write_bytes
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7b6fd0", "#444444")
 """Okabe and Ito's colors, which color-blind readers can tell apart, the yellow left out on white paper."""
@@ -28,6 +29,22 @@ class Point:
     setting: str = ""
     """How it was timed."""
     published: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """A drawing that a notebook shows."""
+
+    svg: bytes
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a file that ends in ``.svg``."""
+        if Path(path).suffix.lower() != ".svg":
+            raise ConfigError(f"the drawing {path} must end in .svg")
+        write_bytes(path, self.svg)
+
+    def _repr_svg_(self) -> str:
+        return self.svg.decode()
 
 
 def new_figure(panels: int, width: float, height: float, **options: Any) -> tuple[Any, list[Any]]:

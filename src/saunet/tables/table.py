@@ -191,6 +191,8 @@ class Table:
         kinds = ["number" if self.numeric(index) else "text" for index in range(len(self.columns))]
         return rendered("tables/table.html", table=self, kinds=kinds)
 
+    _repr_html_ = html
+
     def csv(self) -> str:
         """Return the table as CSV: numbers in full, columns for the group and the note where there are any."""
         grouped, noted = any(row.group for row in self.rows), any(row.note for row in self.rows)

@@ -11,11 +11,13 @@ from clip_tree import CAMERA, frames, make_clip, make_video
 from kitti_tree import make_drive, name
 from tiny import Wall
 
+import saunet
 from saunet.data.kitti import splits
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.selecting import read_manifest, write_manifest
 from saunet.data.loading.stored import CacheSettings
 from saunet.data.loading.windows import Selection
+from saunet.errors import ConfigError
 from saunet.io.video import VideoReader
 from saunet.registry import datamodules
 from saunet.tools.doctor.findings import diagnose, manifest_of
@@ -277,3 +279,20 @@ def test_different_recordings_of_one_name_are_kept_apart(tmp_path):
     assert len(found.frames) == found.known == 12
     assert "error: 'clip' is the name of different recordings" in text
     assert not manifest_of(found, findings, tmp_path / "m.json").leave_out
+
+
+def test_inspect_writes_nothing_and_takes_a_folder_a_name_or_a_spec(tmp_path, monkeypatch):
+    make_clip(tmp_path / "r", "a", frames(6, 5))
+    monkeypatch.chdir(tmp_path)
+    settings = {"workers": 0, "frames_cache": str(tmp_path / "cache"), "val_share": 0.3}
+    found = saunet.inspect(tmp_path / "r", frames=4, **settings)
+    assert found.survey.judged == 4
+    assert found.usable
+    assert found._repr_png_().startswith(b"\x89PNG")
+    assert "manifest" not in str(found)
+    spec = saunet.Spec.of("data", "video", root=str(tmp_path / "r"), **settings)
+    assert saunet.inspect(spec, frames=4).survey.fingerprints == found.survey.fingerprints
+    with pytest.raises(ConfigError, match="did you mean 'synthetic_tiny'"):
+        saunet.inspect("synthetic_tyny")
+    assert not list(tmp_path.glob("*.json"))
+    assert not list(tmp_path.glob("*.png"))

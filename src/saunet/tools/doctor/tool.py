@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
 
 from saunet.data.loading.selecting import Manifest, write_manifest
 from saunet.errors import ConfigError, checked, one_of, positive
 from saunet.io.atomic import check_folder
 from saunet.io.images import write_image
 from saunet.io.progress import bar
-from saunet.registry import Spec
+from saunet.registry import Spec, datamodules
 from saunet.tools.doctor.findings import Finding, diagnose, manifest_of
 from saunet.tools.doctor.sheet import draw_sheet
 from saunet.tools.doctor.survey import SPLITS, Survey, survey
@@ -33,8 +38,8 @@ class DoctorOptions:
 
     data: Spec
     """The data module, with the settings of the training to come."""
-    output_dir: str
-    """Folder for ``doctor.png`` and ``manifest.json``."""
+    output_dir: str | None = None
+    """Folder for ``doctor.png`` and ``manifest.json``; None, as in Python, writes none."""
     splits: Sequence[str] = SPLITS
     """Which of ``train``, ``val`` and ``test``."""
     frames: int = 1000
@@ -50,7 +55,7 @@ class DoctorOptions:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What `doctor` found; ``print`` shows the findings and what to do about them."""
+    """What `doctor` found; ``print`` shows the findings and what to do about them, a notebook the pictures too."""
 
     survey: Survey
     """Everything that was measured."""
@@ -58,8 +63,10 @@ class Diagnosis:
     """What is wrong or noteworthy, errors first."""
     manifest: Manifest
     """Frames that a training should leave out, as written to ``manifest.json``."""
-    sheet: Path
-    """The sheet of pictures."""
+    picture: UInt8[np.ndarray, "_ _ 3"] = field(repr=False)
+    """Frames, charts and findings on one sheet, RGB."""
+    sheet: Path | None = None
+    """Its file."""
 
     @property
     def usable(self) -> bool:
@@ -73,13 +80,16 @@ class Diagnosis:
 
     def __str__(self) -> str:
         found, path = self.survey, self.manifest.path
-        lines = [*map(str, self.findings), f"pictures: {self.sheet}"]
-        if found.judged:
+        lines = [*map(str, self.findings), *([f"pictures: {self.sheet}"] if self.sheet else [])]
+        if found.judged and self.sheet:
             left_out = sum(len(frames) for reasons in self.manifest.leave_out.values() for frames in reasons.values())
             judged = "all" if found.judged == found.known else f"{found.judged} of {found.known}; frames=0 judges all"
             lines.append(f"manifest: {path} names {left_out} frames to leave out (judged: {judged})")
             lines.append(f"train with data.manifest={path}")
         return "\n".join(lines)
+
+    def _repr_png_(self) -> bytes:
+        return bytes(cv2.imencode(".png", cv2.cvtColor(self.picture, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
 def doctor(options: DoctorOptions, *, advance: Callable[[int, int], None] | None = None) -> Diagnosis:
@@ -102,16 +112,48 @@ def doctor(options: DoctorOptions, *, advance: Callable[[int, int], None] | None
         >>> diagnosis.usable
         True
     """
-    folder = check_folder(options.output_dir)
+    folder = None if options.output_dir is None else check_folder(options.output_dir)
     data = options.data.build()
     with bar() as shown:
         task = shown.add_task("reading frames", total=None)
         progress = advance or (lambda done, total: shown.update(task, completed=done, total=total))
         found = survey(data, options.splits, options.frames, progress)
     findings = diagnose(found)
-    manifest = manifest_of(found, findings, folder / "manifest.json")
+    manifest = manifest_of(found, findings, (folder or Path()) / "manifest.json")
     title = f"saunet doctor: {type(data).__name__}{f' at {data.root}' if data.root else ''}"
-    sheet = folder / "doctor.png"
+    picture = draw_sheet(found, findings, title)
+    if folder is None:
+        return Diagnosis(found, findings, manifest, picture)
     write_manifest(manifest.path, manifest)
-    write_image(sheet, draw_sheet(found, findings, title))
-    return Diagnosis(found, findings, manifest, sheet)
+    write_image(folder / "doctor.png", picture)
+    return Diagnosis(found, findings, manifest, picture, folder / "doctor.png")
+
+
+def inspect(data: str | Path | Spec, *, frames: int = 200, **settings: Any) -> Diagnosis:
+    """Look at a data set: frames, how much they move, the camera, and what is wrong; nothing is written.
+
+    Args:
+        data: A folder of clips or a video, a data module's name (one of ``available("data")``), or its `Spec`.
+        frames: Frames to read at most, evenly spread; 0 reads all.
+        **settings: Parameters of the data module, such as ``root="/data/kitti/raw"``.
+
+    Returns:
+        The findings; a notebook shows them with pictures.
+
+    Raises:
+        ConfigError: for a path that is not there, or parameters that do not fit the data module.
+
+    Examples:
+        >>> found = saunet.inspect("synthetic_tiny", frames=4)
+        >>> found.usable
+        True
+    """
+    if not isinstance(data, Spec):
+        path = Path(data)
+        known = str(data) in datamodules.names()
+        if not known and not path.exists():
+            one_of("data", str(data), datamodules.names())
+        data = Spec.of("data", str(data), **settings) if known else Spec.of("data", "video", root=str(data), **settings)
+    else:
+        data = data.changed(**settings)
+    return doctor(DoctorOptions(data=data, frames=frames))
