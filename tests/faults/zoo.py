@@ -106,6 +106,7 @@ GOOD: dict[str, dict[str, Any]] = {
         "T_src_tgt": T[:, None].repeat(1, 2, 1, 1),
     },
     "train": {"options": None},
+    "watch": {"options": None},
     "BenchmarkOptions": {},
     "CalibrateOptions": {},
     "DepthDataModule": {},
@@ -125,6 +126,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "Run": {"path": "/nowhere/run"},
     "Spec": {"node": {"_target_": "x"}},
     "TrainOptions": {},
+    "WatchOptions": {"run": "/nowhere/run"},
 }
 """Arguments that can work (but for ``options``, which are only given wrong)."""
 MORE = {

@@ -42,6 +42,8 @@ export checkpoint: write a checkpoint as files to deploy or share, each checked 
 report runs*: one page of tables, curves and pictures from finished runs; how runs differ
     report outputs/train
     report compare outputs/train/A outputs/train/B
+watch run: a running or finished training or sweep in the browser: curves, pictures, health
+    watch outputs/train/2026-01-31_12-00-00
 benchmark: parameters, FLOPs, time and memory of networks
     benchmark models=[sau_net,street]
     benchmark model/encoder=resnet18 sizes=192x640,320x1024

@@ -100,8 +100,9 @@ class Document:
         return figures + [picture for tile in tiles for picture in (tile.picture, *tile.zooms)]
 
 
-def as_html(document: Document) -> str:
-    return rendered("reporting/page.html", page=document)
+def as_html(document: Document, live: float | None = None) -> str:
+    """Return the page as HTML; with ``live`` it fetches itself again every so many seconds."""
+    return rendered("reporting/page.html", page=document, live=live)
 
 
 def as_markdown(document: Document) -> str:

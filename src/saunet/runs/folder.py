@@ -77,6 +77,7 @@ class RunRecord:
             "versions": versions(),
             "git": git_state(),
             "splits": {},
+            "samples": {},
             "choices": {},
             "overrides": [],
             "protocol": None,

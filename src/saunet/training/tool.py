@@ -240,6 +240,7 @@ def train(
         "overrides": list(overrides),
         "protocol": options.protocol or data.protocol,
         "splits": data.fingerprints(),
+        "samples": {split: data.summary(split) for split in data.datasets},
         "resumed": resume,
     }
     with locked(folder):
