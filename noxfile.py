@@ -64,6 +64,19 @@ def old_runtime(session: nox.Session) -> None:
 
 
 @nox.session
+def app(session: nox.Session) -> None:
+    """Run the tests of ``saunet app``: Gradio wants older versions of some pinned packages, constraints-app.txt."""
+    own = (ROOT / "constraints-app.txt").read_text().splitlines()
+    names = {line.partition("==")[0] for line in own}
+    pins = (ROOT / "constraints.txt").read_text().splitlines()
+    file = Path(session.create_tmp()) / "constraints.txt"
+    file.write_text("\n".join([*own, *(line for line in pins if line.partition("==")[0] not in names)]))
+    session.install("-c", str(file), next(line for line in pins if line.startswith("torch==")))
+    session.install("-c", str(file), "-e", ".[dev,app,browser]")
+    session.run("pytest", "-m", "not gpu", "tests/tools/app", *session.posargs)
+
+
+@nox.session
 def ddp(session: nox.Session) -> None:
     """Run the tests that start several processes."""
     install(session, "-e", ".[dev]")

@@ -90,7 +90,19 @@ ALLOWED: dict[str, set[str]] = {
         "tools",
         "__version__",
     },
-    "tools": {"errors", "registry", "threads", "io", "tables", "models", "data", "prediction", "published"},
+    "tools": {
+        "errors",
+        "registry",
+        "threads",
+        "io",
+        "tables",
+        "models",
+        "data",
+        "prediction",
+        "published",
+        "scale",
+        "weights",
+    },
 }
 # third-party package -> the rooms that may import it
 THIRD_PARTY: dict[str, set[str]] = {

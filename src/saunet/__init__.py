@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from saunet.reporting.run import Run
     from saunet.reporting.tool import ReportOptions, report
     from saunet.reporting.watch import WatchOptions, watch
+    from saunet.tools.app.tool import AppOptions, app
     from saunet.tools.benchmark.tool import BenchmarkOptions, benchmark
     from saunet.tools.calibrate.tool import CalibrateOptions, calibrate
     from saunet.tools.doctor.tool import DoctorOptions, doctor, inspect
@@ -48,15 +49,15 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
-    "BenchmarkOptions", "CalibrateOptions", "CheckpointError", "ConfigError", "DataError", "DepthDataModule",
-    "DepthMetrics", "DepthNet", "DoctorOptions", "Drive", "EvaluateOptions", "ExportOptions", "ModelOptions",
-    "OdometryOptions", "PredictOptions", "Prediction", "Predictor", "PrepareOptions", "ReportOptions", "Run",
-    "SaunetError", "Spec", "TrainOptions", "WatchOptions", "__version__", "attentions", "automask", "available",
-    "backproject", "benchmark", "build", "calibrate", "combine_sources", "crop_intrinsics", "datamodules", "decoders",
-    "disparity_to_depth", "doctor", "encoders", "evaluate", "export", "flip_intrinsics", "gradient_loss", "inspect",
-    "invert_pose", "load", "objectives", "odometry", "photometric_error", "pose_matrix", "poses", "predict", "prepare",
-    "project", "report", "scale_intrinsics", "sigmoid_to_disparity", "smoothness_loss", "ssim_loss", "synthesize",
-    "terms", "train", "watch",
+    "AppOptions", "BenchmarkOptions", "CalibrateOptions", "CheckpointError", "ConfigError", "DataError",
+    "DepthDataModule", "DepthMetrics", "DepthNet", "DoctorOptions", "Drive", "EvaluateOptions", "ExportOptions",
+    "ModelOptions", "OdometryOptions", "PredictOptions", "Prediction", "Predictor", "PrepareOptions", "ReportOptions",
+    "Run", "SaunetError", "Spec", "TrainOptions", "WatchOptions", "__version__", "app", "attentions", "automask",
+    "available", "backproject", "benchmark", "build", "calibrate", "combine_sources", "crop_intrinsics", "datamodules",
+    "decoders", "disparity_to_depth", "doctor", "encoders", "evaluate", "export", "flip_intrinsics", "gradient_loss",
+    "inspect", "invert_pose", "load", "objectives", "odometry", "photometric_error", "pose_matrix", "poses", "predict",
+    "prepare", "project", "report", "scale_intrinsics", "sigmoid_to_disparity", "smoothness_loss", "ssim_loss",
+    "synthesize", "terms", "train", "watch",
 ]  # fmt: skip
 __getattr__ = lazily(
     __name__,
@@ -79,6 +80,7 @@ __getattr__ = lazily(
         "reporting.run": "Run",
         "reporting.tool": "ReportOptions report",
         "reporting.watch": "WatchOptions watch",
+        "tools.app.tool": "AppOptions app",
         "tools.benchmark.tool": "BenchmarkOptions benchmark",
         "tools.calibrate.tool": "CalibrateOptions calibrate",
         "tools.doctor.tool": "DoctorOptions doctor inspect",

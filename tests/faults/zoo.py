@@ -71,6 +71,7 @@ MODEL = {
     "pose": saunet.Spec.of("pose", "posecnn"),
 }
 GOOD: dict[str, dict[str, Any]] = {
+    "app": {"options": None},
     "automask": {"error": image(), "identity": image()},
     "available": {"kind": "encoder"},
     "backproject": {"depth": image(), "K": K},
@@ -107,6 +108,7 @@ GOOD: dict[str, dict[str, Any]] = {
     },
     "train": {"options": None},
     "watch": {"options": None},
+    "AppOptions": {},
     "BenchmarkOptions": {},
     "CalibrateOptions": {},
     "DepthDataModule": {},

@@ -32,6 +32,9 @@ train: train a depth network on driving video
 predict input: depth of an image, a folder, a video or a camera, as pictures, points and videos
     predict road.png output=out
     predict drive.mp4 checkpoint=last.ckpt output=out outputs=[mp4,html] camera=[90]
+app checkpoints*: a page in the browser: drop a picture or a video, see its depth
+    app
+    app last.ckpt port=8000
 evaluate checkpoint: score a checkpoint, or predictions made elsewhere
     evaluate last.ckpt data=kitti data.root=/data/kitti/raw
     evaluate predictions=maps data=kitti
