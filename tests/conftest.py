@@ -10,14 +10,21 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import enforcement
 import numpy as np
 import pytest
 import torch
 from browsing import browser  # noqa: F401 (a fixture)
+from hydra.core.config_store import ConfigStore
 from hypothesis import HealthCheck, settings
 
 DATA_ROOT = Path(os.environ.get("SAUNET_TEST_DATA", Path(__file__).parents[1] / ".." / "shared")).resolve()
 
+
+enforcement.install()
+
+# Hydra copies all that it has in store for every composition, though it copies each node that it gives as well.
+ConfigStore.__deepcopy__ = lambda store, memo: store  # type: ignore[attr-defined]
 
 # Every run tries the same examples, however slow the machine: `pytest --hypothesis-profile=default` looks for new ones.
 settings.register_profile(
@@ -43,6 +50,12 @@ def _plain_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     for name in ("LINES", "FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
         monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Switch the shape and type checks of the tests off, to see what a user sees, or where calls are too many."""
+    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)
 
 
 @pytest.fixture(autouse=True)
@@ -76,7 +89,8 @@ def logging_as_it_was() -> Iterator[None]:
                 logger.removeHandler(handler)
                 handler.close()
             logger.handlers[:], logger.propagate, logger.disabled = handlers, propagate, disabled
-            logger.setLevel(level)
+            if logger.level != level:  # setting one goes through all loggers there are
+                logger.setLevel(level)
 
 
 def _loggers() -> list[logging.Logger]:

@@ -297,8 +297,8 @@ def test_what_is_missing_is_one_sentence(tmp_path):
         ({"crop": [0.5, 0.6, 0.0, 0.0]}, "crop is"),
         ({"fps": 0.0}, "fps is 0"),
         ({"parallax": -1.0}, "parallax is -1"),
-        ({"static": "flow"}, "static is 'flow'|parameter 'static'"),
-        ({"on_error": "ignore"}, "on_error is 'ignore'|parameter 'on_error'"),
+        ({"static": "flow"}, "static is 'flow'|parameter static="),
+        ({"on_error": "ignore"}, "on_error is 'ignore'|parameter on_error="),
         ({"val_share": 2.0}, "val_share is 2"),
     ],
 )

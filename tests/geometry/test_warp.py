@@ -137,6 +137,7 @@ def test_sources_do_not_mix() -> None:
         assert torch.equal(together.valid[:, s : s + 1], alone.valid)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_gradcheck() -> None:
     images = smooth_image(1, 2, 5, 6).double().contiguous().requires_grad_()
     depth = (torch.rand(1, 1, 5, 6, dtype=torch.float64) * 2 + 3).requires_grad_()

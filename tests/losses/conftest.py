@@ -58,12 +58,6 @@ def assemble(batch: dict[str, Any], sigmoid: Sequence[Tensor], axisangle: Tensor
 
 
 @pytest.fixture
-def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Switch the shape and type checks of the tests off, to see what a user sees."""
-    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)
-
-
-@pytest.fixture
 def make_inputs() -> Callable[..., Inputs]:
     def make(
         batch: int = 2,

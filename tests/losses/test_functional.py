@@ -109,6 +109,7 @@ def test_lapdepths_weighting_is_a_line(load: Callable[[str], dict[str, Tensor]],
 # --- derivatives -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_gradcheck_photometric() -> None:
     warped, target = double(1, 2, 3, 4, 5).requires_grad_(), double(1, 1, 3, 4, 5).requires_grad_()
     assert torch.autograd.gradcheck(ssim_loss, (warped, target))

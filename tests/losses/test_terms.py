@@ -77,6 +77,7 @@ def test_photometric_teaches_depth_at_every_scale_and_motion(name: str, make_inp
 
 
 @every_term
+@pytest.mark.usefixtures("unchecked")
 def test_gradcheck(name: str, options: dict[str, Any], make_inputs: Make) -> None:
     if options.get("domain") == "aligned":
         pytest.skip("the median ratio is held fixed by design; see test_gradient.py")

@@ -247,5 +247,5 @@ def test_recordings_that_do_not_fit_are_one_sentence(drive: SyntheticDrive, tmp_
         write_raw(tmp_path, [drive, SyntheticDrive(seed=1, frames=1, height=32, width=96)])
     with pytest.raises(ConfigError, match="one right for each left"):
         write_raw(tmp_path, [drive], right=[])
-    with pytest.raises((ConfigError, TypeCheckError), match=r"image_format is 'bmp'|parameter 'image_format'"):
+    with pytest.raises((ConfigError, TypeCheckError), match=r"image_format is 'bmp'|parameter image_format="):
         write_raw(tmp_path, [drive], image_format="bmp")  # type: ignore[arg-type]

@@ -99,6 +99,7 @@ def test_tokens_of_other_windows_have_no_influence() -> None:
     assert not reached[:, 4:].any()
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_gradcheck() -> None:
     layer = make(window=2, shift=1, dim=4)
     x = torch.randn(1, 3, 4, 4, dtype=torch.double, requires_grad=True)
