@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import python
 
 Tool = Callable[..., Any]
 
 
 def run(tmp_path: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "saunet", "benchmark", f"hydra.run.dir={tmp_path}/out", *overrides]
-    return subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path)
+    return python("-m", "saunet", "benchmark", f"hydra.run.dir={tmp_path}/out", *overrides, cwd=tmp_path)
 
 
 def test_models_are_measured_side_by_side(tmp_path: Path) -> None:

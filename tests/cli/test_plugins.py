@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from processes import python
 
 from saunet import plugins
 from saunet.errors import ConfigError
@@ -47,9 +46,7 @@ QUICK = ("experiment=smoke", "model/encoder=mine", "model.encoder.width=4", "mod
 
 
 def _saunet(*words: str, folder: Path, code: int = 0) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", "saunet", *words], cwd=folder, capture_output=True, text=True, timeout=600, check=False
-    )
+    done = python("-m", "saunet", *words, cwd=folder)
     assert done.returncode == code, done.stderr[-3000:]
     return done.stdout + done.stderr
 

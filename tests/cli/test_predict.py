@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from processes import python
 from torch import nn
 
 import saunet
@@ -167,9 +168,10 @@ def test_one_picture_does_not_import_the_trainer(checkpoint: Path, image: Path, 
         "trainer = ('lightning', 'torchmetrics', 'kornia', 'scipy', 'matplotlib', 'saunet.losses', 'saunet.data')\n"
         "print([name for name in trainer if name in sys.modules])"
     )
-    arguments = [sys.executable, "-c", code, "predict", f"checkpoint={checkpoint}", "input=a.png", "output=out"]
-    for more in ("overwrite=false", "overwrite=true"):  # the first may have to make the table of all keys
-        result = subprocess.run([*arguments, more], capture_output=True, text=True, cwd=tmp_path, check=True)
+    arguments = ["-c", code, "predict", f"checkpoint={checkpoint}", "input=a.png", "output=out"]
+    python(*arguments, cwd=tmp_path)  # which may have to make the table of all keys
+    command = [sys.executable, *arguments, "overwrite=true"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=True)
     assert result.stdout.splitlines()[-1] == "[]"
 
 
@@ -283,10 +285,7 @@ class TestBadInput:
         for how in ("full", "interrupt"):
             out = tmp_path / how
             arguments = [f"checkpoint={checkpoint}", f"input={input_}", f"output={out}", "outputs=[npy,html]"]
-            result = subprocess.run(
-                [sys.executable, "-c", code, how, "predict", *arguments, "camera=[90]"],
-                capture_output=True, text=True, cwd=tmp_path, check=False,
-            )  # fmt: skip
+            result = python("-c", code, how, "predict", *arguments, "camera=[90]", cwd=tmp_path)
             assert "Traceback" not in result.stderr
             if how == "full":
                 assert result.returncode == 1

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import python
 
 from saunet.cli import app, table
 from saunet.cli.table import TOOLS
@@ -48,14 +48,14 @@ def test_a_trained_run_becomes_a_page(smoke_run: Path, tmp_path: Path, monkeypat
 def test_a_run_with_a_folder_of_its_own_is_one_run_that_knows_itself(tool: Any, tmp_path: Path) -> None:
     outcome = tool(
         "train",
-        *("experiment=smoke", "logger=default", "callbacks.pictures=null", "model/encoder=resnet18"),
+        *("experiment=smoke", "logger=default", "callbacks.pictures=null", "model/encoder=lite_mono_tiny"),
         *("model/pose=posecnn", "output_dir=runs/mine"),
     )
     assert outcome.code == 0, outcome.err
     assert not (tmp_path / "outputs").exists()
     (read,) = collect([tmp_path / "runs" / "mine"]).runs
     assert (read.path, read.component("model/encoder"), read.overrides["model/pose"]) == (
-        tmp_path / "runs" / "mine", "resnet18", "posecnn",
+        tmp_path / "runs" / "mine", "lite_mono_tiny", "posecnn",
     )  # fmt: skip
     (score,) = read.scores
     assert (score.data, score.protocol) == ("synthetic_tiny, validation split", "synthetic")
@@ -82,8 +82,7 @@ def test_mistakes_are_one_sentence(
 
 def test_scenes_that_are_no_images(tmp_path: Path) -> None:
     """In a process of its own: here the type checker of the tests would speak first."""
-    command = [sys.executable, "-m", "saunet", "report", "scenes=3", "."]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = python("-m", "saunet", "report", "scenes=3", ".", cwd=tmp_path)
     assert done.returncode == 1
     assert "scenes is 3 (int); it must be str | Sequence[str] | Mapping[str, " in done.stderr
     assert "Traceback" not in done.stderr

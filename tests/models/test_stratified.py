@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import copy
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
 import torch
 import torch.nn.functional as F
+from processes import python
 
 from saunet.errors import ConfigError
 from saunet.models.encoders.stratified import StratifiedTransformer
@@ -109,7 +108,7 @@ from saunet.models.encoders.stratified import StratifiedTransformer
 
 torch.manual_seed(0)
 encoder = StratifiedTransformer(dim=8, depths=(2,), heads=(1,), window=(5,)).eval()
-compiled = torch.compile(encoder, fullgraph=True, backend="aot_eager")
+compiled = torch.compile(encoder, fullgraph=True, backend=BACKEND)
 for shape in ((1, 3, 16, 24), (3, 3, 16, 24), (1, 3, 16, 32)):
     image = torch.rand(shape)
     for grad in (False, True) if shape == (1, 3, 16, 24) else (False,):
@@ -128,9 +127,10 @@ with torch.no_grad():
 """
 
 
-def test_compiles_as_one_graph_for_any_batch_and_size_and_traces() -> None:
+@pytest.mark.parametrize("backend", ["eager", pytest.param("aot_eager", marks=pytest.mark.slow)])
+def test_compiles_as_one_graph_for_any_batch_and_size_and_traces(backend: str) -> None:
     # in a process of its own: the shape checks that run under pytest cannot be traced
-    done = subprocess.run([sys.executable, "-c", COMPILE], capture_output=True, text=True, timeout=600)
+    done = python("-c", COMPILE.replace("BACKEND", repr(backend)))
     assert done.returncode == 0, done.stderr
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from predicting import run
+from processes import python
 from videos import write_video
 
 from saunet.errors import ConfigError, DataError
@@ -183,7 +182,8 @@ class TestUnfinished:
             "except DataError as error:\n    print(error)\n"
         )
         target = tmp_path / "x.mp4"
-        result = subprocess.run([sys.executable, "-c", code, str(target)], capture_output=True, text=True, check=True)
+        result = python("-c", code, str(target))
+        assert result.returncode == 0, result.stderr
         assert f"{target}" in result.stdout
         assert "disk full" in result.stdout or "space" in result.stdout
         assert list(tmp_path.iterdir()) == []

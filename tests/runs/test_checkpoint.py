@@ -6,14 +6,13 @@ import dataclasses
 import json
 import os
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from processes import python
 from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, ConfigError
@@ -283,7 +282,8 @@ class TestAtomicSave:
             "except CheckpointError as error:\n    print(error)\n"
         )
         target = tmp_path / "x.ckpt"
-        result = subprocess.run([sys.executable, "-c", code, str(target)], capture_output=True, text=True, check=True)
+        result = python("-c", code, str(target))
+        assert result.returncode == 0, result.stderr
         assert f"cannot write {target}" in result.stdout
         assert list(tmp_path.iterdir()) == []
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 import torch
+from processes import python
 from training_options import train_options
 
 from saunet.errors import ConfigError
@@ -34,9 +35,7 @@ SMOKE = (
 
 
 def _run(tool: str, folder: Path, *overrides: str) -> str:
-    command = [sys.executable, "-m", "saunet", tool, *overrides, f"hydra.run.dir={folder}"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=900, env=environment, check=False)
+    done = python("-m", "saunet", tool, *overrides, f"hydra.run.dir={folder}", env=ENVIRONMENT)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stderr
 
@@ -72,8 +71,7 @@ def test_spawned_processes_are_refused_with_the_reason(config: dict[str, Any]) -
 
 
 def test_a_sweep_over_processes_is_refused_with_the_ways_out(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "saunet.cli.train", "--multirun", *SMOKE, *TWO, "seed=1,2"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path, check=False)
+    done = python("-m", "saunet.cli.train", "--multirun", *SMOKE, *TWO, "seed=1,2", cwd=tmp_path)
     assert done.returncode == 1
     assert "start each training with a command of its own" in done.stderr
     assert "Traceback" not in done.stderr
@@ -108,8 +106,7 @@ CURVE = Path(__file__).parents[1] / "helpers" / "ddp_curve.py"
 
 
 def _train(folder: Path, *arguments: int) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(CURVE), str(folder), *(str(int(each)) for each in arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=900, env=ENVIRONMENT, check=False)
+    return python(str(CURVE), str(folder), *(str(int(each)) for each in arguments), env=ENVIRONMENT)
 
 
 def _curve(folder: Path, processes: int) -> dict[str, Any]:

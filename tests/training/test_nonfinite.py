@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +11,7 @@ import pytest
 import tiny
 import torch
 from lightning import Callback, LightningModule, Trainer
+from processes import python
 
 from saunet.errors import SaunetError
 from saunet.training.callbacks import LastCheckpoint
@@ -179,14 +178,7 @@ def test_of_accumulated_batches_the_spoiled_one_is_named(
 def test_of_two_processes_the_spoiled_one_is_named_and_nothing_broken_is_saved(action: str, tmp_path: Path) -> None:
     script = Path(__file__).parents[1] / "helpers" / "ddp_nonfinite.py"
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, str(script), str(tmp_path), action],
-        capture_output=True,
-        text=True,
-        timeout=900,
-        env=environment,
-        check=False,
-    )
+    done = python(str(script), str(tmp_path), action, env=environment)
     innocent, spoiled = ((tmp_path / f"names_{rank}").read_text() for rank in (0, 1))
     assert innocent != spoiled
     named = f"the loss became NaN or infinite at step 3 (batch of process 1: {spoiled}; kept as "

@@ -14,6 +14,7 @@ import pytest
 import tiny
 import torch
 from lightning import Callback, LightningModule, Trainer
+from processes import python
 from training_options import train_options
 
 from saunet.errors import CheckpointError, ConfigError
@@ -241,7 +242,7 @@ def test_a_writer_that_dies_midway_leaves_the_previous_checkpoint(tmp_path: Path
         "atomic_save({'epoch': 2}, path)\n"
     )
     path = tmp_path / "last.ckpt"
-    done = subprocess.run([sys.executable, "-c", code, str(path)], check=False, capture_output=True)
+    done = python("-c", code, str(path))
     assert done.returncode == 9
     assert torch.load(path, weights_only=True) == {"epoch": 1}
 

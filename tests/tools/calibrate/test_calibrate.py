@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import cv2
 import numpy as np
 import pytest
 from board_views import SIZE, K, views
+from processes import python
 
 import saunet
 from saunet.data.video.camera import CameraFile, read_camera, write_camera
@@ -64,8 +62,7 @@ def test_a_fisheye_is_calibrated_on_the_command_line(tmp_path):
     save(tmp_path / "pictures", pictures)
 
     def calibrated(*overrides):
-        command = [sys.executable, "-m", "saunet", "calibrate", "input=pictures", *overrides]
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+        return python("-m", "saunet", "calibrate", "input=pictures", *overrides, cwd=tmp_path)
 
     done = calibrated("lens=fisheye")
     assert done.returncode == 0, done.stderr
