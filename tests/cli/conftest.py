@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
 import pytest
+from rendered import share_renderings
 
 from saunet.cli import app
 from saunet.synthetic import SyntheticDrive
@@ -38,6 +40,7 @@ class Outcome:
 
 
 Tool = Callable[..., Outcome]
+SMOKE = ("experiment=smoke", "model/pose=posecnn")
 
 
 def run_tool(name: str, *overrides: str, folder: Path) -> Outcome:
@@ -57,6 +60,13 @@ def run_tool(name: str, *overrides: str, folder: Path) -> Outcome:
     return Outcome(code, out.getvalue(), err.getvalue())
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _rendered_once() -> Iterator[None]:
+    """Let equal synthetic drives share their worlds and frames: each tool renders what one before it has rendered."""
+    with share_renderings():
+        yield
+
+
 @pytest.fixture
 def tool(tmp_path: Path) -> Tool:
     """Run a tool in an empty folder: ``tool("train", "experiment=smoke").code``."""
@@ -69,16 +79,22 @@ def tool(tmp_path: Path) -> Tool:
 
 @pytest.fixture(scope="session")
 def smoke_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run folder of one finished smoke experiment."""
+    """The run folder of one finished smoke experiment, with a pose network whose checkpoint is soon written."""
     folder = tmp_path_factory.mktemp("smoke")
-    outcome = run_tool("train", "experiment=smoke", folder=folder)
+    outcome = run_tool("train", *SMOKE, folder=folder)
     assert outcome.code == 0, outcome.err
     return next((folder / "outputs" / "smoke").iterdir())
 
 
+@pytest.fixture(scope="session")
+def written_raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("written") / "raw"
+    write_raw(root, [SyntheticDrive(seed=seed, frames=6, height=64, width=96) for seed in (1, 2)])
+    return root
+
+
 @pytest.fixture
-def raw_root(tmp_path: Path) -> Path:
-    """Two short synthetic drives on disk in KITTI's raw layout."""
-    drives = [SyntheticDrive(seed=seed, frames=6, height=64, width=96) for seed in (1, 2)]
-    write_raw(tmp_path / "raw", drives)
+def raw_root(written_raw: Path, tmp_path: Path) -> Path:
+    """Two short synthetic drives on disk in KITTI's raw layout, which the test may spoil."""
+    shutil.copytree(written_raw, tmp_path / "raw")
     return tmp_path / "raw"

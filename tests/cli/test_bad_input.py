@@ -32,6 +32,7 @@ class Absent:
 KITTI = (
     "experiment=selfsup",
     "model=sau_net_nano",
+    "model/pose=posecnn",
     "trainer=smoke",
     "data=kitti",
     "data.split=all",
@@ -162,13 +163,14 @@ def test_an_unreadable_checkpoint(
 
 def test_a_checkpoint_of_another_model_cannot_be_resumed(tool: Tool, smoke_run: Path) -> None:
     last = smoke_run / "checkpoints" / "last.ckpt"
-    outcome = tool("train", "experiment=smoke", "model/encoder=resnet18", f"resume={last}")
+    outcome = tool("train", "experiment=smoke", "model/encoder=lite_mono_tiny", "model/pose=posecnn", f"resume={last}")
     outcome.says("checkpoint of another model, the depth network does not fit")
 
 
 def test_a_resumed_run_with_other_settings(tool: Tool, smoke_run: Path) -> None:
     last = smoke_run / "checkpoints" / "last.ckpt"
-    tool("train", "experiment=smoke", "data.width=128", f"resume={last}").says("width 96 and this run has 128")
+    outcome = tool("train", "experiment=smoke", "model/pose=posecnn", "data.width=128", f"resume={last}")
+    outcome.says("width 96 and this run has 128")
 
 
 def test_an_empty_drive(tool: Tool, raw_root: Path) -> None:

@@ -21,6 +21,7 @@ Tool = Callable[..., Any]
 TINY = (
     "experiment=selfsup",
     "model=sau_net_nano",
+    "model/pose=posecnn",
     "trainer=smoke",
     "logger=none",
     "data=video",
@@ -92,7 +93,7 @@ def test_a_video_of_a_real_drive_goes_all_the_way(tool: Tool, kitti_mini: Path, 
     assert depth.shape == (126, 414)
     assert np.isfinite(depth).all()
     scored = tool(
-        "evaluate", "checkpoint=run/checkpoints/last.ckpt", *TINY[4:7], "data.root=campus", "output_dir=results"
+        "evaluate", "checkpoint=run/checkpoints/last.ckpt", *TINY[5:8], "data.root=campus", "output_dir=results"
     )
     assert scored.code == 0, scored.err
     assert "campus" in scored.out
@@ -164,8 +165,7 @@ def test_data_sets_are_mixed_by_config(tool: Tool, raw_root: Path, tmp_path: Pat
         "data.batch_size=2",
     )
     outcome = tool(
-        "train", "experiment=selfsup", "model=sau_net_nano", "trainer=smoke", "logger=none", *mixture, "data.height=64",
-        "data.width=96", "output_dir=run",
+        "train", *TINY[:5], *mixture, "data.height=64", "data.width=96", "output_dir=run",
     )  # fmt: skip
     assert outcome.code == 0, outcome.err
     outcome = tool("evaluate", "checkpoint=run/checkpoints/last.ckpt", *mixture, "output_dir=results")

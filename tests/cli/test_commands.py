@@ -19,6 +19,7 @@ from saunet.tools.prepare.tool import kitti_recordings
 
 Tool = Callable[..., Any]
 SMALL = ("data.height=64", "data.width=96", "data.batch_size=2", "data.workers=0", "trainer=smoke")
+NANO = ("experiment=selfsup", "model=sau_net_nano", "model/pose=posecnn")
 KITTI = ("data=kitti", "data.split=all", "data.val_drives=[2011_09_26_drive_0002_sync]", "data.cameras=[left]")
 
 
@@ -48,7 +49,8 @@ def test_the_record_says_what_was_trained(smoke_run: Path) -> None:
 
 def test_resume_goes_on_from_the_last_checkpoint(tool: Tool, smoke_run: Path) -> None:
     last = smoke_run / "checkpoints" / "last.ckpt"
-    outcome = tool("train", "experiment=smoke", f"resume={last}", "trainer.max_epochs=2", "output_dir=again")
+    more = ("model/pose=posecnn", f"resume={last}", "trainer.max_epochs=2", "output_dir=again")
+    outcome = tool("train", "experiment=smoke", *more)
     assert outcome.code == 0, outcome.err
     assert read_checkpoint(last).epoch == 0
 
@@ -86,9 +88,7 @@ def test_predict_writes_pictures_that_match_the_library(tool: Tool, smoke_run: P
 
 
 def test_the_kitti_path_from_disk(tool: Tool, raw_root: Path, tmp_path: Path) -> None:
-    outcome = tool(
-        "train", "experiment=selfsup", "model=sau_net_nano", *KITTI, f"data.root={raw_root}", *SMALL, "output_dir=run"
-    )
+    outcome = tool("train", *NANO, *KITTI, f"data.root={raw_root}", *SMALL, "output_dir=run")
     assert outcome.code == 0, outcome.err
     outcome = tool(
         "evaluate",
@@ -126,7 +126,7 @@ def test_any_encoder_decoder_objective_can_be_swapped(tool: Tool, decoder: str, 
     outcome = tool(
         "train",
         "experiment=smoke",
-        "model/encoder=resnet18",
+        "model/encoder=lite_mono_tiny",
         f"model/decoder={decoder}",
         "model/pose=posecnn",
         f"objective={objective}",

@@ -21,7 +21,8 @@ from saunet.runs.sweep import summary
 from saunet.training.stopping import GracefulStop
 
 Tool = Callable[..., Any]
-QUICK = ("experiment=smoke", "logger=none", "callbacks.pictures=null", "model/encoder=resnet18", "model/pose=posecnn")
+SMALL = ("model/encoder=lite_mono_tiny", "model/pose=posecnn")
+QUICK = ("experiment=smoke", "logger=none", "callbacks.pictures=null", *SMALL)
 
 
 def record(folder: Path) -> dict[str, Any]:
@@ -161,7 +162,7 @@ def test_an_interrupted_sweep_names_the_jobs_that_never_started(
 
 def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
     last = smoke_run / "checkpoints" / "last.ckpt"
-    again = ("experiment=smoke", "logger=none", "callbacks.pictures=null", "trainer.limit_train_batches=1")
+    again = ("experiment=smoke", "logger=none", "callbacks.pictures=null", "trainer.limit_train_batches=1", SMALL[1])
     outcome = tool("train", *again, f"init_from={last}", "optim.lr=1e-5", "output_dir=warm")
     assert outcome.code == 0, outcome.err
     assert "starting from" in outcome.out

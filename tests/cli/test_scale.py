@@ -274,7 +274,13 @@ def test_speeds_of_other_drives_are_one_sentence(tool: Tool, checkpoint: Path, t
 @pytest.mark.parametrize("offsets", ["[]", "[-1,1]"])
 def test_stereo_trainings_are_config_swaps(tool: Tool, offsets: str, tmp_path: Path) -> None:
     outcome = tool(
-        "train", "experiment=smoke", "data.stereo=true", f"data.offsets={offsets}", "logger=none", "output_dir=run"
+        "train",
+        "experiment=smoke",
+        "model/pose=posecnn",
+        "data.stereo=true",
+        f"data.offsets={offsets}",
+        "logger=none",
+        "output_dir=run",
     )
     assert outcome.code == 0, outcome.err
     record = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt").record

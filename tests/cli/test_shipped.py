@@ -44,7 +44,8 @@ def test_evaluate_and_odometry(tool: Tool, street: Path, tmp_path: Path) -> None
 
 
 def test_init_from(tool: Tool, street: Path) -> None:
-    outcome = tool("train", "experiment=smoke", "init_from=street", "trainer.limit_train_batches=1", "output_dir=warm")
+    settings = ("model/pose=posecnn", "trainer.limit_train_batches=1", "output_dir=warm")
+    outcome = tool("train", "experiment=smoke", "init_from=street", *settings)
     assert outcome.code == 0, outcome.err
     assert "starting from street: all" in outcome.out
 

@@ -1,0 +1,29 @@
+"""Synthetic drives rendered once a test run, for tests of what is done with them."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+from saunet.synthetic import SyntheticDrive
+
+
+@contextlib.contextmanager
+def share_renderings() -> Iterator[None]:
+    """Let drives with equal settings share what they have generated and rendered, which is equal too."""
+    checked, known = SyntheticDrive.__post_init__, dict[Any, SyntheticDrive]()
+
+    def shared(drive: SyntheticDrive) -> None:
+        checked(drive)
+        settings = tuple(getattr(drive, each.name) for each in dataclasses.fields(drive) if each.init)
+        first = known.setdefault(settings, drive)
+        drive._frames, drive.__dict__["world"] = first._frames, first.world
+        drive.__dict__["travel"] = first.travel
+
+    SyntheticDrive.__post_init__ = shared  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        SyntheticDrive.__post_init__ = checked  # type: ignore[method-assign]
