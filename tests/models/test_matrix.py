@@ -6,13 +6,12 @@ networks are those registered, not smaller ones.
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from networks import assert_all_have_gradients, assert_pickles, settle
+from processes import python
 from torch import nn
 
 import saunet
@@ -23,15 +22,15 @@ HEIGHT, WIDTH = 64, 96
 HALF_TOLERANCE = 0.03
 """How far sigmoid disparity under bfloat16 autocast may be from float32, where the range is (0, 1)."""
 FEW = (
-    "stratified_nano+aunet+eca",
     "stratified_nano+lite_mono",
+    "lite_mono_tiny+packnet",
     "resnet18+unet",
     "resnet18+unet_narrow",
     "resnet18+aunet+se",
-    "lite_mono_tiny+packnet",
-    "lite_mono_tiny+aunet+cbam",
-    "lite_mono_tiny+aunet+gct",
-    "lite_mono_tiny+aunet+none",
+    "resnet18+aunet+eca",
+    "resnet18+aunet+cbam",
+    "resnet18+aunet+gct",
+    "resnet18+aunet+none",
 )
 
 
@@ -70,7 +69,7 @@ def check(net: DepthNet, image: torch.Tensor) -> None:
 def compile_networks(backend: str, *names: str) -> None:
     """Compile networks in a process of its own: the compiler cannot look into the tests' type checker."""
     program = Path(__file__).parents[1] / "helpers" / "compile_networks.py"
-    done = subprocess.run([sys.executable, str(program), backend, *names], capture_output=True, text=True, timeout=3600)
+    done = python(str(program), backend, *names, timeout=3600)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == list(names)
 

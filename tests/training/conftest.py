@@ -38,8 +38,8 @@ def config() -> dict[str, Any]:
         "name": "test",
         "seed": 0,
         "model": {
-            "encoder": plain_node("encoder", "resnet18"),
-            "decoder": plain_node("decoder", "aunet"),
+            "encoder": plain_node("encoder", "resnet18", blocks=[1, 1, 1, 1]),
+            "decoder": plain_node("decoder", "aunet", width=8, fine=4),
             "pose": plain_node("pose", "posecnn"),
             "min_depth": 0.1,
             "max_depth": 100.0,
