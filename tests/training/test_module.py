@@ -59,7 +59,7 @@ def test_training_brings_the_loss_down(
     trainer = make_trainer(max_epochs=1, limit_val_batches=1)
     trainer.validate(model, walls, verbose=False)
     before = float(trainer.callback_metrics["val/loss"])
-    trainer = make_trainer(max_epochs=8)
+    trainer = make_trainer(max_epochs=8, check_val_every_n_epoch=8)
     trainer.fit(model, walls)
     assert float(trainer.callback_metrics["val/loss"]) < 0.8 * before
     assert float(trainer.callback_metrics["val/images"]) == 6
@@ -96,14 +96,14 @@ def test_a_resumed_training_equals_the_uninterrupted_one_bit_for_bit(
     torch.manual_seed(0)
     model = assemble(train_options(config), walls)
     twin = copy.deepcopy(model)
-    straight = make_trainer(max_epochs=3)
-    straight.fit(model, walls)
+    make_trainer = partial(make_trainer, max_epochs=3, limit_train_batches=2, limit_val_batches=1)
+    make_trainer().fit(model, walls)
 
     stop = [ModelCheckpoint(tmp_path, save_last=True), StopAfterTwoEpochs()]
-    make_trainer(max_epochs=3, callbacks=stop, enable_checkpointing=True).fit(twin, copy.deepcopy(walls))
+    make_trainer(callbacks=stop, enable_checkpointing=True).fit(twin, copy.deepcopy(walls))
     torch.manual_seed(99)  # what happened in between must not matter
     resumed = assemble(train_options(config), walls)
-    make_trainer(max_epochs=3).fit(resumed, copy.deepcopy(walls), ckpt_path=tmp_path / "last.ckpt", weights_only=True)
+    make_trainer().fit(resumed, copy.deepcopy(walls), ckpt_path=tmp_path / "last.ckpt", weights_only=True)
     expected, got = _weights(model), _weights(resumed)
     assert expected.keys() == got.keys()
     assert all(torch.equal(expected[name], got[name]) for name in expected)
