@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import gc
 import importlib
 import itertools
 import json
@@ -90,6 +91,7 @@ def preload() -> None:
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
     compose.register_configs()
+    gc.freeze()  # or else the children's collector would write to, and so copy, all memory that they share
 
 
 def start(words: Sequence[str], folder: Path, moment: int | None = None) -> int:
@@ -424,7 +426,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=20, help="of each tool, fewer of those that take long")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="tools whose names begin so")
+    parser.add_argument("--only", default=[""], nargs="+", help="tools whose names begin so")
     parser.add_argument("--keep", help="a folder for what is wrong; by default one that is removed")
     given = parser.parse_args(arguments)
     if given.keep:
@@ -437,7 +439,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     make_data(_fresh(top / "data"))
     wrong = 0
     for job in jobs(top / "data"):
-        if not job.name.startswith(given.only):
+        if not job.name.startswith(tuple(given.only)):
             continue
         begin, used = time.monotonic(), sum(os.times()[:4])
         tally = Tally()

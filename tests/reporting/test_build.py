@@ -90,6 +90,16 @@ def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path:
         assert (tmp_path / "report" / reference).is_file()
 
 
+def test_what_looked_sick_in_training_is_in_the_report(tmp_path: Path) -> None:
+    said = "the predicted depth is flat, the same at every pixel"
+    runs = [
+        make_run(tmp_path / "well", status="finished"),
+        make_run(tmp_path / "sick", status="finished", health={"x": said}),
+    ]
+    assert said in as_html(build(collect(runs)))
+    assert "looked sick" not in as_html(build(collect(runs[:1])))
+
+
 def test_the_page_fetches_nothing(everything: list[Path], picture: Path) -> None:
     page = as_html(build(collect(everything), ReportOptions(scenes={"kitti": str(picture)})))
     links = re.findall(r"""(?<![-\w])(?:src|href)=["']?([^"'\s>]+)""", page)

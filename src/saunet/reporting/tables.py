@@ -109,6 +109,15 @@ def explained_table(runs: Mapping[str, Run]) -> Table | None:
     )
 
 
+def health_tables(runs: Mapping[str, Run]) -> list[Table]:
+    """Return what looked sick while runs were trained, in the words of their records; nothing if nothing did."""
+    marks = {name: run.record.get("health") for name, run in runs.items()}
+    rows = [
+        Row((name, str(said))) for name, found in marks.items() if isinstance(found, Mapping) for said in found.values()
+    ]
+    return [Table("health", "What looked sick in training", columns("Run", "Finding"), tuple(rows))] if rows else []
+
+
 def detail_tables(runs: Mapping[str, Run]) -> list[Table]:
     """Return where the errors of runs are, and their scores of edges and point clouds, as far as they were measured."""
     kinds = {

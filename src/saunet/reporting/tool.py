@@ -182,7 +182,7 @@ def build(
     sections = [
         Section("Accuracy", (table1, *((explained,) if explained else ()), *tables.detail_tables(everyone)), intro),
         Section("Networks", (table2, table3)),
-        Section("Runs", _runs(groups, draw, missing)),
+        Section("Runs", [*_runs(groups, draw, missing), *tables.health_tables(everyone)]),
     ]
     if draw:
         curves = [figure for group in groups for figure in _curves(group, missing)]

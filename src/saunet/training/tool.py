@@ -253,6 +253,8 @@ def train(
                 keep_rows(logger, steps, due)
             if resume or started:
                 print(f"resuming from {resume}" if resume else started)
+            if due and 0 <= trainer.max_steps <= steps:
+                print("the validation after the last step was cut short; saunet evaluate makes up for it")
             try:
                 trainer.fit(model, datamodule=data, ckpt_path=resume, weights_only=True)
             except RuntimeError as error:
