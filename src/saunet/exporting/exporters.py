@@ -87,7 +87,10 @@ def _lower_to_17(model: Any) -> bool:
     import onnx
     import onnx_ir
 
-    new = {"Resize": {"antialias": 0, "keep_aspect_ratio_policy": "stretch"}, "Reduce": {"noop_with_empty_axes": 0}}
+    new: dict[str, dict[str, Any]] = {
+        "Resize": {"antialias": 0, "keep_aspect_ratio_policy": "stretch"},
+        "Reduce": {"noop_with_empty_axes": 0},
+    }
     for node in model.graph.all_nodes():
         kind = node.op_type
         if node.domain or onnx.defs.get_schema(kind, 18).since_version < 18:

@@ -69,11 +69,11 @@ _MODULE = 1000
 """Numbers that take as much memory as one module without any: a list of a hundred thousand layers is large too."""
 
 
-class _Counted(TorchDispatchMode):
+class _Counted(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Refuses to make tensors of more numbers together than it was given, before memory is asked for."""
 
     def __init__(self, numbers: int) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.numbers = self.left = numbers
 
     def count(self, numbers: int) -> None:

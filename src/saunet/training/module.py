@@ -272,5 +272,5 @@ class SelfSupervisedDepth(LightningModule):
         if trainer is None or trainer.state.fn != TrainerFn.FITTING or not trainer.training:
             return False
         loop, fetcher = trainer.fit_loop.epoch_loop, trainer.fit_loop._data_fetcher
-        done = loop.batch_progress.current
+        done: Any = loop.batch_progress.current
         return fetcher is not None and done.completed < done.processed and loop._should_check_val_fx(fetcher)
