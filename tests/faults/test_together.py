@@ -33,7 +33,7 @@ def picture(seed: int) -> NDArray[np.uint8]:
 def test_two_preparations_at_once_are_refused_or_correct(job: str, tmp_path: Path) -> None:
     make_tree(tmp_path / "raw")
     size = {"height": 40, "width": 64} if job == "cache" else {}
-    how = {"job": job, "root": tmp_path / "raw", "workers": 0, **size}
+    how = {"job": job, "root": str(tmp_path / "raw"), "workers": 0, **size}
     prepare(PrepareOptions(**how, folder=str(tmp_path / "one")))  # type: ignore[arg-type]
     words = [job, f"root={how['root']}", "folder=two", "workers=0", *(f"{key}={value}" for key, value in size.items())]
     command = [sys.executable, "-m", "saunet", "prepare", *words]
