@@ -84,6 +84,20 @@ def ddp(session: nox.Session) -> None:
 
 
 @nox.session
+def timm(session: nox.Session) -> None:
+    """Run the tests of encoders with timm, beside the newest PyTorch that its torchvision goes with."""
+    session.install("torch==2.14.1", "torchvision==0.29.1")
+    pins = [
+        line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith(("torch", "triton"))
+    ]
+    with tempfile.NamedTemporaryFile("w", suffix=".txt") as others:
+        others.write("\n".join(pins))
+        others.flush()
+        session.install("-c", others.name, "-e", ".[dev,timm]")
+    session.run("pytest", "tests/models", "tests/weights", *session.posargs, env={"OMP_NUM_THREADS": "1"})
+
+
+@nox.session
 def lint(session: nox.Session) -> None:
     """Check style and formatting."""
     session.install("-c", str(ROOT / "constraints.txt"), "ruff")

@@ -29,7 +29,7 @@ ALLOWED: dict[str, set[str]] = {
     "data": {"errors", "registry", "schema", "threads", "types", "io", "fingerprint", "geometry", "synthetic"},
     "synthetic": {"errors", "io", "data"},
     "runs": {"plugins", "errors", "io", "registry", "metrics", "models", "__version__"},
-    "weights": {"errors", "io", "runs"},
+    "weights": {"errors", "io", "registry", "runs"},
     "scale": {"errors", "lazy", "types", "io", "geometry", "runs", "weights"},
     "training": {
         "plugins",

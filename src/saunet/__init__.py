@@ -145,8 +145,9 @@ def load(source: Any = DEFAULT, *, device: str = "cpu", flip: bool = False, keep
 
     Args:
         source: A checkpoint, a folder or ``model.onnx`` written by ``saunet export``, the name of a model that comes
-            with saunet (one of ``available("weights")``), or a model on the Hugging Face hub
-            (``hf://organization/name``).
+            with saunet (one of ``available("weights")``), a model on the Hugging Face hub
+            (``hf://organization/name``), or a file or folder of Monodepth2, ManyDepth, Lite-Mono, SC-Depth, slowtv or
+            packnet-sfm.
         device: Where to run, such as ``"cpu"`` or ``"cuda"``.
         flip: Average with the prediction of the mirrored image.
         keep_aspect: Feed each image at its own aspect ratio.
@@ -155,7 +156,7 @@ def load(source: Any = DEFAULT, *, device: str = "cpu", flip: bool = False, keep
         A `saunet.prediction.Predictor`, or for ONNX a `saunet.exporting.onnx.OnnxPredictor`, which does without torch.
 
     Raises:
-        CheckpointError: if it is missing, broken, or not a saunet model.
+        CheckpointError: if it is missing, broken, or not a model that saunet has.
         ConfigError: if a package is missing or the device does not exist.
 
     Examples:

@@ -15,7 +15,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
-from networks import small_network
+from networks import buildable_encoders, small_network
 from numpy.typing import NDArray
 from processes import python
 from torch import Tensor
@@ -319,7 +319,7 @@ def test_networks_export_to_onnx(node: Node, encoder: str, decoder: str, record:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("decoder", decoders.names())
-@pytest.mark.parametrize("encoder", encoders.names())
+@pytest.mark.parametrize("encoder", buildable_encoders())
 def test_every_pair_exports_to_onnx(
     node: Node, encoder: str, decoder: str, record: ModelRecord, tmp_path: Path
 ) -> None:

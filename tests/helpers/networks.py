@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import pickle
 from typing import Any
@@ -27,6 +28,11 @@ def small_network(encoder: str, decoder: str) -> DepthNet:
     """Return the depth network of two registered parts, small, for evaluation."""
     tiny = TINY.get(encoders.entry(encoder).target.__name__, {})
     return DepthNet(encoders.build(encoder, **tiny), decoders.partial(decoder)).eval()
+
+
+def buildable_encoders() -> list[str]:
+    """Return the names of encoders, timm's where its package can be imported: the session ``timm`` has it."""
+    return [name for name in encoders.names() if name != "timm" or importlib.util.find_spec("timm")]
 
 
 def assert_all_have_gradients(module: nn.Module) -> None:

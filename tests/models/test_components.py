@@ -6,7 +6,7 @@ from functools import cache
 
 import pytest
 import torch
-from networks import assert_all_have_gradients, assert_pickles
+from networks import assert_all_have_gradients, assert_pickles, buildable_encoders
 
 import saunet
 from saunet.registry import attentions, decoders, encoders, poses
@@ -22,10 +22,10 @@ def _features(name: str) -> tuple[FeatureSpec, ...]:
 
 
 def _distinct_features() -> list[tuple[FeatureSpec, ...]]:
-    return list(dict.fromkeys(_features(name) for name in saunet.available("encoder")))
+    return list(dict.fromkeys(_features(name) for name in buildable_encoders()))
 
 
-@pytest.mark.parametrize("name", saunet.available("encoder"))
+@pytest.mark.parametrize("name", buildable_encoders())
 def test_encoder(name):
     encoder = encoders.build(name)
     # PackNet's 3D convolutions take seconds an image.

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from networks import assert_all_have_gradients, assert_pickles, settle
+from networks import assert_all_have_gradients, assert_pickles, buildable_encoders, settle
 from processes import python
 from torch import nn
 
@@ -91,7 +91,7 @@ def test_a_few_compile_to_one_graph() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("encoder", saunet.available("encoder"))
+@pytest.mark.parametrize("encoder", buildable_encoders())
 def test_all(encoder: str) -> None:
     image = torch.rand(2, 3, HEIGHT, WIDTH)
     network = settle(encoders.build(encoder), image)
@@ -103,7 +103,7 @@ def test_all(encoder: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("encoder", saunet.available("encoder"))
+@pytest.mark.parametrize("encoder", buildable_encoders())
 def test_all_compile_to_one_graph(encoder: str) -> None:
     compile_networks("eager", *(f"{encoder}+{head}" for head in heads()))
 
@@ -115,6 +115,6 @@ def test_compiled_code_gives_the_same_numbers_with_every_head(name: str) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("encoder", saunet.available("encoder"))
+@pytest.mark.parametrize("encoder", buildable_encoders())
 def test_compiled_code_gives_the_same_numbers_with_every_encoder(encoder: str) -> None:
     compile_networks("inductor", f"{encoder}+aunet+eca")

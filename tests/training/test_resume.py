@@ -7,6 +7,7 @@ import random
 import signal
 import subprocess
 import sys
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -204,6 +205,14 @@ def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Pa
     atomic_save({"saunet": model.record, "state_dict": {"depth.x": torch.zeros(1)}}, tmp_path / "b.ckpt")
     with pytest.raises(CheckpointError, match=r"nothing of .*b\.ckpt fits the depth network"):
         warm_start(other, tmp_path / "b.ckpt")
+
+
+def test_a_warm_start_says_what_else_makes_depth_differ(model: Any, tmp_path: Path, config: Any, walls: Any) -> None:
+    record = deepcopy(model.record)
+    record["model"]["encoder"]["normalization"] = "imagenet"
+    atomic_save({"saunet": record, "state_dict": model.state_dict()}, tmp_path / "a.ckpt")
+    said = warm_start(model, tmp_path / "a.ckpt")
+    assert "its encoder has normalization imagenet and here monodepth2, so the same weights give other depths" in said
 
 
 def test_a_warm_start_from_a_shipped_model(

@@ -166,7 +166,10 @@ def count(kind: str, name: str) -> str:
         late: dict[str, object] = {"channels": 64} if "channels" in owner.late else {}
         if "features" in owner.late:
             late["features"] = registry("encoder").build("stratified_tiny").features
-        network = owner.build(name, **late)
+        try:
+            network = owner.build(name, **late)
+        except ConfigError:  # of a package that is not installed
+            return "?"
     number = count_parameters(network)
     return f"{number / 1e6:.2f} M" if number > 9999 else str(number)
 

@@ -7,15 +7,18 @@ grow exponentially, damaged headers. What the system refuses (no such file, no r
 from __future__ import annotations
 
 import ast
+import contextlib
 import errno
 import io
 import json
 import math
 import pickle
+import re
 import struct
 import tokenize
 import zipfile
 import zlib
+from collections import OrderedDict
 from collections.abc import Hashable, Iterator
 from pathlib import Path
 from typing import Any
@@ -163,25 +166,60 @@ def read_arrays(
         raise error(f"{path} cannot be read as a .npz file of numbers ({_excerpt(reason)})") from reason
 
 
-def read_torch(path: Path, what: str) -> Any:
-    """Return what ``torch.save`` wrote, on the CPU: plain containers, numbers, text and tensors."""
+class StandIn:
+    """Takes the place of an object in a file whose class is not ours to run: its state as data, and nothing else."""
+
+    def __init__(self, *_: object) -> None:
+        self.state: Any = {}
+
+    def __new__(cls, *_: object) -> StandIn:
+        made = super().__new__(cls)
+        made.state = {}
+        return made
+
+    def __setstate__(self, state: object) -> None:
+        self.state = state
+
+
+_MAPPINGS = ("AttributeDict", "CfgNode", "ConfigDict", "EasyDict", "defaultdict")
+"""Names of classes that are pickled as dictionaries."""
+_STAND_INS = 100
+"""Classes that a file may name."""
+
+
+def read_torch(path: Path, what: str, *, stand_ins: bool = False) -> Any:
+    """Return what ``torch.save`` wrote, on the CPU: plain containers, numbers, text and tensors.
+
+    With ``stand_ins``, objects of any class become a `StandIn` or a dictionary, and calls in the file make one too:
+    other systems pickle their settings beside the weights. Nothing of theirs is imported or run either way.
+    """
     import torch
 
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except MemoryError:
-        raise
-    except pickle.UnpicklingError as reason:
-        if any(mark in str(reason) for mark in ("GLOBAL", "Unsupported class", "Trying to")):
-            raise CheckpointError(
-                f"{path} holds pickled objects, which could run code when read, so it is refused; "
-                "save plain containers and tensors only, as saunet train does"
-            ) from reason
-        raise CheckpointError(f"{path} is not {what}, or is damaged; copy it again") from reason
-    except OSError as reason:
-        raise CheckpointError(f"cannot read {path}: {reason.strerror or reason}") from reason
-    except Exception as reason:  # the unpickler trusts what it reads: a broken file can raise anything
-        raise CheckpointError(f"{path} is damaged or truncated and cannot be read; copy it again") from reason
+    known: dict[str, type] = {}
+    while True:
+        try:
+            allowed = [(kind, name) for name, kind in known.items()]
+            with torch.serialization.safe_globals(allowed) if allowed else contextlib.nullcontext():
+                return torch.load(path, map_location="cpu", weights_only=True)
+        except MemoryError:
+            raise
+        except pickle.UnpicklingError as reason:
+            named = re.search(r"GLOBAL (\S+) was not an allowed global", str(reason))
+            if stand_ins and named and len(known) < _STAND_INS:
+                name = named[1] if "." in named[1] else f"builtins.{named[1]}"
+                if name not in known:
+                    known[name] = OrderedDict if name.rpartition(".")[2] in _MAPPINGS else StandIn
+                    continue
+            if any(mark in str(reason) for mark in ("GLOBAL", "Unsupported class", "Trying to")):
+                raise CheckpointError(
+                    f"{path} holds pickled objects, which could run code when read, so it is refused; "
+                    "save plain containers and tensors only, as saunet train does"
+                ) from reason
+            raise CheckpointError(f"{path} is not {what}, or is damaged; copy it again") from reason
+        except OSError as reason:
+            raise CheckpointError(f"cannot read {path}: {reason.strerror or reason}") from reason
+        except Exception as reason:  # the unpickler trusts what it reads: a broken file can raise anything
+            raise CheckpointError(f"{path} is damaged or truncated and cannot be read; copy it again") from reason
 
 
 _DAMAGED = (

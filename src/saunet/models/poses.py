@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from saunet.errors import ConfigError, divisible, one_of
 from saunet.geometry.pose import pose_matrix
 from saunet.models.encoders.efficientnet_lite import EfficientNetLite
-from saunet.models.encoders.resnet import ResNet
+from saunet.models.encoders.resnet import Normalization, ResNet
 from saunet.models.layers.conv import channels_last_weights
 from saunet.registry import poses
 
@@ -131,6 +131,7 @@ class ResNetPose(StackedPose):
         input: What the encoder sees at once; see `StackedPose`.
         offsets: Time offset of each source, in frames.
         weights: Public weights for the encoder to start from: ``imagenet``, a name, a URL or a file.
+        normalization: Mean and deviation of images: ``monodepth2`` (0.45 and 0.225) or ``imagenet``.
     """
 
     def __init__(
@@ -140,8 +141,9 @@ class ResNetPose(StackedPose):
         input: Literal["pairs", "triplet"] = "pairs",
         offsets: Sequence[int] = (-1, 1),
         weights: str | None = None,
+        normalization: Normalization = "monodepth2",
     ) -> None:
-        super().__init__(lambda frames: ResNet(blocks, bottleneck, frames, weights), input, offsets)
+        super().__init__(lambda frames: ResNet(blocks, bottleneck, frames, weights, normalization), input, offsets)
 
 
 @poses.register("efficientnet_lite0")

@@ -13,6 +13,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, ConfigError
+from saunet.registry import Spec
 from saunet.runs.checkpoint import Checkpoint, load_weights
 from saunet.training.optim import OTHER_SETTINGS
 from saunet.weights.files import read_model
@@ -189,7 +190,21 @@ def warm_start(model: SelfSupervisedDepth, source: str | Path) -> str:
     for end in ("min_depth", "max_depth"):
         if ours.get(end, theirs[end]) != theirs[end]:
             taken.append(f"its {end} is {theirs[end]:g} and here {ours[end]:g}, so the same weights give other depths")
+    for part in ("encoder", "decoder"):
+        taken += [
+            f"its {part} has {key} {was} and here {now}, so the same weights give other depths"
+            for key, was, now in _other_behavior(theirs[part], ours.get(part, theirs[part]))
+        ]
     return f"starting from {source}: {'; '.join(taken)}"
+
+
+def _other_behavior(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yield settings of the same component that change what its weights compute and not their shapes."""
+    if theirs["_target_"] == ours["_target_"]:
+        for key, parameter in Spec(ours).parameters.items():
+            was, now = (node.get(key, parameter.default) for node in (theirs, ours))
+            if key in ("normalization", "upsampling", "rates", "last_rates") and list(was) != list(now):
+                yield key, was, now
 
 
 def _taken(name: str, own: Mapping[str, Tensor], given: Mapping[str, Tensor], fitting: Mapping[str, Tensor]) -> str:

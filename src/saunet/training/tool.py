@@ -83,7 +83,7 @@ class TrainOptions:
         monitor: What chooses ``best.ckpt``.
         protocol: Of the validation; the data's own if None.
         resume: Checkpoint of this training to continue from; ``auto`` for the folder's ``last.ckpt``, if there is one.
-        init_from: Checkpoint whose weights a new training starts from.
+        init_from: Checkpoint whose weights a new training starts from, of saunet or of another system.
         overwrite: Replace the checkpoints that an earlier run left in the folder.
 
     Raises:

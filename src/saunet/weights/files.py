@@ -13,6 +13,7 @@ from saunet.errors import CheckpointError
 from saunet.io.plain import read_json
 from saunet.runs.checkpoint import Checkpoint, read_checkpoint
 from saunet.runs.record import ModelRecord
+from saunet.weights.foreign import read_foreign
 from saunet.weights.locate import CONFIG, POSE, WEIGHTS, locate
 
 
@@ -20,7 +21,7 @@ def read_model(source: str | Path) -> Checkpoint:
     """Read a trained model into memory, without running anything from it.
 
     It is a checkpoint, a folder written by ``saunet export`` (or the safetensors file in it), the name of a shipped
-    model, or a hub id; see `saunet.weights.locate.locate`.
+    model, a hub id (see `saunet.weights.locate.locate`), or a model of another system (see `saunet.weights.foreign`).
     """
     path = locate(source)
     if path.is_dir() and (path / CONFIG).is_file() and not (path / WEIGHTS).is_file():
@@ -30,10 +31,20 @@ def read_model(source: str | Path) -> Checkpoint:
     if path.is_dir() and (path / WEIGHTS).is_file():
         path = path / WEIGHTS
     if path.suffix != ".safetensors":
-        return read_checkpoint(path)
+        return _of_any_system(path)
     if not path.is_file():
         raise CheckpointError(f"no model at {path}; check the path")
     return restored(path, _read_config(path.with_name(CONFIG)))
+
+
+def _of_any_system(path: Path) -> Checkpoint:
+    try:
+        return read_checkpoint(path)
+    except CheckpointError:
+        foreign = read_foreign(path) if path.exists() else None
+        if foreign is None:
+            raise
+        return foreign
 
 
 def restored(path: Path, record: ModelRecord) -> Checkpoint:

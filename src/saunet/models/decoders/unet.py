@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from saunet.errors import ConfigError
+from saunet.errors import ConfigError, one_of
 from saunet.models.decoders.base import SkipDecoder
-from saunet.models.layers.conv import ConvELU, DisparityHead
+from saunet.models.layers.conv import ConvELU, DisparityHead, upsample
 from saunet.registry import decoders
 from saunet.types import FeatureSpec
 
@@ -28,6 +29,7 @@ class UNetDecoder(SkipDecoder):
         features: The encoder's features, finest first.
         channels: Channels at 1/1, 1/2, 1/4, 1/8, 1/16; an encoder whose deepest stride is 16 uses the first four.
         scales: Scales to predict disparity at, finest first.
+        upsampling: How maps are enlarged: ``nearest`` as in Monodepth2, or ``bilinear`` as in SC-Depth.
     """
 
     def __init__(
@@ -35,8 +37,10 @@ class UNetDecoder(SkipDecoder):
         features: Sequence[FeatureSpec],
         channels: Sequence[int] = (16, 32, 64, 128, 256),
         scales: Sequence[int] = (0, 1, 2, 3),
+        upsampling: Literal["nearest", "bilinear"] = "nearest",
     ) -> None:
         super().__init__(features, scales)
+        self.upsampling = one_of("upsampling", upsampling, ("nearest", "bilinear"))
         if len(channels) < self.deepest:
             stride = 2**self.deepest
             raise ConfigError(
@@ -52,4 +56,4 @@ class UNetDecoder(SkipDecoder):
         self.heads = nn.ModuleList([DisparityHead(channels[scale]) for scale in self.scales])
 
     def enlarge(self, x: Tensor) -> Tensor:
-        return F.interpolate(x, scale_factor=2, mode="nearest")
+        return upsample(x) if self.upsampling == "bilinear" else F.interpolate(x, scale_factor=2, mode="nearest")

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from saunet.errors import ConfigError, positive
+from saunet.errors import ConfigError, one_of, positive
 from saunet.models.pretrained import load_pretrained
 from saunet.registry import encoders
 from saunet.types import FeatureSpec
 
 _WIDTHS = (64, 128, 256, 512)
+Normalization = Literal["monodepth2", "imagenet"]
+_STATISTICS = {
+    "monodepth2": ((0.45,), (0.225,)),
+    "imagenet": ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)),
+}
+"""Mean and standard deviation, of all channels alike or of each."""
 
 
 class BasicBlock(nn.Module):
@@ -69,13 +76,15 @@ class ResNet(nn.Module):
     """ResNet features at 1/2, 1/4, 1/8, 1/16, 1/32, the encoder of Monodepth2 (SAU-Net Table 3, first row).
 
     State-dict keys are torchvision's without ``fc``. Images come in [0, 1]; as in Monodepth2 every channel has 0.45
-    subtracted and is divided by 0.225. The first feature follows the first ReLU, before the max-pooling.
+    subtracted and is divided by 0.225, or as in torchvision each channel its own. The first feature follows the first
+    ReLU, before the max-pooling.
 
     Args:
         blocks: Residual blocks in each of the four stages.
         bottleneck: Bottleneck blocks (ResNet-50 and up) instead of basic ones.
         frames: RGB images stacked in the channels of the input: 1 for depth, 2 or 3 for pose.
         weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
+        normalization: Mean and deviation of images: ``monodepth2`` (0.45 and 0.225) or ``imagenet``.
     """
 
     mean: Tensor
@@ -87,6 +96,7 @@ class ResNet(nn.Module):
         bottleneck: bool = False,
         frames: int = 1,
         weights: str | None = None,
+        normalization: Normalization = "monodepth2",
     ) -> None:
         super().__init__()
         blocks = tuple(blocks)
@@ -98,8 +108,9 @@ class ResNet(nn.Module):
         kind: type[BasicBlock] | type[Bottleneck] = Bottleneck if bottleneck else BasicBlock
         self.frames = frames
         self.variant = f"resnet{sum(blocks) * (3 if bottleneck else 2) + 2}"
-        self.register_buffer("mean", torch.tensor(0.45), persistent=False)
-        self.register_buffer("std", torch.tensor(0.225), persistent=False)
+        mean, std = _STATISTICS[one_of("normalization", normalization, tuple(_STATISTICS))]
+        self.register_buffer("mean", _per_channel(mean, frames), persistent=False)
+        self.register_buffer("std", _per_channel(std, frames), persistent=False)
 
         self.conv1 = nn.Conv2d(3 * frames, 64, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
@@ -130,6 +141,10 @@ class ResNet(nn.Module):
             x = stage(x)
             features.append(x)
         return tuple(features)
+
+
+def _per_channel(values: tuple[float, ...], frames: int) -> Tensor:
+    return torch.tensor(values[0]) if len(values) == 1 else torch.tensor(values * frames)[:, None, None]
 
 
 def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Sequential | None:
