@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import importlib.metadata
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor, nn
 
-from saunet.errors import ConfigError
+from saunet.errors import CheckpointError, ConfigError
 from saunet.models.encoders.efficientnet_lite import EfficientNetLite, SameConv2d
 from saunet.models.pretrained import load_pretrained, to_our_names
 from saunet.registry import encoders, poses
@@ -74,6 +75,36 @@ def test_batch_norm_moves_as_published() -> None:
         encoder.train()(image)
     torch.testing.assert_close(encoder.bn_stem.running_mean, reference._bn0.running_mean)
     torch.testing.assert_close(encoder.bn_stem.running_var, reference._bn0.running_var)
+
+
+def test_timms_names() -> None:
+    """timm counts blocks in each stage, and the first stage's have no expansion."""
+    ours = encoders.build("efficientnet_lite0").state_dict()
+    expanded = {"conv_pw": "conv_expand", "bn1": "bn_expand", "conv_dw": "conv_depthwise", "bn2": "bn_depthwise"}
+    plain = {"conv_dw": "conv_depthwise", "bn1": "bn_depthwise", "conv_pw": "conv_project", "bn2": "bn_project"}
+    theirs, number = {"conv_head.weight": torch.zeros(1280, 320, 1, 1), "bn2.weight": torch.zeros(1280)}, 0
+    theirs["classifier.weight"] = torch.zeros(1000, 1280)
+    for stage, count in enumerate((1, 2, 2, 3, 3, 4, 1)):
+        for block in range(count):
+            layers = {**expanded, "conv_pwl": "conv_project", "bn3": "bn_project"} if stage else plain
+            for layer, own in layers.items():
+                front = f"blocks.{number}.{own}."
+                entries = {key[len(front) :]: value for key, value in ours.items() if key.startswith(front)}
+                assert entries
+                theirs |= {f"blocks.{stage}.{block}.{layer}.{end}": value for end, value in entries.items()}
+            number += 1
+    theirs |= {key.replace("bn_stem", "bn1"): value for key, value in ours.items() if "stem" in key}
+    found = to_our_names(theirs)
+    assert found.keys() == ours.keys()
+    assert all(torch.equal(value, ours[key]) for key, value in found.items())
+
+
+@pytest.mark.parametrize("name", ["blocks.0.0.se.conv_reduce.weight", "features.1.0.block.1.fc1.weight"])
+def test_squeeze_and_excitation_is_named(name: str, tmp_path: Path) -> None:
+    timms = {"conv_stem.weight": torch.zeros(32, 3, 3, 3), "blocks.0.0.conv_dw.weight": torch.zeros(32, 1, 3, 3)}
+    torch.save({name: torch.zeros(1), **(timms if name.startswith("blocks") else {})}, tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match="squeeze-and-excitation.*model/encoder=timm"):
+        encoders.build("efficientnet_lite0", weights=str(tmp_path / "w.pth"))
 
 
 @pytest.mark.parametrize(

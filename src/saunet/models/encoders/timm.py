@@ -1,0 +1,97 @@
+"""Any network of timm that gives feature maps; the extra ``timm`` has it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from saunet.errors import CheckpointError, ConfigError, divisible, suggest
+from saunet.registry import encoders
+from saunet.types import FeatureSpec
+
+
+@encoders.register("timm")
+class TimmEncoder(nn.Module):
+    """A network of timm with ``features_only``: its deepest map at each stride.
+
+    Images come in [0, 1] and are normalized with the mean and deviation of the network's public weights. Needs the
+    extra ``timm``: ``pip install 'saunet[timm]'``.
+
+    Args:
+        model: Name of the network in timm, such as ``convnext_tiny`` or ``efficientnet_b0``.
+        weights: ``imagenet`` for the public weights, which timm fetches, or a file of the network's weights.
+        image_size: Height and width of the images, for networks that are built for one size, such as Swin's and ViT's.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self, model: str = "convnext_tiny", weights: str | None = None, image_size: Sequence[int] | None = None
+    ) -> None:
+        super().__init__()
+        timm = _timm()
+        if not timm.is_model(model):
+            hint = suggest(model, timm.list_models()) or ";"
+            raise ConfigError(
+                f"model is '{model}', which timm {timm.__version__} does not have{hint} see timm.list_models()"
+            )
+        more: dict[str, Any] = {} if image_size is None else {"img_size": tuple(image_size)}
+        if weights is not None:
+            more["pretrained"] = True
+        if weights not in (None, "imagenet"):
+            more["pretrained_cfg_overlay"] = {"file": str(_existing(str(weights)))}
+        try:
+            self.network = timm.create_model(model, features_only=True, **more)
+        except Exception as reason:  # each network of timm has its own ways to refuse
+            text = " ".join(str(reason).split())[:300]
+            if weights is not None:
+                raise CheckpointError(
+                    f"timm cannot give '{model}' the weights '{weights}' ({text}); give a file of this network's"
+                ) from reason
+            raise ConfigError(f"timm's '{model}' gives no feature maps ({type(reason).__name__}: {text})") from reason
+        info = self.network.feature_info
+        strides = info.reduction()
+        self.taken = tuple(sorted({stride: index for index, stride in enumerate(strides)}.values()))
+        self.features = tuple(FeatureSpec(info.channels()[index], strides[index]) for index in self.taken)
+        self.size_divisor = self.features[-1].stride
+        self.image_size = None if image_size is None else tuple(image_size)
+        self.channels_last = "NHWC" in str(getattr(self.network, "output_fmt", ""))
+        config = timm.models.get_pretrained_cfg(model)
+        for name, default in (("mean", (0.485, 0.456, 0.406)), ("std", (0.229, 0.224, 0.225))):
+            values = getattr(config, name, None) or default
+            self.register_buffer(name, torch.tensor(values).view(3, 1, 1), persistent=False)
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
+        divisible(image.shape[-2], image.shape[-1], self.size_divisor)
+        if self.image_size is not None and tuple(image.shape[-2:]) != self.image_size:
+            size, wanted = ("x".join(map(str, each)) for each in (image.shape[-2:], self.image_size))
+            raise ConfigError(
+                f"the image is {size} and the encoder was built for {wanted}; give image_size of the images"
+            )
+        maps = self.network((image - self.mean) / self.std)
+        chosen = [maps[index] for index in self.taken]
+        return tuple(each.permute(0, 3, 1, 2) if self.channels_last else each for each in chosen)
+
+
+def _timm() -> Any:
+    try:
+        import timm
+    except Exception as missing:  # a torchvision of another torch breaks in many ways when it is imported
+        why = "is not installed" if isinstance(missing, ModuleNotFoundError) else f"cannot be imported ({missing})"
+        raise ConfigError(
+            f"model/encoder=timm needs the package timm, which {why}; run: pip install 'saunet[timm]'"
+        ) from missing
+    return timm
+
+
+def _existing(weights: str) -> Path:
+    path = Path(weights).expanduser()
+    if not path.is_file():
+        raise CheckpointError(f"weights is '{weights}', but there is no such file; give a file, or weights=imagenet")
+    return path
