@@ -32,7 +32,7 @@ from saunet.exporting.tool import ExportOptions, export
 from saunet.io.images import write_image
 from saunet.models.depth import DepthNet
 from saunet.prediction.predictor import Predictor
-from saunet.registry import decoders, encoders
+from saunet.registry import decoders
 from saunet.runs.checkpoint import atomic_save, build_networks
 from saunet.runs.record import ModelRecord, Scale
 

@@ -103,7 +103,7 @@ def test_timms_names() -> None:
 def test_squeeze_and_excitation_is_named(name: str, tmp_path: Path) -> None:
     timms = {"conv_stem.weight": torch.zeros(32, 3, 3, 3), "blocks.0.0.conv_dw.weight": torch.zeros(32, 1, 3, 3)}
     torch.save({name: torch.zeros(1), **(timms if name.startswith("blocks") else {})}, tmp_path / "w.pth")
-    with pytest.raises(CheckpointError, match="squeeze-and-excitation.*model/encoder=timm"):
+    with pytest.raises(CheckpointError, match=r"squeeze-and-excitation.*model/encoder=timm"):
         encoders.build("efficientnet_lite0", weights=str(tmp_path / "w.pth"))
 
 
