@@ -246,12 +246,13 @@ def _slowtv(path: Path, state: State, content: Mapping[str, Any]) -> _Model:
         encoder = Spec.of("encoder", "timm", model=kind)
         names.append((r"^depth\.encoder\.network\.", "nets.depth.encoder."))
     pose, left = None, []
-    if _is_resnet(state, "nets.pose.encoder.") and "nets.pose.decoders.pose.2.weight" in state:
+    forward = _setting(config, "trainer", "always_fwd_pose") is not False
+    if forward and _is_resnet(state, "nets.pose.encoder.") and f"{_SLOWTV_POSE}2.weight" in state:
         pose = Spec.of("pose", "resnet18", **_resnet(state, "nets.pose.encoder."), normalization="imagenet")
         names.append((r"^pose\.encoder\.", "nets.pose.encoder."))
-        parts_of = {"squeeze": "squeeze.0", "conv1": "decoders.pose.0.0", "conv2": "decoders.pose.1.0"}
-        ends = {**parts_of, "project": "decoders.pose.2"}
-        names.append((r"^pose\.head\.(\w+)\.", lambda found: f"nets.pose.{ends[found[1]]}."))
+        ends = {"conv1": "0.0", "conv2": "1.0", "project": "2"}
+        names.append((r"^pose\.head\.squeeze\.", "nets.pose.squeeze.0."))
+        names.append((r"^pose\.head\.(\w+)\.", lambda found: f"{_SLOWTV_POSE}{ends[found[1]]}."))
     kept = ["nets.depth.encoder.", depth, *(("nets.pose.encoder.", "nets.pose.squeeze.", _SLOWTV_POSE) if pose else ())]
     unread = sorted({_front(name) for name in state if not name.startswith(tuple(kept))})
     if unread:
@@ -261,7 +262,9 @@ def _slowtv(path: Path, state: State, content: Mapping[str, Any]) -> _Model:
     if _setting(config, "net", "depth", "use_stereo_blend"):
         left.append("the blend with the mirrored image, which flip=true does")
     near, far = (_setting(config, "trainer", key) for key in ("min_depth", "max_depth"))
-    limits = (float(near or 0.01), float(far or FAR)) if near or far else (1.0, FAR)
+    limits = (1.0, FAR)  # disparity is the sigmoid itself
+    if isinstance(near, int | float):
+        limits = float(near), float(far) if isinstance(far, int | float) else FAR
     return _Model(
         "slowtv",
         encoder,
@@ -482,7 +485,8 @@ def _size(value: object) -> tuple[int, int] | None:
 
 
 def _front(name: str, parts: int = 3) -> str:
-    return ".".join(name.split(".")[:parts])
+    words = name.split(".")
+    return ".".join(words[: 4 if words[2:3] == ["decoders"] else parts])
 
 
 def _more(names: Sequence[str]) -> str:
