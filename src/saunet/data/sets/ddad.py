@@ -161,7 +161,7 @@ class DdadDataModule(FilesDataModule):
 
 @functools.lru_cache(maxsize=16)
 def _read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    return resize(read_image(path)[..., 0], *size) >= 128
+    return np.asarray(resize(read_image(path)[..., 0], *size) >= 128, dtype=np.bool_)
 
 
 def _find_mask(masks: Path, scene: str, camera: str) -> Path | None:
