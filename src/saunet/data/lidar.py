@@ -28,7 +28,8 @@ def read_scan(path: Path, columns: int = 4) -> Float32[ndarray, "n 3"]:
     if not known.all():
         lost = len(points) - int(known.sum())
         warnings.warn(f"{path}: {lost} of {len(points)} points are not finite numbers and are left out", stacklevel=2)
-    return points[known]
+    kept: Float32[ndarray, "n 3"] = points[known]
+    return kept
 
 
 def points_to_depth(
