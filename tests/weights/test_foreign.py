@@ -364,7 +364,7 @@ def write_manydepth(folder: Path) -> Depth:
 
 def write_lite_mono(folder: Path, width: int = 640) -> Depth:
     dims, depths = (8, 16, 24), (2, 3, 5)
-    encoder, depth = lite_mono(dims, depths), decoder(LITE_MONO, dims, (4, 8, 12), 3, gain=1)
+    encoder, depth = lite_mono(dims, depths), decoder(LITE_MONO, dims, (4, 8, 12), 3, gain=0.1)
     height = {640: 192, 1024: 320}[width]
     save(folder / "encoder.pth", {**encoder, "height": height, "width": width, "use_stereo": False})
     save(folder / "depth.pth", depth)
@@ -524,7 +524,8 @@ def test_depth_is_that_of_their_code(
     said = "; ".join(record.getMessage() for record in caplog.records)
     assert re.search(left, said) if left else not said
     depth = checkpoint.networks()[0].eval().double()
-    image = torch.rand(2, 3, HEIGHT, WIDTH, dtype=torch.float64)
+    width = 2 * WIDTH if "lite_mono" in write.__name__ else WIDTH  # its rates differ in what lies 6 or 10 pixels away
+    image = torch.rand(1, 3, HEIGHT, width, dtype=torch.float64)
     with torch.no_grad():
         expected, found = forward(image), depth(image).depth[0]
     assert expected.amax() / expected.amin() > 1.1  # it depends on the image
