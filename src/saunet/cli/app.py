@@ -222,9 +222,10 @@ def call(name: str, composed: Composed, table: Table) -> tuple[int, object]:
     wanted = inspect.signature(called).parameters
     quiet()
     result = called(options, **{key: value for key, value in record.items() if key in wanted})
-    if isinstance(result, Shown):
+    first = os.environ.get("RANK", "0") == "0"  # of the processes that torchrun started, if it did
+    if isinstance(result, Shown) and first:
         result.show()
-    elif result is not None and "describe" not in wanted:
+    elif result is not None and "describe" not in wanted and first:
         print(result)
     if isinstance(result, Partial):
         for failure in result.failures:

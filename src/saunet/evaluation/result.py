@@ -293,7 +293,8 @@ class EvaluationResult:
             known = ~np.isnan(values)
             means = (values[known[:, place], place] for place in range(values.shape[1]))
             numbers = (float(each.mean()) if each.size else math.nan for each in means)
-            found.append(ShapeSummary(protocol, predictor, *numbers, *known[:, [0, 2]].sum(0).tolist()))
+            counts = {"edge_images": int(known[:, 0].sum()), "cloud_images": int(known[:, 2].sum())}
+            found.append(ShapeSummary(protocol, predictor, *numbers, **counts))
         return tuple(found)
 
     @property

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,6 +17,7 @@ from torch.nn.functional import max_pool2d, pad
 from saunet.errors import ConfigError, DataError, one_of, positive
 from saunet.evaluation.predictors import Motion, Predictor, truths_of
 from saunet.evaluation.result import BucketRow, EvaluationResult, ImageRow, ShapeRow, ViewRow
+from saunet.evaluation.team import ALONE, Team
 from saunet.geometry.camera import scale_intrinsics
 from saunet.geometry.depth import disparity_to_depth
 from saunet.geometry.warp import synthesize
@@ -33,6 +36,7 @@ from saunet.metrics.protocols import (
 from saunet.metrics.shapes import DENSE, boundary_scores, cloud_scores, points
 from saunet.types import EvalBatch
 
+R = TypeVar("R", ImageRow, ShapeRow, ViewRow)
 _NO_IMAGE = "there is no image to evaluate; check the split and the data root"
 EDGE_RATIO = 1.25
 """Depths that differ by more than this factor make an edge, the strictest threshold of Bochkovskii et al., Depth Pro,
@@ -145,6 +149,11 @@ class BucketSums:
         self._sums += (inside @ error_terms(sample.prediction, sample.target).T).cpu()
         self._counts += inside.sum(1).cpu()
 
+    def total(self, team: Team) -> None:
+        """Add up the sums of all processes."""
+        sums, counts = zip(*team.everyones((self._sums, self._counts)), strict=True)
+        self._sums, self._counts = torch.stack(sums).sum(0), torch.stack(counts).sum(0)
+
     def rows(self, predictor: str, protocol: str) -> tuple[BucketRow, ...]:
         """Return the buckets that hold pixels."""
         errors = root_terms(self._sums / self._counts[:, None]).tolist()
@@ -179,7 +188,7 @@ class Shapes:
         rules: Protocol,
     ) -> ShapeRow:
         """Measure one image; ``about`` is predictor, protocol and name, ``K`` is in pixels of the truth."""
-        edges = cloud = (math.nan,) * 3
+        edges, cloud = (math.nan, math.nan), (math.nan, math.nan, math.nan)
         if self.boundaries and sample.target.numel():
             resized = resize_disparity(disparity, (truth.shape[0], truth.shape[1])).double()
             depth = aligned_depth(resized, sample.ratio, sample.shift, rules)
@@ -188,7 +197,7 @@ class Shapes:
             mask, matrix = sample.mask.cpu().numpy(), K.cpu().numpy()
             predicted, true = (points(each.cpu().numpy(), mask, matrix) for each in (sample.prediction, sample.target))
             cloud = cloud_scores(predicted, true, self.cloud)
-        return ShapeRow(*about, *edges[:2], *cloud)
+        return ShapeRow(*about, *edges, *cloud)
 
 
 @torch.inference_mode()
@@ -202,22 +211,27 @@ def score(
     shapes: Shapes | None = None,
     total: int | None = None,
     progress: bool = True,
+    team: Team = ALONE,
 ) -> EvaluationResult:
     """Score predictors, by the name that tables show, on the same images under protocols for their ground truth.
 
     Only one batch is held at a time; one in which no image has depth may come without ``depth``. Batches and
     predictions may lie on any device; numbers are computed where the ground truth lies. Each predictor, protocol and
-    image becomes a row, also an image without ground truth.
+    image becomes a row, also an image without ground truth. With a ``team``, each process is given other batches, and
+    all return the result of all.
     """
     _check_request(predictors, protocols, ground_truth)
     rows: list[ImageRow] = []
     shape_rows: list[ShapeRow] = []
     sums = {(p, q.name): BucketSums(buckets) for p in predictors for q in protocols} if buckets else {}
-    with bar(progress, "images", taken=True) as shown:
+    with bar(progress and team.rank == 0, "images", taken=True) as shown:
         task = shown.add_task("evaluate", total=total)
         for batch in batches:
             rows += _score_batch(predictors, batch, protocols, sums, buckets, shapes, shape_rows)
-            shown.advance(task, len(batch["name"]))
+            shown.advance(task, len(batch["name"]) * team.size)
+    for each in sums.values():
+        each.total(team)
+    rows, shape_rows = taken_in_turn(team, rows), taken_in_turn(team, shape_rows)
     if not rows:
         raise DataError(_NO_IMAGE)
     if not any(row.pixels for row in rows):
@@ -291,6 +305,16 @@ def _truth_intrinsics(batch: EvalBatch, place: int, truth: Float[Tensor, "h w"])
     return scale_intrinsics(batch["K"][place].double(), columns / width, rows / height)
 
 
+def taken_in_turn(team: Team, rows: list[R]) -> list[R]:
+    """Return the rows of all processes, image by image as one process would: each has every so manieth image."""
+    if team.size == 1:
+        return rows
+    every = team.everyones(rows)
+    names = [list(dict.fromkeys(row.name for row in each)) for each in every]
+    order = {name: place for place, name in enumerate(filter(None, itertools.chain(*itertools.zip_longest(*names))))}
+    return sorted(itertools.chain(*every), key=lambda row: order[row.name])
+
+
 @torch.inference_mode()
 def score_views(
     predictors: Mapping[str, tuple[Predictor, Motion]],
@@ -300,6 +324,7 @@ def score_views(
     group_of: Callable[[str], str],
     total: int | None = None,
     progress: bool = True,
+    team: Team = ALONE,
 ) -> EvaluationResult:
     """Warp the neighbors of each image into it by predicted depth and motion, and compare.
 
@@ -313,7 +338,7 @@ def score_views(
             "score it with `score`, or choose one that needs none, such as campus"
         )
     rows: list[ViewRow] = []
-    with bar(progress, "images", taken=True) as shown:
+    with bar(progress and team.rank == 0, "images", taken=True) as shown:
         task = shown.add_task(protocol.name, total=total)
         for batch in batches:
             if batch["sources"].shape[1] == 0:
@@ -324,7 +349,8 @@ def score_views(
                     ViewRow(name, protocol.name, image, group_of(image), *values)
                     for image, *values in zip(batch["name"], *columns, strict=True)
                 ]
-            shown.advance(task, len(batch["name"]))
+            shown.advance(task, len(batch["name"]) * team.size)
+    rows = taken_in_turn(team, rows)
     if not rows:
         raise DataError(_NO_IMAGE)
     return EvaluationResult((protocol,), tuple(predictors), (), views=tuple(rows))

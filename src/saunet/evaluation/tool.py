@@ -17,10 +17,17 @@ from saunet.data.loading.module import surroundings
 from saunet.data.loading.stored import cache_truths
 from saunet.data.loading.windows import measured_distance
 from saunet.errors import ConfigError, DataError, checked, one_of, usable_device
-from saunet.evaluation.predictors import ExportingPredictor, FilePredictor, NetworkPredictor, Predictor, existing
+from saunet.evaluation.predictors import (
+    ExportingPredictor,
+    FilePredictor,
+    NetworkPredictor,
+    Predictor,
+    existing,
+)
 from saunet.evaluation.result import EvaluationResult, read_rows, write_results
 from saunet.evaluation.scoring import Buckets, Shapes, score, score_views
 from saunet.evaluation.statistics import drive_of, with_statistics
+from saunet.evaluation.team import Team, joined
 from saunet.io.atomic import check_folder
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
 from saunet.metrics.protocols import Protocol as Rules
@@ -55,7 +62,9 @@ class EvaluationData(Protocol):
 
     def setup(self, stage: str | None = None) -> None: ...
 
-    def batches(self, split: str, device: str | torch.device) -> Iterator[EvalBatch]: ...
+    def batches(
+        self, split: str, device: str | torch.device, place: tuple[int, int] | None = None
+    ) -> Iterator[EvalBatch]: ...
 
     def listed(self, split: str) -> list[str]:
         """Return the names of a split's images, in the order of its list."""
@@ -164,8 +173,14 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
         >>> data = saunet.Spec.of("data", "synthetic_tiny")
         >>> evaluate(EvaluateOptions(data=data, checkpoint="best.ckpt")).show()  # doctest: +SKIP
     """
+    with joined() as team:
+        return evaluate_with(options, team)
+
+
+def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
+    """Evaluate with the processes of a team; each returns the result of all."""
     earlier = read_rows(Path(options.compare)) if options.compare else None
-    device = usable_device(options.device)
+    device = team.device(usable_device(options.device))
     folder = None if options.output_dir is None else check_folder(options.output_dir)
     settings: dict[str, object] = {"data": options.data.name}
     model, pose = None, None
@@ -174,7 +189,7 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
         networks = checkpoint.networks()
         passes = _passes(options, _resized(options.data, checkpoint.record), motion=networks[1] is not None)
         _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth is of the same images
-        depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device)
+        depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device, first=team.rank == 0)
         model = NetworkPredictor(depth, options.flip)
         settings |= {"checkpoint": options.checkpoint, "scale": scale}
     else:
@@ -182,13 +197,14 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
         existing(Path(str(options.predictions)))
         settings |= {"predictions": options.predictions, "match": options.match}
     settings |= {"split": options.split, "post_processing": "monodepth blend of two flips" if options.flip else None}
-    result, exported = _score_passes(options, passes, model, pose, device)
+    result, exported = _score_passes(options, passes, model, pose, device, team)
     sources = tuple(options.data.get("sources") or ())
     result = replace(result, settings={**settings, **result.settings}, sources=sources, folder=folder, notes=exported)
-    if folder is not None and earlier is not None:
+    first = team.rank == 0
+    if folder is not None and earlier is not None and first:
         write_results(result, folder)  # an evaluation that does not compare is not lost
     result = with_statistics(result, options.intervals, earlier, options.compare)
-    if folder is not None:
+    if folder is not None and first:
         write_results(result, folder)
     return result
 
@@ -260,6 +276,7 @@ def _score_passes(
     model: NetworkPredictor | None,
     pose: nn.Module | None,
     device: torch.device,
+    team: Team,
 ) -> tuple[EvaluationResult, tuple[str, ...]]:
     """Go through the images once for each ground truth; return the result, and what was exported."""
     split, name, exporter = options.split, "model" if model else "predictions", None
@@ -275,21 +292,25 @@ def _score_passes(
         )
         if options.export and exporter is None:  # in the first pass, which is of the first protocol's truth
             predictor = exporter = ExportingPredictor(predictor, Path(options.export), rules[0])
-        batches, total = data.batches(split, device), len(data.datasets[split])
+        share = {} if team.place is None else {"place": team.place}
+        batches, total = data.batches(split, device, **share), len(data.datasets[split])
         if rules[0].ground_truth == "none":
             assert pose is not None
             pair = {name: (predictor, lambda batch: pose(batch["target"], batch["sources"]))}
             group_of = _conditions(data, split)
-            results += [score_views(pair, batches, rule, group_of=group_of, total=total) for rule in rules]
+            results += [score_views(pair, batches, rule, group_of=group_of, total=total, team=team) for rule in rules]
         else:
             predictors = {name: predictor, **(trivial(data, options.truth_cache) if options.baselines else {})}
             truth = data.ground_truth
-            results.append(
-                score(predictors, batches, rules, ground_truth=truth, buckets=buckets, shapes=shapes, total=total)
-            )
-    joined = functools.reduce(EvaluationResult.joined, results)
+            measured: dict[str, Any] = {"buckets": buckets, "shapes": shapes}
+            results.append(score(predictors, batches, rules, ground_truth=truth, total=total, team=team, **measured))
+    whole = functools.reduce(EvaluationResult.joined, results)
+    if exporter is not None:
+        exporter.written, exporter.left_out = (
+            sum(team.everyones(count)) for count in (exporter.written, exporter.left_out)
+        )
     asked = [protocol(name) for name in options.protocols or [rule.name for _, rules in passes for rule in rules]]
-    return replace(joined, protocols=tuple(asked)), (str(exporter),) if exporter else ()
+    return replace(whole, protocols=tuple(asked)), (str(exporter),) if exporter else ()
 
 
 def _conditions(data: EvaluationData, split: str) -> Callable[[str], str]:
@@ -325,6 +346,7 @@ def _scaled(
     networks: tuple[DepthNet, nn.Module | None],
     data: Any,
     device: torch.device,
+    first: bool,
 ) -> tuple[nn.Module, nn.Module | None, dict[str, object]]:
     """Return depth and pose network on the device, in meters if the options ask for it, and what to report of that."""
     depth, pose = networks[0].to(device).eval(), None if networks[1] is None else networks[1].to(device).eval()
@@ -343,7 +365,8 @@ def _scaled(
         estimate = estimate_scale(method, batches, lambda image: depth(image).depth[0], pose, height)
         report = {key: value for key, value in estimate.as_json().items() if key != "per_frame"}  # scale.json has it
         folder = None if options.output_dir is None else Path(options.output_dir)
-        scale = keep_scale(estimate, options.scale.storable(str(options.checkpoint)), folder)
+        store_in = options.scale.storable(str(options.checkpoint))
+        scale = keep_scale(estimate, store_in, folder) if first else estimate.scale()
     scale = options.scale.chosen(scale)
     if scale is None:
         return depth, pose, {"method": method, "factor": None}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, cast, get_args
 
 import torch
 from jaxtyping import Bool, Float
@@ -109,7 +109,8 @@ def protocol(name: str) -> Protocol:
     found = PROTOCOLS[one_of("protocol", base, PROTOCOLS)]
     if slash and found.ground_truth == "none":
         raise ConfigError(f"protocol '{name}' aligns with ground truth, which '{base}' does without; ask for '{base}'")
-    return replace(found, name=name, alignment=one_of("alignment", alignment, ALIGNMENTS)) if slash else found
+    chosen = cast(Alignment, one_of("alignment", alignment, ALIGNMENTS)) if slash else found.alignment
+    return replace(found, name=name, alignment=chosen) if slash else found
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,11 +96,11 @@ def collect(paths: Sequence[str | Path], checkpoint: str = "best", *, strangers:
         mine = [evaluation for evaluation in evaluations.values() if belongs(evaluation, run)]
         scores = (*(score for evaluation in mine for score in evaluation.scores), *run.scores)
         explained = tuple(row for evaluation in mine for row in evaluation.explained)
-        about = {
-            "details": tuple(row for evaluation in mine for row in evaluation.details),
-            "evaluations": tuple(evaluation.folder for evaluation in mine),
-        }
-        return dataclasses.replace(_as_trained(run), scores=scores, explained=explained, **about)
+        details = tuple(row for evaluation in mine for row in evaluation.details)
+        folders = tuple(evaluation.folder for evaluation in mine)
+        return dataclasses.replace(
+            _as_trained(run), scores=scores, explained=explained, details=details, evaluations=folders
+        )
 
     return Inputs(
         tuple(scored(run) for run in runs.values()),

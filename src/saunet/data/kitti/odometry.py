@@ -143,6 +143,8 @@ class KittiOdometryDataModule(DepthDataModule):
     """
 
     neighbors = ("train", "val", "test")
+    protocol = "campus"
+    ground_truth = "none"
     camera_height = CAMERA_HEIGHT
 
     root: str

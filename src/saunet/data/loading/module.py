@@ -77,6 +77,8 @@ class DepthDataModule(LightningDataModule):
     """Whether ``saunet prepare cache`` can make copies for it."""
     root: str | None = None
     """Where its files are; None if it reads none."""
+    recognizable: bool = True
+    """Whether its files are arranged as those of no other data set, so that it can be found among others."""
 
     @property
     def camera_height(self) -> float | None:
@@ -242,9 +244,21 @@ class DepthDataModule(LightningDataModule):
         """Return the frames to predict, each once."""
         return self._eval_loader("predict")
 
-    def batches(self, split: str, device: str | torch.device) -> Iterator[EvalBatch]:
-        """Yield a split's batches as the networks want them, on a device: evaluation without a trainer."""
-        for batch in self._eval_loader(split):
+    def batches(
+        self, split: str, device: str | torch.device, place: tuple[int, int] | None = None
+    ) -> Iterator[EvalBatch]:
+        """Yield a split's batches as the networks want them, on a device: evaluation without a trainer.
+
+        With a place, a process's number and the number of processes, they are every so manieth sample.
+        """
+        loader = self._eval_loader(split)
+        if place is not None:
+            samples = range(place[0], len(self._set_up(split)), place[1])
+            sampler = [
+                list(samples[first : first + self.batch_size]) for first in range(0, len(samples), self.batch_size)
+            ]
+            loader = Loader(self.datasets[split], sampler=sampler, **self._loading())
+        for batch in loader:
             yield self.prepare(move_data_to_device(batch, torch.device(device)))
 
     def ground_truths(self, split: str, most: int = 500) -> Iterator[Float[torch.Tensor, "1 h w"]]:

@@ -129,6 +129,7 @@ class PairsDataModule(RecordingsDataModule):
         ConfigError: if a parameter is out of range.
     """
 
+    recognizable = False
     protocol = "synthetic"
     ground_truth = "exact"
     cacheable = False  # copies are of recordings whose images share one size

@@ -205,6 +205,7 @@ class VideoDataModule(DepthDataModule):
     """
 
     neighbors = ("train", "val", "test")
+    recognizable = False
     protocol = "campus"
     ground_truth = "none"
 
