@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from saunet.metrics.depth import DepthMetrics
     from saunet.models.depth import DepthNet
     from saunet.models.systems import ModelOptions
+    from saunet.prediction.foreign import ForeignOptions
     from saunet.prediction.prediction import Prediction
     from saunet.prediction.predictor import Predictor
     from saunet.prediction.tool import PredictOptions, predict
@@ -51,8 +52,9 @@ __version__ = "0.1.0"
 __all__ = [
     "AppOptions", "BenchmarkOptions", "CalibrateOptions", "CheckpointError", "ConfigError", "DataError",
     "DepthDataModule", "DepthMetrics", "DepthNet", "DoctorOptions", "Drive", "EvaluateOptions", "ExportOptions",
-    "ModelOptions", "OdometryOptions", "PredictOptions", "Prediction", "Predictor", "PrepareOptions", "ReportOptions",
-    "Run", "SaunetError", "Spec", "TrainOptions", "WatchOptions", "__version__", "app", "attentions", "automask",
+    "ForeignOptions", "ModelOptions", "OdometryOptions", "PredictOptions", "Prediction", "Predictor", "PrepareOptions",
+    "ReportOptions", "Run", "SaunetError", "Spec", "TrainOptions", "WatchOptions", "__version__", "app", "attentions",
+    "automask",
     "available", "backproject", "benchmark", "build", "calibrate", "combine_sources", "crop_intrinsics", "datamodules",
     "decoders", "disparity_to_depth", "doctor", "encoders", "evaluate", "export", "flip_intrinsics", "gradient_loss",
     "inspect", "invert_pose", "load", "objectives", "odometry", "photometric_error", "pose_matrix", "poses", "predict",
@@ -74,6 +76,7 @@ __getattr__ = lazily(
         "metrics.depth": "DepthMetrics",
         "models.depth": "DepthNet",
         "models.systems": "ModelOptions",
+        "prediction.foreign": "ForeignOptions",
         "prediction.prediction": "Prediction",
         "prediction.predictor": "Predictor",
         "prediction.tool": "PredictOptions predict",
@@ -140,7 +143,14 @@ def available(kind: str) -> list[str]:
 
 
 @checked
-def load(source: Any = DEFAULT, *, device: str = "cpu", flip: bool = False, keep_aspect: bool = False) -> Any:
+def load(
+    source: Any = DEFAULT,
+    *,
+    device: str = "cpu",
+    flip: bool = False,
+    keep_aspect: bool = False,
+    foreign: ForeignOptions | None = None,
+) -> Any:
     """Load a trained model for prediction: ``saunet.load("last.ckpt").predict(image)``.
 
     Args:
@@ -151,6 +161,7 @@ def load(source: Any = DEFAULT, *, device: str = "cpu", flip: bool = False, keep
         device: Where to run, such as ``"cpu"`` or ``"cuda"``.
         flip: Average with the prediction of the mirrored image.
         keep_aspect: Feed each image at its own aspect ratio.
+        foreign: What an ONNX or TorchScript model of another system takes and gives.
 
     Returns:
         A `saunet.prediction.Predictor`, or for ONNX a `saunet.exporting.onnx.OnnxPredictor`, which does without torch.
@@ -170,4 +181,4 @@ def load(source: Any = DEFAULT, *, device: str = "cpu", flip: bool = False, keep
         raise CheckpointError(f"saunet.load got {got}; give the path of a checkpoint or an exported folder")
     from saunet.prediction.prediction import load as load_any
 
-    return load_any(source, device=device, flip=flip, keep_aspect=keep_aspect)
+    return load_any(source, device=device, flip=flip, keep_aspect=keep_aspect, foreign=foreign)

@@ -20,6 +20,8 @@ from saunet.io.plain import read_array
 from saunet.metrics.depth import native_depths
 from saunet.metrics.functional import flip_blend
 from saunet.metrics.protocols import Protocol, aligned_depth, resize_disparity, sample_image
+from saunet.prediction.foreign import ForeignPredictor
+from saunet.prediction.prediction import ImagePredictor
 from saunet.types import DepthPyramid, EvalBatch
 
 Predictor: TypeAlias = Callable[[EvalBatch], Tensor]
@@ -48,6 +50,21 @@ class NetworkPredictor:
     def _disparity(self, image: Tensor) -> Tensor:
         output = self.network(image)
         return output.disparity[0] if isinstance(output, DepthPyramid) else output
+
+
+class PredictorNetwork(nn.Module):
+    """A predictor of single images, such as one that runs an ONNX file, as a network of disparity in its unit."""
+
+    def __init__(self, predictor: ImagePredictor) -> None:
+        super().__init__()
+        self.predictor = predictor
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 _ _"]:
+        predictor, images = self.predictor, image.float().cpu().numpy()
+        raw = predictor.raw_disparity if isinstance(predictor, ForeignPredictor) else predictor.disparity
+        disparity = raw(images)
+        factor = predictor.scale.factor if predictor.scale else 1.0
+        return torch.from_numpy(disparity / np.float32(factor))[:, None].to(image.device)
 
 
 class FilePredictor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, get_args, runtime_checkable
 
@@ -22,6 +22,7 @@ from saunet.evaluation.predictors import (
     FilePredictor,
     NetworkPredictor,
     Predictor,
+    PredictorNetwork,
     existing,
 )
 from saunet.evaluation.result import EvaluationResult, read_rows, write_results
@@ -33,6 +34,8 @@ from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
 from saunet.metrics.protocols import Protocol as Rules
 from saunet.metrics.protocols import protocol
 from saunet.models.depth import DepthNet
+from saunet.prediction.foreign import NOTHING, ForeignOptions, ForeignPredictor, is_foreign
+from saunet.prediction.prediction import load
 from saunet.registry import Spec
 from saunet.runs.record import ModelRecord
 from saunet.scale.estimate import MetricDepth, MetricMotion, estimate_scale, keep_scale
@@ -40,6 +43,7 @@ from saunet.scale.options import ScaleOptions
 from saunet.scale.recorded import read_speeds
 from saunet.types import EvalBatch
 from saunet.weights.files import read_model
+from saunet.weights.locate import locate
 
 STAGES = {"test": "test", "val": "validate"}
 """Splits that can be evaluated, and the stage that sets each up."""
@@ -91,6 +95,7 @@ class EvaluateOptions:
         flip: Blend with the prediction of the mirrored image (Monodepth's post-processing).
         baselines: Also score predictors that look at no image.
         scale: How depth becomes meters.
+        foreign: What an ONNX or TorchScript model of another system takes and gives.
         buckets: Also report errors by distance, image region and at depth edges.
         distances: Limits of the distance ranges in meters, ascending.
         boundaries: Also measure how near depth edges are to true ones, in pixels, where ground truth is dense.
@@ -121,6 +126,7 @@ class EvaluateOptions:
     flip: bool = False
     baselines: bool = True
     scale: ScaleOptions = field(default_factory=ScaleOptions)
+    foreign: ForeignOptions = NOTHING
     buckets: bool = False
     distances: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0, 50.0, 80.0)
     boundaries: bool = False
@@ -184,7 +190,15 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
     folder = None if options.output_dir is None else check_folder(options.output_dir)
     settings: dict[str, object] = {"data": options.data.name}
     model, pose = None, None
-    if options.checkpoint is not None:
+    if options.checkpoint is not None and runs_alone(options):
+        loaded = load(options.checkpoint, device=str(device), flip=options.flip, foreign=options.foreign)
+        size = {"height": loaded.height, "width": loaded.width}
+        shifted = isinstance(loaded, ForeignPredictor) and loaded.shifted
+        passes = _passes(options, options.data.changed(**size), motion=False, shifted=shifted)
+        model = NetworkPredictor(PredictorNetwork(loaded))
+        about = {key: value for key, value in asdict(options.foreign).items() if value is not None}
+        settings |= {"checkpoint": options.checkpoint, **({"foreign": about} if options.foreign.given else {})}
+    elif options.checkpoint is not None:
         checkpoint = read_model(options.checkpoint)
         networks = checkpoint.networks()
         passes = _passes(options, _resized(options.data, checkpoint.record), motion=networks[1] is not None)
@@ -207,6 +221,18 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
     if folder is not None and first:
         write_results(result, folder)
     return result
+
+
+def runs_alone(options: EvaluateOptions) -> bool:
+    """Return whether the checkpoint is a file that is run as it is: ONNX, or TorchScript of another system."""
+    path = locate(str(options.checkpoint))
+    alone = options.foreign.given or path.suffix.lower() == ".onnx" or is_foreign(path)
+    if alone and options.scale.method not in ("auto", "none"):
+        raise ConfigError(
+            f"scale.method={options.scale.method} measures with a saunet checkpoint, and '{options.checkpoint}' is "
+            "not one; leave it out"
+        )
+    return alone
 
 
 def evaluate_network(network: nn.Module, data: EvaluationData) -> EvaluationResult:
@@ -236,12 +262,22 @@ def _fitting(data: EvaluationData, motion: bool) -> list[str]:
     return [name for name in data.protocols if motion or protocol(name).ground_truth != "none"] or list(data.protocols)
 
 
-def _passes(options: EvaluateOptions, spec: Spec, motion: bool) -> list[tuple[EvaluationData, list[Rules]]]:
+def _passes(
+    options: EvaluateOptions, spec: Spec, motion: bool, shifted: bool = False
+) -> list[tuple[EvaluationData, list[Rules]]]:
     """Return the data modules to go through, not set up, one for each ground truth, with the protocols for each."""
     spare: list[EvaluationData] = [spec.build()]
     own, choice = spare[0].ground_truth, spec.parameters.get("depth")
     kinds = tuple(dict.fromkeys([own, *get_args(choice.annotation if choice else None)]))
-    rules = [protocol(name) for name in options.protocols or _fitting(spare[0], motion)]
+    fitting = [f"{name}/least_squares_disparity" if shifted else name for name in _fitting(spare[0], motion)]
+    rules = [protocol(name) for name in options.protocols or fitting]
+    for rule in rules if shifted else ():
+        if rule.alignment != "least_squares_disparity":
+            raise ConfigError(
+                f"protocol '{rule.name}' aligns by a factor at most, and the model's disparity has an unknown shift "
+                f"too; ask for {rule.name.partition('/')[0]}/least_squares_disparity, or set foreign.factor and "
+                "foreign.shift"
+            )
     found = []
     for kind, each in passes(rules, own).items():
         if kind not in ("none", *kinds):

@@ -39,7 +39,10 @@ class OnnxPredictor(ImagePredictor):
         self._session = open_session(self.path, device, threads)
         plain = self._session.get_modelmeta().custom_metadata_map.get(METADATA)
         if plain is None:
-            raise CheckpointError(f"{path} is an ONNX model, but not one that saunet exported: it has no model record")
+            raise CheckpointError(
+                f"{path} is an ONNX model, but not one that saunet exported: it has no model record; say what it is "
+                "with foreign.preset=... or foreign.output=... (docs/deploy.md)"
+            )
         try:
             self.record = ModelRecord.from_plain(parse_json(plain, "the model record"))
         except ValueError as reason:

@@ -23,6 +23,7 @@ from saunet.runs.record import Scale
 from saunet.weights.locate import locate
 
 if TYPE_CHECKING:
+    from saunet.prediction.foreign import ForeignOptions
     from saunet.prediction.pointcloud import Camera, PointCloud
 
 ImageLike = Any
@@ -255,9 +256,22 @@ def as_image(image: ImageLike) -> UInt8[np.ndarray, "h w 3"]:
     return as_rgb_bytes(values.transpose(1, 2, 0), "the image tensor")
 
 
-def load(source: str | Path, *, device: str = "cpu", flip: bool = False, keep_aspect: bool = False) -> ImagePredictor:
+def load(
+    source: str | Path,
+    *,
+    device: str = "cpu",
+    flip: bool = False,
+    keep_aspect: bool = False,
+    foreign: ForeignOptions | None = None,
+) -> ImagePredictor:
     """Load a trained model, however it is stored; see `saunet.load`. ONNX is run without even importing torch."""
+    from saunet.prediction.foreign import NOTHING, SCRIPT_SUFFIXES, ForeignPredictor, is_foreign
+
     path = locate(source)
+    if (foreign is not None and foreign.given) or is_foreign(path):
+        if path.suffix.lower() not in (".onnx", *SCRIPT_SUFFIXES):
+            raise ConfigError(f"foreign.* is for ONNX and TorchScript files of other systems, and {path} is neither")
+        return ForeignPredictor(path, foreign or NOTHING, device, flip, keep_aspect)
     if path.is_dir() and (path / "model.onnx").is_file() and not (path / "model.safetensors").is_file():
         path = path / "model.onnx"
     if path.suffix.lower() == ".onnx":

@@ -15,6 +15,7 @@ from saunet.io.atomic import remove_partial_files
 from saunet.io.colormaps import COLORMAPS, RunningRange
 from saunet.io.video import CODECS
 from saunet.prediction import sinks
+from saunet.prediction.foreign import NOTHING, ForeignOptions
 from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import ImagePredictor, load
 from saunet.prediction.scaling import apply_scale
@@ -60,6 +61,7 @@ class PredictOptions:
         flip: Average with the prediction of the mirrored image: twice the time, a little less error.
         keep_aspect: Feed each image at its own aspect ratio.
         scale: How depth becomes meters.
+        foreign: What an ONNX or TorchScript model of another system takes and gives.
         overwrite: Replace results that are already there, whoever made them.
         batch_size: Images that go through the network together.
         device: Where to predict; ``auto`` takes a GPU if there is one.
@@ -88,6 +90,7 @@ class PredictOptions:
     flip: bool = False
     keep_aspect: bool = False
     scale: ScaleOptions = field(default_factory=ScaleOptions)
+    foreign: ForeignOptions = NOTHING
     overwrite: bool = False
     batch_size: int = 1
     device: str = "auto"
@@ -192,7 +195,8 @@ def predict(
         outputs = tuple(dict.fromkeys(options.outputs or default))
         if predictor is None:
             device = str(usable_device(options.device))
-            predictor = load(options.checkpoint, device=device, flip=options.flip, keep_aspect=options.keep_aspect)
+            about = {"flip": options.flip, "keep_aspect": options.keep_aspect}
+            predictor = load(options.checkpoint, device=device, foreign=options.foreign, **about)
         camera, height = _camera(options, recording, predictor)
         apply_scale(options.scale, predictor, options.input, camera, folder, options.checkpoint, height)
         print(f"depth is {predictor.unit}")

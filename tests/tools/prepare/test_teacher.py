@@ -3,13 +3,20 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import torch
 from prepare_tree import name
 
 from saunet.data.loading.stored import DepthMaps
-from saunet.errors import DataError
+from saunet.errors import ConfigError, DataError
+from saunet.prediction.foreign import ForeignOptions
 from saunet.prediction.prediction import ImagePredictor
 from saunet.tools.prepare.targets import FileTeacher, ModelTeacher, teach
-from saunet.tools.prepare.tool import kitti_recordings
+from saunet.tools.prepare.tool import PrepareOptions, kitti_recordings, prepare
+
+
+class Mean(torch.nn.Module):
+    def forward(self, x):
+        return x.mean(1)
 
 
 class Brightness(ImagePredictor):
@@ -84,3 +91,18 @@ def test_what_cannot_work_is_one_sentence(tree, tmp_path):
     np.save(tmp_path / "one" / "0000000000.npy", np.ones((20, 60)))
     with pytest.raises(DataError, match=r"has no depth for .*0000000001.png; expected"):
         teach(recordings, FileTeacher(tmp_path / "one"))
+
+
+def test_models_of_other_systems_teach_depth_but_not_disparity_of_unknown_shift(tree, tmp_path):
+    path = tmp_path / "mean.ts"
+    torch.jit.trace(Mean(), torch.rand(1, 3, 16, 48)).save(str(path))
+    about = {"height": 16, "width": 48, "run_code": True}
+    shared = {"job": "teacher", "root": str(tree), "cameras": ("left",), "checkpoint": str(path), "device": "cpu"}
+    said = prepare(PrepareOptions(**shared, foreign=ForeignOptions(output="depth", factor=20.0, **about)))
+    assert said.made == 10
+    drive = kitti_recordings(tree, ["left"])[0][0]
+    small = cv2.resize(drive.image(2), (48, 16), interpolation=cv2.INTER_AREA) / 255
+    stored = DepthMaps("teacher").read(drive, 2)
+    assert stored.mean() == pytest.approx(20 * small.mean(), rel=0.05)
+    with pytest.raises(ConfigError, match="unknown shift"):
+        prepare(PrepareOptions(**shared, foreign=ForeignOptions(output="affine_disparity", **about)))

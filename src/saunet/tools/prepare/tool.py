@@ -14,6 +14,8 @@ from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.stored import DENSE_KINDS, CacheSettings
 from saunet.data.loading.windows import other_view
 from saunet.errors import ConfigError, DataError, checked, one_of, positive, suggest, usable_device
+from saunet.prediction.foreign import NOTHING, ForeignOptions, ForeignPredictor
+from saunet.prediction.prediction import load
 from saunet.registry import Spec
 from saunet.threads import available_cores
 from saunet.tools.prepare.cache import CacheReport, build_cache
@@ -25,7 +27,7 @@ _KITTI = ("root", "cameras", "drives", "split")
 _SHARED = ("job", *_KITTI, "folder", "on_error")
 KEYS: dict[str, tuple[str, ...]] = {
     "densify": (*_SHARED, "kinds", "depth", "workers"),
-    "teacher": (*_SHARED, "checkpoint", "input", "values", "device"),
+    "teacher": (*_SHARED, "checkpoint", "foreign", "input", "values", "device"),
     "cache": (*_SHARED, "data", "height", "width", "format", "quality", "workers"),
 }
 """Job -> the options that it reads."""
@@ -65,6 +67,8 @@ class PrepareOptions:
     """``densify``: the ground truth to start from, ``camera_z`` (scans) or ``improved`` (KITTI's accumulated depth)."""
     checkpoint: str | None = None
     """``teacher``: the trained model that predicts the depth."""
+    foreign: ForeignOptions = NOTHING
+    """``teacher``: what an ONNX or TorchScript model of another system takes and gives."""
     input: str | None = None
     """``teacher``: a folder of depth that another system predicted."""
     values: Values = "depth"
@@ -157,9 +161,13 @@ def _teacher(options: PrepareOptions) -> ModelTeacher | FileTeacher:
     device = str(usable_device(options.device))
     if options.input is not None:
         return FileTeacher(options.input, options.values)
-    from saunet.prediction.predictor import Predictor
-
-    return ModelTeacher(Predictor.from_checkpoint(str(options.checkpoint), device))
+    predictor = load(str(options.checkpoint), device=device, foreign=options.foreign)
+    if isinstance(predictor, ForeignPredictor) and predictor.shifted:
+        raise ConfigError(
+            f"{options.checkpoint} gives disparity with an unknown shift, of which no depth up to scale can be made; "
+            "set foreign.factor and foreign.shift, or use a teacher that gives depth"
+        )
+    return ModelTeacher(predictor)
 
 
 def kitti_recordings(
