@@ -11,6 +11,7 @@ most expensive operations::
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import time
 from collections.abc import Iterator
@@ -28,6 +29,7 @@ from saunet.data.loading.windows import DRAWS
 from saunet.registry import instantiate
 from saunet.training.speed import Speed
 from saunet.training.tool import TrainOptions, assemble
+from saunet.types import Views
 
 SIZE = (192, 640)
 
@@ -87,15 +89,15 @@ def step(model: Any, data: Any, frames: Any, optimizer: Any, timer: Any, precisi
             pyramid = model.depth(batch["target"])
         with timer("3 pose network"):
             poses = model.motion(batch)
-        with timer("4 view synthesis"):
-            views = model.synthesize(batch, pyramid, poses)
-        with timer("5 losses"):
+        with timer("4 view synthesis and losses"):  # on a CPU with their gradients
+            synthesize = functools.partial(model.synthesize, batch, pyramid, poses)
+            views = synthesize() if model.speed.compile else Views(len(pyramid.disparity), synthesize)
             terms = model.objective(batch, pyramid, poses, views)
-    with timer("6 backward, view synthesis and losses"):
+    with timer("5 backward, view synthesis and losses"):
         gradients = torch.autograd.grad(terms.total, [*pyramid.sigmoid, poses])
-    with timer("7 backward, networks"):
+    with timer("6 backward, networks"):
         torch.autograd.backward([*pyramid.sigmoid, poses], list(gradients))
-    with timer("8 optimizer"):
+    with timer("7 optimizer"):
         optimizer.step()
         optimizer.zero_grad()
 
@@ -116,7 +118,8 @@ def main() -> None:
     model, data = build(options.overrides, options.batch)
     model.to(options.device).train()
     data.augment.to(options.device)
-    Speed(compile=options.compile, checkpoint_activations=options.checkpoint_activations).apply(model)
+    model.speed = Speed(compile=options.compile, checkpoint_activations=options.checkpoint_activations)
+    model.speed.apply(model)
     frames = random_frames(options.batch, len(data.offsets), options.device)
     fused = options.device == "cuda"
     optimizer = torch.optim.Adam(model.parameters(), 1e-4, fused=fused)

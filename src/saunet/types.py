@@ -6,8 +6,9 @@ Results are frozen slotted dataclasses whose tuples are indexed by scale (0 = fu
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
@@ -101,6 +102,22 @@ class View:
     image: Float[Tensor, "b s 3 h w"]
     valid: Bool[Tensor, "b s 1 h w"]
     """The point lies in front of the source camera and projects into its image."""
+
+
+class Views(Sequence[View]):
+    """The views of all scales, made when one is first asked for: a loss that needs none saves their memory."""
+
+    def __init__(self, scales: int, make: Callable[[], tuple[View, ...]]) -> None:
+        self._scales, self._make = scales, make
+        self._made: tuple[View, ...] | None = None
+
+    def __len__(self) -> int:
+        return self._scales
+
+    def __getitem__(self, scale: Any) -> Any:
+        if self._made is None:
+            self._made = self._make()
+        return self._made[scale]
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from training_options import train_options
 
 from saunet.data.loading.module import DepthDataModule
-from saunet.losses import functional, terms
+from saunet.losses import one_pass
 from saunet.registry import objectives
 from saunet.training.module import SelfSupervisedDepth
 from saunet.training.monitors import NonFinite, health
@@ -85,25 +85,26 @@ def test_watching_for_nan_does_not_wait_for_the_device(tmp_path: Path) -> None:
     assert +waits.found == Counter()
 
 
-def test_identity_losses_once_and_one_ssim_pass_a_scale(
+def test_identity_losses_once_and_one_comparison_a_scale(
     model: SelfSupervisedDepth, walls: DepthDataModule, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    passes: list[tuple[tuple[int, ...], bool]] = []
-    ssim = functional.ssim_loss
+    kept: list[int | None] = []
+    error = one_pass._Comparison.error
 
-    def counted(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        passes.append((tuple(prediction.shape), torch.is_grad_enabled()))
-        return ssim(prediction, target)
+    def counted(self: Any, image: torch.Tensor, keep: int | None = None) -> torch.Tensor:
+        kept.append(keep)
+        return error(self, image, keep)
 
-    monkeypatch.setattr(functional, "ssim_loss", counted)
-    assert terms.photometric_error is functional.photometric_error  # which looks ssim_loss up when it is called
+    monkeypatch.setattr(one_pass._Comparison, "error", counted)
+    monkeypatch.setattr(model, "synthesize", lambda *_: pytest.fail("views are made that no term asks for"))
+    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # to check the type of views, one is looked at
     walls.setup("fit")
     batch: Any = walls.on_after_batch_transfer(next(iter(walls.train_dataloader())), 0)
     _, _, views, _ = model.step(batch)
-    both_sources = tuple(batch["loss_sources"].shape)
+    images = len(batch["name"])
     assert len(views) == 4
-    assert [shape for shape, _ in passes] == [both_sources] * 5  # four scales, and the unwarped sources once
-    assert [learns for _, learns in passes].count(False) == 1
+    # Each image: both sources as they are, and both at each of four scales, with their gradients.
+    assert kept == [None, None, *[0, 1] * 4] * images
 
 
 @pytest.mark.gpu

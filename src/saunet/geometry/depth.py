@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -44,6 +45,14 @@ def disparity_to_depth(disparity: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         tensor([ 2., 10.])
     """
     return disparity.reciprocal()
+
+
+@full_precision
+def enlarge(disparity: Float[Tensor, "b 1 _ _"], height: int, width: int) -> Float[Tensor, "b 1 {height} {width}"]:
+    """Disparity of a coarse scale at full size, bilinear."""
+    if disparity.shape[-2:] == (height, width):
+        return disparity
+    return F.interpolate(disparity, size=(height, width), mode="bilinear", align_corners=False)
 
 
 @full_precision

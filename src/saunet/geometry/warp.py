@@ -20,7 +20,8 @@ FAR = 1e6
 """Meters that stand for infinity: no parallax is left, and 0 * infinity does not occur."""
 BORDER = 1e-2
 """Pixels beyond the outermost pixel centers still inside: more than float32 rounding, too little to see."""
-_BEHIND = -2.0
+BEHIND = -2.0
+"""Pixel, in both axes, of a point that no source sees: outside every image."""
 
 
 @full_precision
@@ -93,7 +94,7 @@ def project_each(
     fx, skew, cx, fy, cy = (entry[:, None] for entry in _entries(K))
     x, y = x / safe, y / safe
     pixels = torch.stack((fx * x + skew * y + cx, fy * y + cy), dim=-1)
-    return torch.where(front[..., None], pixels, torch.full_like(pixels, _BEHIND)), z
+    return torch.where(front[..., None], pixels, torch.full_like(pixels, BEHIND)), z
 
 
 @full_precision

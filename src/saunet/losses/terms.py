@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from saunet.errors import ConfigError, in_range, one_of, positive
-from saunet.geometry.depth import median_ratio
+from saunet.geometry.depth import enlarge, median_ratio
 from saunet.geometry.warp import FAR, backproject, project_each, sample, visible
+from saunet.losses import one_pass
 from saunet.losses.base import Term, TermResult, require
 from saunet.losses.functional import (
     automask,
@@ -25,7 +26,7 @@ from saunet.losses.functional import (
     smoothness_loss,
 )
 from saunet.registry import terms
-from saunet.types import DepthPyramid, TrainBatch, View
+from saunet.types import DepthPyramid, TrainBatch, View, Views
 
 _TARGETS = {
     "lidar": ("target_depth", "set data.target_depth=true, or target: image, which needs no ground truth"),
@@ -73,6 +74,8 @@ class Photometric(Term):
     def forward(
         self, batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"], views: Sequence[View]
     ) -> TermResult:
+        if isinstance(views, Views) and one_pass.takes(batch):
+            return self._in_one_pass(batch, pyramid, poses)
         target = batch["loss_target"][:, None]
         identity = self._identity(batch["loss_sources"], target) if self.automask else None
         values: list[Tensor] = []
@@ -88,6 +91,21 @@ class Photometric(Term):
                 kind = "automask" if self.automask else "visible"
                 maps = {"photometric_error": error.detach(), kind: mask.to(error.dtype)}
         return TermResult(value=torch.stack(values).mean(), maps=maps)
+
+    def _in_one_pass(self, batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"]) -> TermResult:
+        """Do what `forward` does, without the views."""
+        target, noise = batch["loss_target"], None
+        if self.automask and self.training and self.noise > 0:
+            noise = torch.stack([self.noise * torch.randn_like(target[:, 0]) for _ in pyramid.disparity])
+        disparities = [enlarge(disparity, *target.shape[-2:]) for disparity in pyramid.disparity]
+        choices = one_pass.Choices(
+            self.ssim_weight, self.sources == "minimum", self.automask, self.reduction == "masked", self.use_validity
+        )
+        values, error, counted = one_pass.photometric(
+            poses, batch["K"], target, batch["loss_sources"], noise, disparities, choices
+        )
+        kind = "automask" if self.automask else "visible"
+        return TermResult(value=values.mean(), maps={"photometric_error": error, kind: counted})
 
     @torch.no_grad()
     def _identity(self, sources: Tensor, target: Tensor) -> Tensor:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,10 @@ from lightning import Callback, LightningModule
 from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from saunet.errors import ConfigError
 from saunet.geometry import warp
-from saunet.geometry.depth import disparity_to_depth
+from saunet.geometry.depth import disparity_to_depth, enlarge
 from saunet.losses.base import Objective
 from saunet.metrics.depth import DepthMetrics
 from saunet.runs.folder import RunRecord
@@ -26,7 +26,7 @@ from saunet.training.monitors import health
 from saunet.training.optim import MovingAverage, Recipe
 from saunet.training.resume import continuation, owe_validation, validation_due
 from saunet.training.speed import Speed
-from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
+from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View, Views
 
 EPOCH_LOSS = "train/loss_epoch"
 """Name of the mean of ``train/loss`` over an epoch and all processes, which is itself the last batch's."""
@@ -106,11 +106,12 @@ class SelfSupervisedDepth(LightningModule):
         means: Tensor = trainer.strategy.reduce(stacked, reduce_op="mean")
         return dict(zip(figures, means.unbind(), strict=True))
 
-    def step(self, batch: TrainBatch) -> tuple[DepthPyramid, Float[Tensor, "b s 4 4"], tuple[View, ...], LossTerms]:
+    def step(self, batch: TrainBatch) -> tuple[DepthPyramid, Float[Tensor, "b s 4 4"], Sequence[View], LossTerms]:
         """Predict depth and motion, synthesize the target from its neighbors, and compare."""
         pyramid: DepthPyramid = self.depth(batch["target"])  # Z_t
         poses = self.motion(batch)  # D_{t->t'}
-        views = self.synthesize(batch, pyramid, poses)  # H_{t'->t}, eq. (7)
+        synthesize = functools.partial(self.synthesize, batch, pyramid, poses)  # H_{t'->t}, eq. (7)
+        views = synthesize() if self.speed.compile else Views(len(pyramid.disparity), synthesize)
         if self.objective.needs_source_depth:
             near: DepthPyramid = self.depth(batch["sources"].flatten(0, 1))
             shape = (*batch["sources"].shape[:2], *near.depth[0].shape[1:])
@@ -139,14 +140,9 @@ class SelfSupervisedDepth(LightningModule):
         Coarse disparity is enlarged to full resolution first (Monodepth2): sampling small images would leave holes in
         the gradient and copy texture into depth.
         """
-        size = batch["loss_target"].shape[-2:]
-        views = []
-        for disparity in pyramid.disparity:
-            full = disparity
-            if disparity.shape[-2:] != size:
-                full = F.interpolate(disparity, size=size, mode="bilinear", align_corners=False)
-            views.append(warp.synthesize(batch["loss_sources"], disparity_to_depth(full), batch["K"], poses))
-        return tuple(views)
+        height, width = batch["loss_target"].shape[-2:]
+        depths = [disparity_to_depth(enlarge(disparity, height, width)) for disparity in pyramid.disparity]
+        return tuple(warp.synthesize(batch["loss_sources"], depth, batch["K"], poses) for depth in depths)
 
     def validation_step(self, batch: EvalBatch, batch_idx: int) -> None:
         """Score depth where there is ground truth, and the loss where the batch has neighbors."""
