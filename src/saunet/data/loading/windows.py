@@ -183,6 +183,8 @@ class WindowDataset(Dataset[dict[str, Any]]):
             sample["depth"] = torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32))[None]
         for key, maps in self.maps.items():
             sample[key] = self._sized(maps.read(drive, frame))
+        if self.stereo:
+            sample["T_stereo_tgt"] = torch.from_numpy(np.asarray(T_stereo_tgt, np.float64)).float()
         if self.with_mask:
             mask = np.ones(self.size, np.bool_) if drive.scene_mask is None else drive.scene_mask
             shown = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
