@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, ConfigError, divisible, suggest
+from saunet.models.pretrained import read_state
 from saunet.registry import encoders
 from saunet.types import FeatureSpec
 
@@ -55,6 +57,8 @@ class TimmEncoder(nn.Module):
                     f"timm cannot give '{model}' the weights '{weights}' ({text}); give a file of this network's"
                 ) from reason
             raise ConfigError(f"timm's '{model}' gives no feature maps ({type(reason).__name__}: {text})") from reason
+        if weights not in (None, "imagenet"):
+            self._check_complete(model, str(weights))
         info = self.network.feature_info
         strides = info.reduction()
         self.taken = tuple(sorted({stride: index for index, stride in enumerate(strides)}.values()))
@@ -66,6 +70,19 @@ class TimmEncoder(nn.Module):
         for name, default in (("mean", (0.485, 0.456, 0.406)), ("std", (0.229, 0.224, 0.225))):
             values = getattr(config, name, None) or default
             self.register_buffer(name, torch.tensor(values).view(3, 1, 1), persistent=False)
+
+    def _check_complete(self, model: str, weights: str) -> None:
+        """Check that a file has every weight, which timm leaves as it was where it finds none."""
+
+        def plain(name: str) -> str:  # timm names parts of a network for features with _ in place of .
+            return re.sub(r"[._]", "", name.removeprefix("model."))
+
+        given = {plain(name) for name in read_state(_existing(weights))}
+        missing = [name for name in self.network.state_dict() if plain(name) not in given]
+        missing = [name for name in missing if not name.endswith("num_batches_tracked")]
+        if missing:
+            more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
+            raise CheckpointError(f"{weights} is not a file of timm's '{model}': it lacks '{missing[0]}'{more}")
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
         divisible(image.shape[-2], image.shape[-1], self.size_divisor)
