@@ -293,8 +293,11 @@ class EvaluationResult:
             known = ~np.isnan(values)
             means = (values[known[:, place], place] for place in range(values.shape[1]))
             numbers = (float(each.mean()) if each.size else math.nan for each in means)
-            counts = {"edge_images": int(known[:, 0].sum()), "cloud_images": int(known[:, 2].sum())}
-            found.append(ShapeSummary(protocol, predictor, *numbers, **counts))
+            edges, clouds = int(known[:, 0].sum()), int(known[:, 2].sum())
+            accuracy, completeness, precision, recall, f_score = numbers
+            found.append(
+                ShapeSummary(protocol, predictor, accuracy, completeness, precision, recall, f_score, edges, clouds)
+            )
         return tuple(found)
 
     @property

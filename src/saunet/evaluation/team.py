@@ -39,7 +39,7 @@ class Team:
     def device(self, device: torch.device) -> torch.device:
         """Return a GPU of this process's own."""
         local = int(os.environ.get("LOCAL_RANK", self.rank))
-        own = device.type == "cuda" and device.index is None and self.size > 1
+        own = str(device) == "cuda" and self.size > 1  # "cuda:1" names one
         return torch.device("cuda", local % torch.cuda.device_count()) if own else device
 
 

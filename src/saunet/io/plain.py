@@ -198,7 +198,7 @@ def read_torch(path: Path, what: str, *, stand_ins: bool = False) -> Any:
     known: dict[str, type] = {}
     while True:
         try:
-            allowed = [(kind, name) for name, kind in known.items()]
+            allowed: list[Any] = [(kind, name) for name, kind in known.items()]
             with torch.serialization.safe_globals(allowed) if allowed else contextlib.nullcontext():
                 return torch.load(path, map_location="cpu", weights_only=True)
         except MemoryError:

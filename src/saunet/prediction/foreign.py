@@ -191,7 +191,7 @@ class ForeignPredictor(ImagePredictor):
         found = self.raw_disparity(images)
         if self.shifted:
             found = np.maximum(found, _SMALLEST * np.abs(found).max(axis=(1, 2), keepdims=True))
-        return np.maximum(found, np.float32(1e-9))
+        return np.asarray(np.maximum(found, np.float32(1e-9)), np.float32)
 
     def raw_disparity(self, images: Float32[np.ndarray, "b 3 h w"]) -> Float32[np.ndarray, "b _ _"]:
         """Run the model: RGB in [0, 1] to disparity, which may be 0 and below where its zero means nothing."""

@@ -148,7 +148,7 @@ def _folder_pose(path: Path, state: State) -> tuple[Spec | None, _Rules, tuple[s
     else:
         state |= found
         parts = _resnet(found, "pose_encoder.pth:encoder.")
-        names = [(r"^pose\.encoder\.", "pose_encoder.pth:encoder."), _pose_head("pose.pth:net.{}.")]
+        names: _Rules = [(r"^pose\.encoder\.", "pose_encoder.pth:encoder."), _pose_head("pose.pth:net.{}.")]
         return Spec.of("pose", "resnet18", **parts), names, ()
     return None, (), (f"the pose network ({', '.join(files)}): {why}",)
 

@@ -59,7 +59,7 @@ class DepthFilesDrive(FilesDrive):
 def pair_up(left: DepthFilesDrive, right: DepthFilesDrive, T_right_left: Array) -> None:
     """Make two recordings the two sides of a pair."""
     left.partner, right.partner = right, left
-    T_left_right: Array = np.linalg.inv(T_right_left)
+    T_left_right: Array = np.asarray(np.linalg.inv(T_right_left), np.float64)
     left.T_partner_cam, right.T_partner_cam = T_right_left, T_left_right
 
 

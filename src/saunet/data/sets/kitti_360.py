@@ -52,7 +52,7 @@ class Kitti360Drive(ScannedDrive):
         T_velo_cam0 = _rigid(_table(home / "calib_cam_to_velo.txt", 12).reshape(3, 4))
         T_car_velo = _rigid(cam_to_car["image_00"]) @ np.linalg.inv(T_velo_cam0)
         # Scans and images of one number belong to one moment, so that depth needs no pose.
-        self._T: Array = np.linalg.inv(self.T_car_cam) @ T_car_velo
+        self._T: Array = np.asarray(np.linalg.inv(self.T_car_cam) @ T_car_velo, np.float64)
         poses, times = root / "data_poses" / sequence / "poses.txt", read_timestamps(images / "timestamps.txt")
         rows = _table(poses, 13) if poses.is_file() else np.empty((0, 13))
         folder = images / ("data_rgb" if fisheye else "data_rect")
