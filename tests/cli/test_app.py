@@ -14,7 +14,7 @@ from unittest import mock
 import pytest
 from echo_tool import ECHOED, EchoOptions
 
-from saunet.cli import app
+from saunet.cli import app, table
 from saunet.cli.table import Tool
 
 ECHO = Tool(
@@ -301,3 +301,18 @@ def test_a_signal_ends_any_tool_with_a_word(
     assert stop.value.code == 128 + number
     assert f"saunet prepare: stopped by {name}" in capsys.readouterr().err
     assert tidied
+
+
+def test_keys_of_sources_that_changed_since_their_import_are_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    table._read.cache_clear()
+    monkeypatch.setattr(table, "_IMPORTED", 0)
+    assert "predict" in table.read().tools
+    assert not list(tmp_path.rglob("keys-*"))
+    table._read.cache_clear()
+    monkeypatch.setattr(table, "_IMPORTED", time.time_ns())
+    table.read()
+    assert list(tmp_path.rglob("keys-*.json"))
+    table._read.cache_clear()

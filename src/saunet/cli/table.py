@@ -12,6 +12,7 @@ import os
 import pkgutil
 import re
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -125,6 +126,8 @@ PLUGINS = schema.Key(
 """The key that every tool has beside those of its options."""
 HIDDEN = {"base", "lightning"}
 """Members of config groups that others build on and nobody chooses."""
+_IMPORTED = time.time_ns()
+"""About when this process imported the sources: a table made later, of sources that changed since, is not kept."""
 
 
 def config_dir() -> Path:
@@ -206,10 +209,11 @@ def _read(state: str, cache_home: str | None, registered: tuple[Entry, ...]) -> 
     if plain is None or plain["state"] != state:
         plain = {"state": state, **_make()}
         with suppress(OSError):  # without a cache folder it is only slower
-            file.parent.mkdir(parents=True, exist_ok=True)
-            temporary = file.with_suffix(f".{os.getpid()}")
-            temporary.write_text(json.dumps(plain))
-            temporary.replace(file)
+            if all(path.stat().st_mtime_ns <= _IMPORTED for path in _sources()):
+                file.parent.mkdir(parents=True, exist_ok=True)
+                temporary = file.with_suffix(f".{os.getpid()}")
+                temporary.write_text(json.dumps(plain))
+                temporary.replace(file)
     tools = {name: replace(each, keys=(*each.keys, PLUGINS)) for name, each in _nodes(plain["tools"]).items()}
     components = {kind: _nodes(each) for kind, each in plain["components"].items()}
     for kind, registry in REGISTRIES.items():
@@ -226,9 +230,13 @@ def _nodes(plain: Mapping[str, Mapping[str, object]]) -> dict[str, schema.Node]:
     return {name: schema.Node.from_plain(each) for name, each in plain.items()}
 
 
+def _sources() -> list[Path]:
+    return sorted(Path(saunet.__path__[0]).rglob("*.py"))
+
+
 def _state() -> str:
     """Return what the table depends on: our sources, the folders of installed packages, and Python."""
-    sources = [path.stat() for path in sorted(Path(saunet.__path__[0]).rglob("*.py"))]
+    sources = [path.stat() for path in _sources()]
     folders = [Path(each) for each in sys.path if Path(each).name in ("site-packages", "dist-packages")]
     packages = [each.stat().st_mtime_ns for each in folders if each.is_dir()]
     state = [sys.version, saunet.__version__, [(each.st_mtime_ns, each.st_size) for each in sources], packages]
