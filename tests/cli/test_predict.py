@@ -25,8 +25,9 @@ from saunet.runs.record import ModelRecord
 @pytest.fixture(scope="module")
 def checkpoint(node: Callable[..., dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained model on disk."""
-    parts = {"encoder": node("encoder", "resnet18"), "decoder": node("decoder", "unet"), "pose": None}
-    record = ModelRecord(**parts, min_depth=0.1, max_depth=100.0, height=32, width=64)
+    encoder = {**node("encoder", "resnet18"), "blocks": [1, 1, 1, 1]}
+    decoder = {**node("decoder", "unet"), "channels": [8] * 5}
+    record = ModelRecord(encoder, decoder, None, min_depth=0.1, max_depth=100.0, height=32, width=64)
     depth, _ = build_networks(record)
     path = tmp_path_factory.mktemp("model") / "x.ckpt"
     state = dict(nn.ModuleDict({"depth": depth}).state_dict())

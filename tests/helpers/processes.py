@@ -27,7 +27,7 @@ def _server() -> socket.socket:
         server = subprocess.Popen([sys.executable, str(program), str(theirs.fileno())], pass_fds=[theirs.fileno()])
 
     def end() -> None:
-        ours.close()
+        server.terminate()
         server.wait()
 
     atexit.register(end)
