@@ -253,8 +253,9 @@ def test_speeds_of_a_clip_of_which_every_third_frame_is_used(given: float | None
     scale = ScaleOptions(method="speed", speeds=str(tmp_path / "speeds.csv"), fps=given)
     options = EvaluateOptions(data=Spec({}), checkpoint="x", scale=scale, output_dir=str(tmp_path / "out"))
     inspect.unwrap(_scaled)(
-        options, SimpleNamespace(scale=None, offsets=(-1, 1)), (Flat(), StraightOn()), data, torch.device("cpu")
-    )
+        options, SimpleNamespace(scale=None, offsets=(-1, 1)), (Flat(), StraightOn()), data, torch.device("cpu"),
+        first=True,
+    )  # fmt: skip
     found = json.loads((tmp_path / "out" / "scale.json").read_text())["per_frame"]
     (drive,) = data.datasets["test"].drives
     assert len(found) >= 3

@@ -17,6 +17,7 @@ from prepare_tree import name
 
 from saunet.data.loading.stored import CacheSettings, ImageCache
 from saunet.errors import ConfigError, DataError
+from saunet.io.atomic import partial_name
 from saunet.io.images import read_image, resize
 from saunet.tools.prepare.cache import build_cache
 from saunet.tools.prepare.tool import kitti_recordings
@@ -63,7 +64,7 @@ def test_damaged_and_missing_copies_are_made_again(tree, tmp_path):
     home = folder / name(1) / "l"
     (home / "0000000001.jpg").write_bytes(b"garbage")
     (home / "0000000002.jpg").unlink()
-    (home / ".0000000004.77.partial.jpg").write_bytes(b"half")
+    (home / partial_name("0000000004", ".jpg").replace(str(os.getpid()), "999999999")).write_bytes(b"half")
     report = build_cache(recordings, folder, SMALL)
     assert (report.made, report.replaced, report.verified) == (2, 1, 8)
     assert content(folder) == expected

@@ -10,6 +10,7 @@ from prepare_tree import name
 
 from saunet.data.loading.stored import DepthMaps
 from saunet.errors import ConfigError, DataError
+from saunet.io.atomic import partial_name
 from saunet.io.images import read_depth
 from saunet.tools.prepare.targets import densify, densify_map, interpolate
 from saunet.tools.prepare.tool import kitti_recordings
@@ -72,7 +73,7 @@ def test_a_tree_is_densified_once_and_completed(tree):
     assert len(stamps) == 20
     lost = next(iter(stamps))
     lost.unlink()
-    leftover = lost.with_name(".0000000003.99.partial.png")
+    leftover = lost.with_name(partial_name("0000000003", ".png").replace(str(os.getpid()), "999999999"))
     leftover.write_bytes(b"half")
     done = densify(recordings, ["linear", "colorization"])
     assert (done.made, done.before) == (1, 9)
