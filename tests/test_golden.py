@@ -18,7 +18,7 @@ from saunet.registry import instantiate
 from saunet.training.tool import assemble
 
 GOLDEN: dict[str, list[float]] = {
-    "saunet": [1.4267, 1.39975, 1.28687, 1.25977],  # per image since the masked mean does not pool the batch
+    "saunet": [1.41698, 1.4019, 1.2878, 1.26001],  # the auto-mask's near ties in the flat sky hang on the last digits
     "monodepth2": [0.13076, 0.11966, 0.10443, 0.09828],
 }
 

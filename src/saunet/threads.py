@@ -78,8 +78,9 @@ class Usage:
             return None
         tick = os.sysconf("SC_CLK_TCK")
         user, nice, system, _, _, interrupts, soft = map(int, first[1:8])
+        children = multiprocessing.active_children()  # which also collects those that have ended, so it comes first
         own = sum(os.times()[:4])
-        for child in multiprocessing.active_children():
+        for child in children:
             fields = _read(Path(f"/proc/{child.pid}/stat")).rpartition(")")[2].split()
             own += sum(map(int, fields[11:15])) / tick
         return Usage(time.monotonic(), (user + nice + system + interrupts + soft) / tick, own)

@@ -118,6 +118,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "Drive": {},
     "EvaluateOptions": {},
     "ExportOptions": PATHS,
+    "ForeignOptions": {},
     "ModelOptions": MODEL,
     "OdometryOptions": {},
     "PredictOptions": {**PATHS, "input": "/nowhere/images"},

@@ -175,6 +175,26 @@ def test_what_learns_otherwise_gets_the_separate_operations(key: str, make_input
     assert not one_pass.takes({**inputs.batch, "loss_target": inputs.batch["loss_target"][..., :3]})
 
 
+def test_pixels_of_the_own_vehicle_are_left_out(make_inputs: Make) -> None:
+    inputs = make_inputs()
+    inputs.batch["target_mask"] = (torch.rand_like(inputs.batch["loss_target"][:, :1]) > 0.5).float()
+    ours, separate = both(Photometric(), inputs)
+    assert ours.value == separate.value
+    assert not ours.maps["automask"][inputs.batch["target_mask"] == 0].any()
+
+
+def test_near_ties_of_bright_flat_areas_fall_as_in_double_precision(make_inputs: Make) -> None:
+    torch.manual_seed(0)
+    inputs = make_inputs()
+    for key in ("loss_target", "loss_sources"):
+        inputs.batch[key] = 0.9 + 0.01 * inputs.batch[key]
+    term = Photometric(noise=0.0)
+    ours, separate = both(term, inputs)
+    exact = both(term, double(inputs))[1].maps["photometric_error"]
+    errors = [(each.maps["photometric_error"] - exact).abs().mean() for each in (ours, separate)]
+    assert errors[0] < 0.5 * errors[1]
+
+
 def test_views_are_made_once_and_when_asked_for(make_inputs: Make) -> None:
     made: list[int] = []
     inputs = make_inputs(scales=2)

@@ -171,7 +171,8 @@ class Table:
     def type(self, tool: str, key: str) -> str:
         """Return the type of a key as `saunet.schema.Key.type`; ``any`` for one that is not known."""
         found = {each.type for each in self.known(tool, key)}
-        return found.pop() if len(found) == 1 else "any"
+        alike = {each.rstrip("?") for each in found}  # one data set may need a folder that another can do without
+        return "any" if len(alike) != 1 else found.pop() if len(found) == 1 else f"{alike.pop()}?"
 
     def by_path(self, path: object) -> schema.Node | None:
         """Return the keys of what a ``_target_`` names; None if it is no component."""

@@ -5,7 +5,7 @@ scales are kept for the gradient. Here the few maps at work stay in the processo
 
 - A pixel (u, v) of disparity D is seen at (M (u, v, 1) + D m) / w, where w is the third row, M = A R K^-1, m = A t, and
   A is K followed by the scaling to [-1, 1]. Depth is never formed, and only D, M and m get gradients.
-- Box sums stand for box means: C1 and C2 of SSIM are multiplied by 81, and what is constant is added before summing.
+- Box sums stand for box means: C1 and C2 of SSIM are multiplied by 81.
 - A mask is a number, 1.0 or 0.0: on a CPU, choosing by truth values costs ten times a multiplication.
 """
 
@@ -27,6 +27,8 @@ from saunet.geometry.warp import BEHIND, BORDER, FAR, MIN_Z
 from saunet.types import TrainBatch
 
 _C1, _C2 = 81 * 0.01**2, 81 * 0.03**2
+_CENTER = 0.5
+"""Taken from the images before they are squared: the small variances of bright, flat areas (sky) keep their digits."""
 _UNSEEN = 1e6
 """Added to the error of a source that does not count: more than any error."""
 
@@ -46,7 +48,8 @@ def takes(batch: TrainBatch) -> bool:
     """Return whether a batch can be compared in one pass: on a CPU, where nothing but disparities and poses learns."""
     given = batch["loss_target"], batch["loss_sources"], batch["K"]
     large = min(given[0].shape[-2:]) >= 4
-    return large and given[0].device.type == "cpu" and not any(each.requires_grad for each in given)
+    plain = "target_mask" not in batch  # pixels left out are the separate operations' matter
+    return plain and large and given[0].device.type == "cpu" and not any(each.requires_grad for each in given)
 
 
 @full_precision
@@ -224,49 +227,58 @@ class _Warp:
 
 
 class _Comparison:
-    """SSIM and absolute difference to one image, with the slopes for every source; its maps are made once."""
+    """SSIM and absolute difference to one image, with the slopes for every source; its maps are made once.
+
+    With x and y about `_CENTER`, X and Y the box sums of these, and A and B those of the images themselves:
+    n1 = 2 A B + C1, d1 = A^2 + B^2 + C1, n2 = 18 sum(x y) - 2 X Y + C2, d2 = 9 sum(x^2 + y^2) - X^2 - Y^2 + C2.
+    """
 
     def __init__(self, like: Tensor, count: int, ssim_weight: float, learns: bool) -> None:
         shape = like.shape[1:]
         self.weight = ssim_weight
         self.kept = like.new_empty(count if learns else 1, 4, *shape)  # what remains of each source for its slope
-        self.stats, self.work = like.new_empty(4, *shape), like.new_empty(6, *shape)
+        self.stats, self.work = like.new_empty(7, *shape), like.new_empty(7, *shape)
         self.gradient = like.new_empty(count if learns else 0, *shape)
-        self.added = [like.new_full(shape[-1:], value) for value in ((_C1 + _C2) / 9, _C1)]
+        self.C2 = like.new_full(shape[-1:], _C2 / 9)
 
     def look_at(self, target: Tensor) -> None:
         """Compare with this image, 3 h w, from now on."""
         self.target = target
-        t18, double, square, constant = self.stats
-        torch.mul(target, 18, out=t18)
-        mean = _box(target, double, self.work[0])
-        torch.addcmul(self.added[1], mean, mean, out=square)
-        mean.mul_(2)
-        torch.addcmul(self.added[0], target, target, value=9, out=constant)
+        t18, double, twice, first, second, constant, square = self.stats
+        y = torch.sub(target, _CENTER, out=self.work[1])
+        torch.mul(y, 18, out=t18)
+        torch.addcmul(self.C2, y, y, value=9, out=constant)
+        Y = _box(y, double, self.work[0])
+        torch.mul(Y, Y, out=square)
+        B = torch.add(Y, 9 * _CENTER, out=self.work[0])
+        torch.mul(B, 2, out=twice)
+        torch.mul(twice, 9 * _CENTER, out=first).add_(_C1)
+        torch.mul(B, B, out=second).add_(81 * _CENTER**2 + _C1)
+        double.mul_(2)
 
     def error(self, image: Tensor, keep: int | None = None) -> Tensor:
         """Return the error of an image, h w; ``keep`` is the source whose slopes are kept."""
         difference, p, q, a = self.kept[keep or 0]
-        product, squares, n1, d1, den, work = self.work
+        product, squares, n1, d1, den, work, x = self.work
         error = torch.abs(torch.sub(image, self.target, out=difference), out=work).sum(0).mul_((1 - self.weight) / 3)
         if self.weight == 0:
             return error
-        t18, double, square, constant = self.stats
-        mean = _box(image, a, work)
-        n2 = _box(torch.addcmul(self.added[0], image, t18, out=den), product, work)
-        d2 = _box(torch.addcmul(constant, image, image, value=9, out=den), squares, work)
-        torch.addcmul(self.added[1], mean, double, out=n1)
-        torch.addcmul(square, mean, mean, out=d1)
-        n2.sub_(n1)
-        d2.sub_(d1)
+        t18, double, twice, first, second, constant, square = self.stats
+        torch.sub(image, _CENTER, out=x)
+        X = _box(x, a, work)
+        n2 = _box(torch.addcmul(self.C2, x, t18, out=den), product, work).addcmul_(X, double, value=-1)
+        d2 = _box(torch.addcmul(constant, x, x, value=9, out=den), squares, work).addcmul_(X, X, value=-1).sub_(square)
+        torch.addcmul(first, X, twice, out=n1)
+        torch.addcmul(second, X, X, out=d1).add_(X, alpha=18 * _CENTER)
         torch.mul(d1, d2, out=den)
         torch.div(n1, den, out=p)  # SSIM is n1 n2 / (d1 d2). Its slope by the box sum of the products is 18 p,
         similarity = torch.mul(p, n2, out=n1)
         if keep is not None:
             torch.div(similarity, d2, out=q)  # by that of the squares -9 q,
-            torch.addcdiv(p, n2, den, value=-1, out=n2).mul_(double)
-            torch.addcdiv(q, similarity, d1, value=-1, out=d1)
-            torch.addcmul(n2, mean, d1, value=-2, out=a)  # and by that of the image -a
+            n2.div_(den)
+            torch.div(similarity, d1, out=d1)
+            torch.sub(p, n2, out=den).mul_(double).addcmul_(torch.sub(q, d1, out=work), X, value=-2)
+            torch.add(den, d1.sub_(n2), alpha=18 * _CENTER, out=a)  # and by that of the image -a
         return error.add_(similarity.clamp_(-1, 1).sum(0).neg_().add_(3), alpha=self.weight / 6)
 
     def slope(self, image: Tensor, keep: int, grad: Tensor) -> None:
@@ -279,7 +291,8 @@ class _Comparison:
             part = grad * (self.weight / 6)
             _box(a.mul_(part), slope, work, adjoint=True)
             slope.addcmul_(self.stats[0], _box(p.mul_(part), box, work, adjoint=True), value=-1)
-            slope.addcmul_(image, _box(q.mul_(part), box, work, adjoint=True), value=18)
+            _box(q.mul_(part), box, work, adjoint=True)
+            slope.addcmul_(image, box, value=18).add_(box, alpha=-18 * _CENTER)
         slope.addcmul_(difference.sign_(), grad, value=(1 - self.weight) / 3)
 
 
