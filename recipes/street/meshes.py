@@ -225,6 +225,47 @@ def tree(rng: np.random.Generator, bark: int, leaf: int, height: float, detail: 
     return soup
 
 
+def young_tree(rng: np.random.Generator, bark: int, leaf: int, stake: int, height: float, detail: float = 1.0) -> Soup:
+    """Return a newly planted tree, as along streets: a thin bare stem, a small open crown, and often stakes around."""
+    soup = Soup()
+    stem, radius = height * rng.uniform(0.3, 0.5), rng.uniform(0.03, 0.08)
+    soup.add(
+        tube([[0, -0.3, 0], [0, stem, 0], [rng.normal(0, 0.05), height * 0.9, 0]], [radius, radius * 0.8, 0.01], 6),
+        bark,
+    )
+    width = height * rng.uniform(0.12, 0.26)
+    up = rng.uniform(0.05, 0.95, 7)
+    around = rng.uniform(0, 2 * np.pi, 7)
+    out = width * rng.uniform(0.2, 0.8, 7) * np.sin(np.pi * (0.2 + 0.7 * up))
+    centers = np.stack([out * np.cos(around), stem + (height - stem) * up * 0.92, out * np.sin(around)], 1)
+    radii = np.stack(
+        [
+            width * rng.uniform(0.35, 0.7, 7),
+            (height - stem) * rng.uniform(0.12, 0.25, 7),
+            width * rng.uniform(0.35, 0.7, 7),
+        ],
+        1,
+    )
+    for tip in centers:
+        soup.add(tube([[0, stem * rng.uniform(0.9, 1.3), 0], tip], [radius * 0.4, 0.01], 4), bark)
+    triangles, tint = leaves(
+        rng, centers, radii, int(detail * rng.uniform(250, 1200)), 0.055 * height**0.6 / detail**0.5
+    )
+    soup.add(triangles, leaf, tint=tint)
+    if rng.uniform() < 0.5:
+        count, away, tall = int(rng.integers(2, 5)), rng.uniform(0.25, 0.6), stem * rng.uniform(0.7, 1.1)
+        feet = [(np.cos(a), np.sin(a)) for a in 2 * np.pi * (np.arange(count) / count + rng.uniform())]
+        lean = rng.uniform(0.3, 1.0)
+        for x, z in feet:
+            soup.add(
+                tube([[away * x, -0.2, away * z], [away * x * lean, tall, away * z * lean]], [0.04, 0.04], 5), stake
+            )
+        for (x0, z0), (x1, z1) in zip(feet, feet[1:] + feet[:1], strict=True):
+            a = away * lean
+            soup.add(tube([[a * x0, tall * 0.95, a * z0], [a * x1, tall * 0.95, a * z1]], [0.03, 0.03], 4), stake)
+    return soup
+
+
 def conifer(rng: np.random.Generator, bark: int, leaf: int, height: float, detail: float = 1.0) -> Soup:
     """Return a conifer: layers of drooping leaf clusters on a straight trunk."""
     soup = Soup()

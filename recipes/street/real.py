@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from saunet.data.kitti.files import lidar_depth, read_scan
+from saunet.data.kitti.files import lidar_depth
+from saunet.data.lidar import read_scan
 from saunet.metrics.protocols import evaluate_image, protocol
 
 Frame = tuple[np.ndarray, Tensor, str]

@@ -86,7 +86,7 @@ class Street:
             rng.choice(["suburb", "town", "avenue", "highway", "country", "jam"], p=[0.3, 0.2, 0.18, 0.1, 0.1, 0.12])
         )
         self.road = Road(rng, straight=self.kind in ("highway", "jam") or rng.uniform() < 0.5)
-        self.trees: dict[tuple[float, float], list[Soup]] = {}
+        self.trees: dict[tuple[float, float, bool], list[Soup]] = {}
         self._palette()
         self._light()
         self._ground()
@@ -298,7 +298,7 @@ class Street:
             ):
                 rise = rng.normal(0, 0.1) if self.kind not in ("highway", "country") else rng.normal(0, 0.8)
                 strip(
-                    rng.uniform(1.2, 8.0 if self.kind == "avenue" else 4.5),
+                    rng.uniform(1.2, 12.0 if rng.uniform() < 0.3 else 8.0 if self.kind == "avenue" else 4.5),
                     rise,
                     int(rng.choice([*self.grass, self.soil], p=[0.3, 0.3, 0.3, 0.1])),
                     "verge",
@@ -381,13 +381,16 @@ class Street:
         )
         return m.truck(self.rng, self._paint(), cargo, self.glass, self.tire, self.lamps)
 
-    def _tree(self, height: float, detail: float = 1.0) -> Soup:
+    def _tree(self, height: float, detail: float = 1.0, young: bool = False) -> Soup:
         """Return a tree; a scene has a few of each size and detail, which are turned and scaled."""
         rng = self.rng
-        key = (round(np.log(height) * 2), detail)
+        key = (round(np.log(height) * 2), detail, young)
         grown = self.trees.setdefault(key, [])
         if len(grown) < 3 or (detail >= 2 and len(grown) < 4):
             bark, leaf = int(rng.choice(self.bark)), int(rng.choice(self.leaf))
+            if young:
+                grown.append(m.young_tree(rng, bark, leaf, int(rng.choice(self.bark)), height, detail))
+                return grown[-1]
             maker = m.conifer if rng.uniform() < 0.15 else m.tree
             grown.append(maker(rng, bark, leaf, height, detail))
         out = Soup()
@@ -462,7 +465,8 @@ class Street:
 
     def _row(self, d: float, h: float, gap: float, what: str, side: int = 1, chance: float = 0.9) -> None:
         rng = self.rng
-        height, shared = rng.uniform(4, 13), None
+        young = what == "tree" and rng.uniform() < 0.5
+        height, shared = rng.uniform(2.5, 7) if young else rng.uniform(4, 13), None
         for s in np.arange(self.road.start + 10 + rng.uniform(0, gap), 200, gap):
             if rng.uniform() > chance or self._blocked(s, 2.0, side):
                 continue
@@ -470,7 +474,7 @@ class Street:
             detail = 2.5 if s < 40 else 1.0 if s < 90 else 0.4
             if what == "tree":
                 self._put(
-                    self._tree(height * rng.uniform(0.8, 1.25), detail),
+                    self._tree(height * rng.uniform(0.8, 1.25), detail, young),
                     at,
                     d + rng.normal(0, 0.2),
                     h,
@@ -574,6 +578,8 @@ class Street:
             )
             if tall:
                 self._row(middle(verge, rng.uniform(0.3, 0.7)), verge[2], rng.uniform(5, 16), "tree", side)
+                if rng.uniform() < 0.3:
+                    self._row(middle(verge, rng.uniform(0.1, 0.9)), verge[2], rng.uniform(8, 30), "tree", side)
             if rng.uniform() < 0.25:
                 self._row(middle(verge), verge[2], rng.uniform(2, 9), "bush", side)
         strip = verge or walk or front
@@ -621,7 +627,7 @@ class Street:
                     continue
                 roll = rng.uniform()
                 part = (
-                    self._tree(rng.uniform(2, 9), 2.5 if s < 40 else 1.0)
+                    self._tree(rng.uniform(2, 9), 2.5 if s < 40 else 1.0, rng.uniform() < 0.4)
                     if roll < 0.5 and abs(front[1] - front[0]) > 2
                     else m.bush(
                         rng,
