@@ -7,6 +7,7 @@ import functools
 import inspect
 import math
 import numbers
+import re
 import reprlib
 import sys
 import types
@@ -18,6 +19,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union
 from typing_extensions import Unpack
 
 C = TypeVar("C", bound=Callable[..., Any])
+_ENDLESS = re.compile(r"\S{500,}")
+"""Longer than what anybody reads, and than the paths of most systems."""
 
 if TYPE_CHECKING:
     import torch
@@ -33,6 +36,9 @@ class SaunetError(Exception):
         ...     print(error)
         unknown encoder 'resnet19'; did you mean 'resnet18'? available: ...
     """
+
+    def __init__(self, message: str = "") -> None:  # a damaged file may have words of any length
+        super().__init__(_ENDLESS.sub(lambda word: f"{word[0][:100]}...", message))
 
 
 class ConfigError(SaunetError, ValueError):

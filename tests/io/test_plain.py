@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import saunet
 from saunet.errors import CheckpointError, UnreadableError
 from saunet.io import plain
 from saunet.io.plain import iterate_json, parse_json, read_array, read_arrays, read_json, read_text, read_yaml
@@ -209,3 +210,9 @@ def test_a_long_list_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.Monkey
 )
 def test_a_long_list_that_is_refused(tmp_path: Path, text: str, words: str) -> None:
     assert words in refused(lambda path: list(iterate_json(path)), tmp_path / "rows.json", text.encode())
+
+
+def test_a_message_quotes_no_word_of_any_length() -> None:
+    error = saunet.DataError(f"the lens model is '{'9' * 5000}'; known: pinhole")
+    assert len(str(error)) < 200
+    assert "known: pinhole" in str(error)
