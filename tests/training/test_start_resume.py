@@ -22,7 +22,7 @@ def test_a_resumed_run_keeps_its_csv_rows_up_to_the_checkpoint(tmp_path: Path) -
     resumed = CSVLogger(tmp_path, name=None, version="csv")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        keep_rows(resumed, steps=2)  # the rows of steps 2 and 3 come again
+        keep_rows(resumed, {"global_step": 2})  # the rows of steps 2 and 3 come again
     resumed.log_metrics({"loss": 9.0, "other": 5.0}, 2)
     resumed.save()
     with (tmp_path / "csv" / "metrics.csv").open() as file:
@@ -31,6 +31,6 @@ def test_a_resumed_run_keeps_its_csv_rows_up_to_the_checkpoint(tmp_path: Path) -
 
 
 def test_nothing_is_done_without_rows_or_for_another_logger(tmp_path: Path) -> None:
-    keep_rows(CSVLogger(tmp_path, name=None, version="csv"), steps=2)
-    keep_rows(TensorBoardLogger(tmp_path, name=None, version="tensorboard"), steps=2)
+    keep_rows(CSVLogger(tmp_path, name=None, version="csv"), {"global_step": 2})
+    keep_rows(TensorBoardLogger(tmp_path, name=None, version="tensorboard"), {"global_step": 2})
     assert list(tmp_path.iterdir()) == []

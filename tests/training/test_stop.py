@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from saunet.cli.table import config_dir
 from saunet.runs.folder import Stopped
 from saunet.training.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
-from saunet.training.resume import keep_rows, validation_due
+from saunet.training.resume import keep_rows
 from saunet.training.stopping import GracefulStop
 
 BATCHES = 6  # an epoch's, of two epochs
@@ -58,7 +58,7 @@ def train(
     last = folder / "last.ckpt"
     if resume:
         stored = torch.load(last, weights_only=True)
-        keep_rows(logger, stored["global_step"], validation_due(stored))
+        keep_rows(logger, stored)
     callbacks = [
         Ask(asked),
         BestCheckpoint(str(folder)),
@@ -172,3 +172,24 @@ def test_a_kill_after_a_warning_loses_no_validation_either(whole: Path, tmp_path
         train(tmp_path, BATCHES, False, Kill(BATCHES, "on_validation_batch_end"))
     train(tmp_path, resume=True)
     same(whole, tmp_path)
+
+
+@pytest.mark.parametrize("step", [1, BATCHES - 1, 2 * BATCHES - 1])
+def test_a_kill_between_saving_a_step_and_logging_it_loses_no_row(
+    step: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    train(whole, every=1)
+    log = CSVLogger.log_metrics
+
+    def strike(self: CSVLogger, metrics: Any, **more: Any) -> None:
+        if "train/loss" in metrics and more["step"] == step:
+            raise KilledError
+        log(self, metrics=metrics, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CSVLogger, "log_metrics", strike)
+        with pytest.raises(KilledError):
+            train(killed, every=1)
+    train(killed, resume=True, every=1)
+    same(whole, killed)

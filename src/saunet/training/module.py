@@ -260,13 +260,22 @@ class SelfSupervisedDepth(LightningModule):
             settings["batch_size"] = data.batch_size
         if "train" in getattr(data, "datasets", {}):
             settings["train_split"] = data.datasets["train"].fingerprint()
-        return {"recipe": self.recipe.to_plain(), "settings": settings, "validation_due": self._validation_due()}
+        due, row = self._to_come()
+        known = {"recipe": self.recipe.to_plain(), "settings": settings, "validation_due": due}
+        return {**known, "unlogged": row} if row else known
 
-    def _validation_due(self) -> bool:
-        """Return whether a step is done and the validation after it is not, which a kill would lose otherwise."""
+    def _to_come(self) -> tuple[bool, dict[str, float]]:
+        """Return whether a validation follows the step just done, and the step's row of the curves, if it is due.
+
+        Lightning logs a step after the callbacks that save it. A kill in between would lose the row.
+        """
         trainer = self._trainer
         if trainer is None or trainer.state.fn != TrainerFn.FITTING or not trainer.training:
-            return False
-        loop, fetcher = trainer.fit_loop.epoch_loop, trainer.fit_loop._data_fetcher
+            return False, {}
+        loop, fetcher, logs = trainer.fit_loop.epoch_loop, trainer.fit_loop._data_fetcher, trainer._logger_connector
         done: Any = loop.batch_progress.current
-        return fetcher is not None and done.completed < done.processed and loop._should_check_val_fx(fetcher)
+        if fetcher is None or done.completed >= done.processed:
+            return False, {}
+        row = {key: float(value) for key, value in logs.metrics["log"].items()} if logs.should_update_logs else {}
+        row = {**row, "epoch": trainer.current_epoch, "step": loop._batches_that_stepped} if row else {}
+        return loop._should_check_val_fx(fetcher), row

@@ -139,11 +139,11 @@ def owe_validation(loops: dict[str, Any]) -> None:
 
 
 @rank_zero_only
-def keep_rows(logger: Logger, steps: int, due: bool = False) -> None:
+def keep_rows(logger: Logger, checkpoint: Mapping[str, Any]) -> None:
     """Keep what a resumed run logged as CSV before; Lightning's logger would begin the file afresh.
 
-    Rows after the ``steps`` done by the checkpoint are dropped, as they will be logged again; so is the validation
-    after the last of them if it is still due.
+    Rows after the last step of the checkpoint are dropped, as they will be logged again; so is the validation after it
+    if that is still due. Its own row is made up for where a kill came before it was logged.
     """
     if not isinstance(logger, CSVLogger):
         return
@@ -155,10 +155,15 @@ def keep_rows(logger: Logger, steps: int, due: bool = False) -> None:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*will be deleted when the new ones are saved.*")
         writer = logger.experiment
+    steps, due = int(checkpoint["global_step"]), validation_due(checkpoint)
     whole = (row for row in rows if row.get("step", "").isdecimal())  # a kill can cut the last one
     kept = [row for row in whole if int(row["step"]) < steps]
-    again = [row for row in kept if due and int(row["step"]) == steps - 1 and any(key[:4] == "val/" for key in row)]
+    last = [row for row in kept if int(row["step"]) == steps - 1]
+    again = [row for row in last if due and any(key[:4] == "val/" for key in row)]
     writer.metrics.extend(row for row in kept if row not in again)
+    unlogged = checkpoint.get("saunet_training", {}).get("unlogged", {})
+    if unlogged.get("step") == steps - 1 and not any("train/loss" in row for row in last):
+        writer.metrics.append({key: str(value) for key, value in unlogged.items()})
     writer.save()
 
 

@@ -231,7 +231,8 @@ def train(
     data.setup("fit")
     data.train_dataloader()  # knows whether there are enough samples
     steps = check_resume(model, checkpoint, data) if checkpoint else 0
-    due = checkpoint is not None and validation_due(checkpoint.rest)
+    done = {"global_step": steps, "saunet_training": checkpoint.rest.get("saunet_training", {})} if checkpoint else {}
+    due = validation_due(done)
     del checkpoint  # as large as the model and its moments
     started = warm_start(model, options.init_from) if options.init_from and not resume else None
     known = {
@@ -250,7 +251,7 @@ def train(
         with recording(folder, options.name, describe, **known) as record:
             model.run_record = record
             for logger in loggers if resume else ():
-                keep_rows(logger, steps, due)
+                keep_rows(logger, done)
             if resume or started:
                 print(f"resuming from {resume}" if resume else started)
             if due and 0 <= trainer.max_steps <= steps:
