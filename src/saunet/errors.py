@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union
 from typing_extensions import Unpack
 
 C = TypeVar("C", bound=Callable[..., Any])
-_ENDLESS = re.compile(r"\S{500,}")
-"""Longer than what anybody reads, and than the paths of most systems."""
+_ENDLESS = re.compile(r"\S{500,}|(?<=')[^']{500,}(?=')")
+"""A word or quotation that is longer than what anybody reads, and than the paths of most systems."""
 
 if TYPE_CHECKING:
     import torch

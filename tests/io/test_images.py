@@ -281,3 +281,21 @@ def test_times_in_names_are_in_order() -> None:
     times = ["1403636579.5", "1403636579.55", "1403636579.6", "1403636579.763555", "1403636580"]
     assert sorted((f"{time}.png" for time in times[::-1]), key=natural_order) == [f"{time}.png" for time in times]
     assert sorted(["shot_2.10.png", "shot_2.9.png"], key=natural_order) == ["shot_2.9.png", "shot_2.10.png"]
+
+
+def test_a_png_that_promises_more_than_its_bytes_can_hold_is_damaged(tmp_path: Path) -> None:
+    data = bytearray(cv2.imencode(".png", np.zeros((6, 9), np.uint16))[1].tobytes())
+    data[20:22] = b"\x7f\x10"
+    (tmp_path / "huge.png").write_bytes(bytes(data))
+    with pytest.raises(DataError, match="damaged"):
+        read_depth(tmp_path / "huge.png")
+    write_image(tmp_path / "flat.png", np.zeros((2000, 3000, 3), np.uint8))  # which shrinks as far as can be
+    assert read_image(tmp_path / "flat.png").shape == (2000, 3000, 3)
+
+
+def test_a_png_whose_chunk_is_longer_than_the_file_is_not_decoded(tmp_path: Path) -> None:
+    data = bytearray(cv2.imencode(".png", np.zeros((6, 9), np.uint16))[1].tobytes())
+    data[33] = 0xCC  # of the length of the first chunk after the header
+    (tmp_path / "long.png").write_bytes(bytes(data))
+    with pytest.raises(DataError, match="truncated"):
+        read_depth(tmp_path / "long.png")

@@ -215,4 +215,5 @@ def test_a_long_list_that_is_refused(tmp_path: Path, text: str, words: str) -> N
 def test_a_message_quotes_no_word_of_any_length() -> None:
     error = saunet.DataError(f"the lens model is '{'9' * 5000}'; known: pinhole")
     assert len(str(error)) < 200
+    assert len(str(saunet.DataError(f"no parameter '{'a: {' * 600}'; allowed: dims"))) < 200
     assert "known: pinhole" in str(error)

@@ -26,6 +26,10 @@ _NUMBER = re.compile(r"(\d{9,}\.\d+|\d+)", re.ASCII)
 """A number in a name; with decimals only where they are those of a time, in seconds since 1970."""
 
 
+_DEFLATE = 1032
+"""The most that PNG's compression can shrink: 258 bytes to two bits."""
+
+
 def natural_order(name: str | Path) -> tuple[list[tuple[int, int | Fraction, str]], str]:
     """Return the key that sorts names of files by the numbers in them: ``frame_2`` before ``frame_10``."""
     parts: list[tuple[int, int | Fraction, str]] = [
@@ -209,6 +213,11 @@ def _decode(path: str | Path, flags: int) -> NDArray[Any]:
         raise UnreadableError(
             f"{path} is truncated ({data.size} bytes, the end of the image is missing); copy it again"
         )
+    if (claimed := _claimed_bytes(data[:26].tobytes())) > _DEFLATE * data.size:  # decoders would make room for it first
+        raise UnreadableError(
+            f"{path} is damaged: it says that it holds {claimed} bytes of pixels, which {data.size} bytes cannot; "
+            "copy it again"
+        )
     try:
         image = cv2.imdecode(data, flags)
     except cv2.error as reason:
@@ -221,13 +230,25 @@ def _decode(path: str | Path, flags: int) -> NDArray[Any]:
     return np.asarray(image)
 
 
+def _claimed_bytes(head: bytes) -> int:
+    """Return how many bytes of pixels the header of a PNG promises; 0 for other formats."""
+    if head[:8] != b"\x89PNG\r\n\x1a\n" or head[12:16] != b"IHDR" or len(head) < 26:
+        return 0
+    width, height = (int.from_bytes(head[start : start + 4], "big") for start in (16, 20))
+    channels = {2: 3, 4: 2, 6: 4}.get(head[25], 1)
+    return height * (width * channels * head[24] // 8)
+
+
 def _complete(data: bytes) -> bool:
     """Return False for a PNG or JPEG whose end is missing; decoders paint the rest gray, some without a word.
 
     The end is looked for from behind and anywhere: cameras and editors append data of their own after it.
     """
     if data.startswith(b"\x89PNG"):
-        return data.rfind(b"IEND") >= 0
+        at = 8
+        while at < len(data) and data[at + 4 : at + 8] != b"IEND":  # chunks; a decoder makes room for any length
+            at += 12 + int.from_bytes(data[at : at + 4], "big")
+        return at < len(data)
     if data.startswith(b"\xff\xd8"):
         return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
     return True
