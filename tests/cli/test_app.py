@@ -199,6 +199,13 @@ def test_a_mistake_is_one_sentence(echo: Said, words: str, expected: tuple[str, 
     assert list(Path().iterdir()) == []
 
 
+def test_an_address_is_an_input_whatever_is_in_it(echo: Said) -> None:
+    for address in ("rtsp://me:a,b@10.0.0.5:554/cam=1", "http://10.0.0.5/video?fps=25&size=1"):
+        code, _, err = echo(address)
+        assert code == 0, err
+        assert ECHOED[-1].input == address
+
+
 def test_a_sweep_keeps_text_and_writes_its_plan(echo: Said) -> None:
     code, out, err = echo("-m", "input=0001,2024_05_01", "names=a,b", "hydra.sweep.dir=sweep")
     assert code == 0, err

@@ -14,7 +14,8 @@ from videos import Picture, number_of, numbered, write_video
 
 from saunet.errors import ConfigError, DataError
 from saunet.io import video as module
-from saunet.io.video import CameraReader, VideoReader, VideoWriter, nearest_steps
+from saunet.io.live import CameraReader
+from saunet.io.video import VideoReader, VideoWriter, nearest_steps
 
 
 def numbers(path: Path, **options: Any) -> list[int]:

@@ -19,7 +19,8 @@ from predicting import run
 from saunet.errors import ConfigError, SaunetError
 from saunet.io.colormaps import RunningRange, colorize
 from saunet.io.images import read_image, write_image
-from saunet.io.video import CameraReader, VideoFrame, VideoReader, VideoWriter
+from saunet.io.live import CameraReader
+from saunet.io.video import VideoFrame, VideoReader, VideoWriter
 from saunet.prediction.odometer import Odometer
 from saunet.prediction.pointcloud import ViewerWriter
 from saunet.prediction.predictor import Predictor

@@ -17,7 +17,8 @@ from videos import write_video
 from saunet.errors import ConfigError, DataError
 from saunet.io.colormaps import RunningRange
 from saunet.io.images import write_image
-from saunet.io.video import CameraReader, VideoFrame, VideoReader, VideoWriter
+from saunet.io.live import CameraReader
+from saunet.io.video import VideoFrame, VideoReader, VideoWriter
 from saunet.prediction.predictor import Predictor
 from saunet.prediction.sinks import compose
 from saunet.prediction.sources import find_sources

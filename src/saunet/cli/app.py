@@ -334,7 +334,11 @@ class _Reader:
             found = _OVERRIDE.fullmatch(word)
             if found is None and word.startswith("~"):
                 made.append(word)
-            elif found is None or (self.tool.positional and not self._is_key(found["key"]) and Path(word).exists()):
+            elif found is None or (
+                self.tool.positional
+                and not self._is_key(found["key"])
+                and ("://" in found["key"] or Path(word).exists())
+            ):
                 plain.append(word)
             else:
                 key = self.tool.aliases.get(found["key"], found["key"])
@@ -394,6 +398,11 @@ class _Reader:
         if not matching:
             raise ConfigError(f"{group}=glob({pattern}) matches none of: {', '.join(names) or 'no files'}")
         return matching
+
+
+def _is_place(word: str) -> bool:
+    """Return whether a word with ``=`` in it is an address or a file."""
+    return "://" in word.partition("=")[0] or Path(word).exists()
 
 
 def _list(value: str, kind: str) -> str:

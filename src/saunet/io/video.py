@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import av
-import cv2
 import numpy as np
 from av.error import FFmpegError
 from jaxtyping import UInt8
@@ -51,6 +49,8 @@ class VideoFrame:
     time: float | None
     """Seconds since the first frame; None if unknown."""
     image: Picture
+    arrived: float | None = None
+    """When it came from a live camera, on the monotonic clock."""
 
 
 class VideoReader(Session):
@@ -84,7 +84,7 @@ class VideoReader(Session):
                 raise UnreadableError(
                     f"{self.name} holds no frame that can be decoded; it may be truncated or have an unusual codec"
                 )
-            self.height, self.width = _rgb(first, self.name).shape[:2]
+            self.height, self.width = to_rgb(first, self.name).shape[:2]
             self._timed = container.format.name not in _RAW and first.time is not None
             self._origin = float(first.time) if self._timed else 0.0  # time stamp of the first frame
             mean, usual = self._rates(container, stream)
@@ -105,7 +105,7 @@ class VideoReader(Session):
         if fps is not None and self._pace is not None and fps < self._pace * (1 - 1e-3):
             stamped = nearest_steps(stamped, positive("fps", fps))
         for number, seconds, frame in stamped:
-            image = _rgb(frame, self.name)
+            image = to_rgb(frame, self.name)
             if image.shape[:2] != (self.height, self.width):
                 raise DataError(
                     f"{self.name} changes its size from {self.width}x{self.height} to {image.shape[1]}x"
@@ -141,7 +141,7 @@ class VideoReader(Session):
 
     def _decoded(self, container: Any, stream: Any) -> Iterator[Any]:
         """Yield decoded frames, deinterlaced where they are interlaced."""
-        weave: _Deinterlacer | None = None
+        weave: Deinterlacer | None = None
         for packet in _packets(container, stream):
             self._broken |= packet is None
             try:
@@ -152,7 +152,7 @@ class VideoReader(Session):
             for frame in frames:
                 self.damaged += frame.is_corrupt
                 if weave is None and frame.interlaced_frame:
-                    weave = _Deinterlacer(stream)
+                    weave = Deinterlacer(stream)
                 yield from (frame,) if weave is None else weave.push(frame)
         if weave is not None:
             yield from weave.push(None)
@@ -201,37 +201,6 @@ class VideoReader(Session):
             return int(stream.frames)
         lasts = float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) / 1e6
         return round(lasts * self.fps) or None if self.fps and self._timed else None
-
-
-class CameraReader:
-    """Frames of a camera that is connected, until somebody stops it; times are those of arrival."""
-
-    declared, timed, missing = None, True, 0
-
-    def __init__(self, number: int) -> None:
-        self.name = f"camera {number}"
-        self._capture = cv2.VideoCapture(number)
-        done, frame = self._capture.read() if self._capture.isOpened() else (False, None)
-        if not done or frame is None:
-            self.close()
-            raise DataError(
-                f"{self.name} gives no picture; check that it is connected and that no other program uses it"
-            )
-        self.height, self.width = frame.shape[:2]
-        fps = self._capture.get(cv2.CAP_PROP_FPS)
-        self.fps = float(fps) if 0 < fps < 1000 else 25.0
-
-    def frames(self) -> Iterator[VideoFrame]:
-        """Yield frames as they come."""
-        start = time.monotonic()
-        for number in itertools.count():
-            done, frame = self._capture.read()
-            if not done:
-                return
-            yield VideoFrame(number, time.monotonic() - start, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
-
-    def close(self) -> None:
-        self._capture.release()
 
 
 def nearest_steps(
@@ -329,7 +298,7 @@ class VideoWriter(Session):
             raise DataError(f"{self.path} kept {kept} of {self.count} frames, so it was discarded; is the disk full?")
 
 
-class _Deinterlacer:
+class Deinterlacer:
     """FFmpeg's yadif: one frame out for each one in; frames that are not interlaced pass unchanged."""
 
     def __init__(self, stream: Any) -> None:
@@ -374,7 +343,7 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
         yield None
 
 
-def _rgb(frame: Any, name: str) -> Picture:
+def to_rgb(frame: Any, name: str) -> Picture:
     """Convert by the frame's own tags of matrix and range, and turn it as its display matrix says."""
     try:
         image = frame.to_ndarray(format="rgb24")

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saunet.errors import ConfigError
+from saunet.io.live import live_source
 from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import ImagePredictor
-from saunet.prediction.sources import Input, Recording, camera_number
+from saunet.prediction.sources import Input, Recording
 from saunet.scale.options import ScaleOptions
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def _batches(
     from saunet.scale.recorded import clip_batches, read_speeds
 
     method, more = options.method, dict[str, Any]()
-    if camera_number(source) is not None:
+    if live_source(source) is not None:
         raise ConfigError(
             f"scale.method={method} measures over a whole recording and a live camera cannot be looked at beforehand; "
             "measure with scale.store=true on recorded frames, then leave scale.method out"

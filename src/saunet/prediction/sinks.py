@@ -23,6 +23,7 @@ from saunet.errors import ConfigError, DataError, one_of
 from saunet.io.atomic import Session, write_json
 from saunet.io.colormaps import RunningRange, colorize, depth_to_png16
 from saunet.io.images import write_image
+from saunet.io.live import CameraReader
 from saunet.io.plain import read_json
 from saunet.io.progress import bar
 from saunet.io.video import VideoWriter
@@ -278,14 +279,14 @@ def fill(
     batch_size: int,
     total: int | None,
     *,
-    live: bool = False,
+    live: CameraReader | None = None,
     failures: list[str] | None = None,
     check: Callable[[], None] = lambda: None,
 ) -> int:
     """Predict every frame into every sink, with a few pictures in memory; return how many.
 
     A picture that cannot be read becomes one sentence in ``failures`` if that is given, and is an error else; ``check``
-    has the last word before sinks are completed. Ctrl-C completes what a ``live`` recording has so far.
+    has the last word before sinks are completed. Ctrl-C completes what a ``live`` camera has given so far.
     """
     count, left, limits = 0, iter(frames), RunningRange(range_smoothing)
     with contextlib.ExitStack() as stack:
@@ -310,32 +311,35 @@ def fill(
                     for sink in sinks:
                         sink.add(frame, result, now)
                     count += 1
+                    if live is not None and frame.arrived is not None:
+                        shown.update(task, description=f"predicting, {live.answered(frame.arrived)}")
                 shown.advance(task, len(batch))
             if stopped() and count == 0:
                 raise KeyboardInterrupt
         except KeyboardInterrupt:
-            if not live or stopped() or count == 0:
+            if live is None or stopped() or count == 0:
                 raise
         check()
     return count
 
 
 @contextlib.contextmanager
-def _interrupt_noted(wanted: bool) -> Iterator[Callable[[], bool]]:
-    """Note the first Ctrl-C of the block instead of raising; a second one raises as ever.
+def _interrupt_noted(live: CameraReader | None) -> Iterator[Callable[[], bool]]:
+    """Note the first Ctrl-C of the block instead of raising, and stop the camera; a second one raises as ever.
 
     Raised in the middle of writing a frame, it would leave nobody knowing whether the frame is in the file. Where
     Ctrl-C is ignored or another program handles it, and outside of the main thread, everything stays as it is.
     """
     noted, usual = threading.Event(), signal.default_int_handler
     main = threading.current_thread() is threading.main_thread()
-    if not wanted or not main or signal.getsignal(signal.SIGINT) is not usual:
+    if live is None or not main or signal.getsignal(signal.SIGINT) is not usual:
         yield noted.is_set
         return
 
     def note(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, usual)
         noted.set()
+        live.stop()
 
     signal.signal(signal.SIGINT, note)
     try:

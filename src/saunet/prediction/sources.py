@@ -16,7 +16,8 @@ from jaxtyping import UInt8
 
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import IMAGE_SUFFIXES, image_size, natural_order
-from saunet.io.video import VIDEO_SUFFIXES, CameraReader, VideoReader
+from saunet.io.live import CameraReader, live_source, live_title
+from saunet.io.video import VIDEO_SUFFIXES, VideoReader
 from saunet.prediction.prediction import ImageLike, as_image
 
 IMAGE_FPS = 10.0
@@ -25,7 +26,7 @@ STREAM_FPS = 25.0
 """Frames per second of a bare video stream that does not contain its rate."""
 
 Input = str | Path | int | Sequence[str | Path] | Iterable[Any]
-"""A video file, images (files, folders, patterns), a camera's number, or RGB arrays."""
+"""A video file, images (files, folders, patterns), a live camera (its number, device or address), or RGB arrays."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +39,8 @@ class Frame:
     """What its results are called, relative to the output folder."""
     time: float | None = None
     """Seconds since the first; None if unknown."""
+    arrived: float | None = None
+    """When it came from a live camera, on the monotonic clock."""
 
     def read(self) -> UInt8[np.ndarray, "_ _ 3"]:
         return as_image(self.image)
@@ -49,7 +52,7 @@ class Recording:
     Attributes:
         title: What to call results of the whole.
         images: The files, if it is images; else None.
-        live: Whether it is a camera, which ends when somebody stops it.
+        live: The live camera, if it is one: it ends when somebody stops it.
         declared: How many pictures there are, as far as known.
         fps: Frames per second: as given, as recorded, or assumed.
         timed: Whether frames have times.
@@ -60,14 +63,18 @@ class Recording:
         self._reader: VideoReader | CameraReader | None = None
         self._size: tuple[int, int] | None = None
         self._frames: Iterable[Frame]
-        number = camera_number(source)
-        self.title, self.live, self.declared, self.timed = title_of(source), number is not None, None, False
+        camera = live_source(source)
+        self.title, self.declared, self.timed = title_of(source), None, False
+        self.live = None if camera is None else CameraReader(camera)
         self.fps: float = float(fps or IMAGE_FPS)
-        if number is not None or (isinstance(source, str | Path) and _is_video(Path(source))):
-            self._reader = reader = CameraReader(number) if number is not None else VideoReader(str(source), fps)
+        if self.live or (isinstance(source, str | Path) and _is_video(Path(source))):
+            self._reader = reader = self.live or VideoReader(str(source), fps)
             self._size, self.timed = (reader.height, reader.width), reader.timed
             self.declared, self.fps = reader.declared, float(fps or reader.fps or STREAM_FPS)
-            self._frames = (Frame(each.image, f"{self.title}/{each.number:06d}", each.time) for each in reader.frames())
+            self._frames = (
+                Frame(each.image, f"{self.title}/{each.number:06d}", each.time, each.arrived)
+                for each in reader.frames()
+            )
         elif isinstance(source, str | Path) or (
             isinstance(source, Sequence) and all(isinstance(item, str | Path) for item in source)
         ):
@@ -99,10 +106,10 @@ class Recording:
 
     @property
     def problems(self) -> list[str]:
-        """What was wrong with a video that has been read to its end, a sentence each."""
+        """What was wrong with a video that has been read to its end, or with a camera; a sentence each."""
         reader = self._reader
-        if not isinstance(reader, VideoReader):
-            return []
+        if reader is None or isinstance(reader, CameraReader):
+            return reader.problems if reader else []
         name = reader.name
         found = {
             f"{name} ends {reader.missing} frames earlier than it declares: it is truncated": reader.missing,
@@ -122,22 +129,15 @@ class Recording:
             self._reader.close()
 
 
-def camera_number(source: Input) -> int | None:
-    """Return the number of the camera that an input names, None if it is no camera."""
-    if isinstance(source, int):
-        return source
-    return int(source) if isinstance(source, str) and source.isdecimal() and not Path(source).exists() else None
-
-
 def _is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
 
 
 def title_of(source: Input) -> str:
     """Return what to call a source's results."""
-    number = camera_number(source)
-    if number is not None:
-        return f"camera{number}"
+    camera = live_source(source)
+    if camera is not None:
+        return live_title(camera)
     if not isinstance(source, str | Path):
         return "frames"
     path = Path(source)

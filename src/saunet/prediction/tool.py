@@ -41,7 +41,8 @@ class PredictOptions:
 
     Args:
         checkpoint: The model: a checkpoint, an exported folder or file, a shipped model's name, or ``hf://owner/name``.
-        input: An image, a folder (with everything below), a pattern (``frames/*.png``), a video, or a camera's number;
+        input: An image, a folder (with everything below), a pattern (``frames/*.png``), a video, or a live
+            camera (its number, ``/dev/video0``, an ``rtsp://`` or ``http://`` address);
             in Python also several images, or RGB arrays h x w x 3.
         output: The folder of the results, made if missing; names follow the inputs.
         outputs: ``color`` (disparity in colors), ``png16`` (depth x 256), ``npy`` (depth in float32), ``ply`` (points),
@@ -148,6 +149,8 @@ class PredictResult:
     """Frames that a truncated video lacks."""
     failures: tuple[str, ...] = ()
     """One sentence for each image that could not be read, and for what was wrong with a video."""
+    notes: tuple[str, ...] = ()
+    """How it went with a live camera: latency, frames passed over, connections lost; a sentence each."""
 
     @property
     def exit_code(self) -> int:
@@ -162,7 +165,7 @@ class PredictResult:
         for paths, what in ((self.clips, f"{self.frames} frames"), (self.finished, "finished before")):
             if paths:
                 lines.append(f"{what}: {', '.join(map(str, paths))}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *self.notes])
 
 
 def predict(
@@ -232,6 +235,7 @@ def predict(
                 clips=tuple(path for sink in clips for path in sink.paths),
                 missing=recording.missing,
                 failures=tuple(recording.problems),
+                notes=tuple(recording.live.notes) if recording.live else (),
             )
         if "pairs" in outputs and camera is not None:
             sinks.write_pairs_camera(folder, camera, recording.fps if recording.images is None else None)
