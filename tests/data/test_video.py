@@ -12,7 +12,8 @@ import pytest
 from clip_tree import CAMERA, frames, make_clip, make_video
 from jaxtyping import TypeCheckError
 
-from saunet.data.video.clips import CUT, cuts, every, find_clips, frame_paths, read_clip, relative_change
+from saunet.data.video.clips import every, find_clips, frame_paths, read_clip
+from saunet.data.video.motion import CUT, cuts, relative_change
 from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
 

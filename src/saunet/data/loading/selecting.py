@@ -251,19 +251,28 @@ def _is_entry(reasons: Any) -> bool:
 
 
 def median_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
-    """Return the median length of the optical flow between two images, in pixels of an image 320 pixels wide."""
-    return float(np.median(np.linalg.norm(optical_flow(first, second), axis=-1)))
+    """Return the median length of `optical_flow`."""
+    x, y = cv2.split(optical_flow(first, second))
+    squares = (x * x + y * y).ravel()
+    low, high = (squares.size - 1) // 2, squares.size // 2
+    return float(np.sqrt(np.partition(squares, [low, high])[low : high + 1]).mean())
 
 
 def optical_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the optical flow between two images, h x w x 2, in pixels of an image 320 pixels wide."""
-    before, after = _small(first), _small(second)
+    """Return the optical flow between two images, h x w x 2, in pixels of an image 320 pixels wide.
+
+    Gray images are taken as they are: those of `gray`, so that none is converted twice, or of another width.
+    """
+    before, after = gray(first), gray(second)
     flow = np.zeros((*before.shape, 2), np.float32)
     measure = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     return np.asarray(measure.calc(before, after, flow), dtype=np.float32)
 
 
-def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an RGB image as a gray one, 320 pixels wide; a gray image itself."""
+    if image.ndim == 2:
+        return image
     height = max(32, round(image.shape[0] * FLOW_WIDTH / image.shape[1]))
     small = cv2.resize(image, (FLOW_WIDTH, height), interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
@@ -283,11 +292,12 @@ def static_by_flow(drive: Drive, frames: Sequence[int], min_flow: float, *, skip
                 raise
             existing.discard(frame)  # the frame after it is then judged as a first one
             continue
-        if last is not None and last[0] == frame - 1 and median_flow(last[1], image) < min_flow:
+        small = gray(image)
+        if last is not None and last[0] == frame - 1 and median_flow(last[1], small) < min_flow:
             static.add(frame)
             if frame - 2 not in existing:
                 static.add(frame - 1)
-        last = (frame, image)
+        last = (frame, small)
     return static & wanted
 
 

@@ -1,7 +1,7 @@
-"""Clips of any camera on disk: which there are, their frames in order, and how much the picture moves between them.
+"""Clips of any camera on disk: which there are, and their frames in order.
 
 Reading a video out of order is slow (every frame needs those before it), so its frames are kept as JPEGs in a cache
-folder, as are measurements. The originals are only ever read.
+folder. The originals are only ever read.
 """
 
 from __future__ import annotations
@@ -15,27 +15,20 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import overload
 
 import numpy as np
-from numpy.typing import NDArray
 
-from saunet.data.loading.selecting import FLOW_WIDTH, MIN_FLOW, median_flow
 from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera
 from saunet.errors import DataError
 from saunet.io.atomic import partial_name, remove_partial_files, write_json
-from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order, read_image, resize
+from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order, resize
 from saunet.io.plain import read_json
 from saunet.io.video import VIDEO_SUFFIXES, VideoReader, nearest_steps
 
 _NO_CLIPS = frozenset({"@eaDir", "__MACOSX"})
 """Folders in which other systems keep thumbnails and attributes; names with a dot in front are skipped as well."""
 QUALITY = 95  # JPEG quality of cached frames
-SAME_PICTURE = 0.01
-"""Mean difference over the picture's standard deviation under which two frames are the same picture twice."""
-CUT = 0.75
-"""The same measure from which two frames may be of different scenes (1.13 if nothing matches): KITTI's neighbors differ
-by up to 0.5, frames of different recordings by 0.88 to 1.0."""
-PEAK = 1.3  # times the changes around it that a cut exceeds: fast motion lasts, a cut does not
 
 
 class FramesCacheError(DataError):
@@ -55,7 +48,7 @@ class Clip:
 class Recording:
     """The frames of a clip that are taken in the first place, in order of time."""
 
-    paths: tuple[Path, ...]
+    paths: FramePaths
     numbers: tuple[int, ...]  # number of each in the clip as recorded, from 0
     fps: float | None  # frames per second as recorded; None if unknown
     missing: int = 0  # frames at the end that a video claims to hold and that cannot be decoded
@@ -90,12 +83,42 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
     return [Clip(name, path, given or _camera_of(path, base, known)) for name, path in zip(names, paths, strict=True)]
 
 
-def frame_paths(folder: Path) -> list[Path]:
+class FramePaths(Sequence[Path]):
+    """Paths of files in one folder, each made when it is asked for: a million of them take a second and 300 MB."""
+
+    def __init__(self, folder: Path, names: Sequence[str]) -> None:
+        self.folder, self.names = folder, tuple(names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @overload
+    def __getitem__(self, place: int) -> Path: ...
+    @overload
+    def __getitem__(self, place: slice) -> FramePaths: ...
+    def __getitem__(self, place: int | slice) -> Path | FramePaths:
+        found = self.names[place]
+        return self.folder / found if isinstance(found, str) else FramePaths(self.folder, found)
+
+    def texts(self) -> list[str]:
+        """Return the absolute paths as text."""
+        base = os.path.join(os.path.abspath(self.folder), "")
+        return [base + name for name in self.names]
+
+
+def frame_paths(folder: Path) -> FramePaths:
     """Return the images directly in a folder in order of time: ``frame_2`` before ``frame_10``, stamps as numbers."""
     with os.scandir(folder) as entries:
-        names = [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
-    names = [name for name in names if Path(name).suffix.lower() in IMAGE_SUFFIXES]
-    return [folder / names[place] for place in frame_order(names)]
+        names = [entry.name for entry in entries if _is_image(entry.name) and entry.is_file()]
+    return FramePaths(folder, [names[place] for place in frame_order(names)])
+
+
+def _is_image(name: str) -> bool:
+    return _suffix(name) in IMAGE_SUFFIXES and not name.startswith(".")
+
+
+def _suffix(name: str) -> str:
+    return os.path.splitext(name)[1].lower()
 
 
 def every(recorded: float | None, wanted: float | None) -> Iterator[int]:
@@ -130,22 +153,22 @@ def read_clip(
     paths = frame_paths(folder)
     if len(paths) != len(numbers):
         raise DataError(f"{folder} holds {len(paths)} of {len(numbers)} frames; delete it, so that it is made again")
-    return Recording(tuple(paths), numbers, rate, missing, count - len(numbers), plain, times)
+    return Recording(paths, numbers, rate, missing, count - len(numbers), plain, times)
 
 
 def _read_folder(clip: Clip, fps: float | None) -> Recording:
     paths = frame_paths(clip.path)
-    stamps = name_times([path.stem for path in paths])
+    stamps = name_times([os.path.splitext(name)[0] for name in paths.names])
     rate = clip.camera.fps
     if rate is None and stamps is not None and len(stamps) > 1:
         rate = 1 / float(np.median(np.diff(stamps)))
     if stamps is None or fps is None:
         numbers = tuple(itertools.takewhile(lambda number: number < len(paths), every(rate, fps)))
     else:
-        steps = nearest_steps(zip(range(len(paths)), stamps, paths, strict=False), fps)
+        steps = nearest_steps(zip(range(len(paths)), stamps, paths.names, strict=False), fps)
         numbers = tuple(number for number, _, _ in steps)
     times = None if stamps is None else tuple(stamps[number] for number in numbers)
-    taken = tuple(paths[number] for number in numbers)
+    taken = FramePaths(paths.folder, [paths.names[number] for number in numbers])
     return Recording(taken, numbers, rate, passed_over=len(paths) - len(taken), times=times)
 
 
@@ -213,6 +236,8 @@ def short_hash(text: str) -> str:
 
 def _is_depth(folder: Path) -> bool:
     """Return whether the first image of a folder is a 16-bit PNG of one channel."""
+    if not any(_suffix(name) == ".png" for name in os.listdir(folder)):
+        return False
     for path in frame_paths(folder)[:1]:
         with contextlib.suppress(OSError), path.open("rb") as stream:
             head = stream.read(26)
@@ -234,10 +259,11 @@ def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
             continue
         seen.add(os.path.realpath(place))
         links += [Path(place) / name for name in folders if os.path.islink(os.path.join(place, name))]
-        shown = [Path(place) / name for name in files if not name.startswith(".")]
-        if any(path.suffix.lower() in IMAGE_SUFFIXES for path in shown):
+        if any(map(_is_image, files)):
             yield Path(place)
-        yield from (path for path in shown if path.suffix.lower() in VIDEO_SUFFIXES)
+        for name in files:
+            if _suffix(name) in VIDEO_SUFFIXES and not name.startswith("."):
+                yield Path(place) / name
     for link in sorted(links):
         yield from _clip_paths(link, seen)
 
@@ -254,116 +280,3 @@ def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraF
         f"no {FILE_NAME} for {path}: put one beside it or at {base / FILE_NAME}, or set data.camera; "
         "saunet calibrate makes one (see docs/your_camera.md)"
     )
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What was measured of a sequence of frames; entry i compares frame i with the readable one before it."""
-
-    flow: NDArray[np.float64]
-    """Median optical flow in pixels of an image 320 pixels wide; NaN for the first frame and for unreadable ones."""
-    change: NDArray[np.float64]  # mean difference over the standard deviation of the picture; NaN likewise
-    unreadable: tuple[int, ...] = ()  # frames that cannot be decoded
-
-    def doubled(self) -> NDArray[np.bool_]:
-        """Say which frames are the same picture as the one before, one value a frame: the frame rate was raised."""
-        return np.nan_to_num(self.change, nan=1.0) < SAME_PICTURE
-
-    def static(self, min_flow: float = MIN_FLOW) -> NDArray[np.bool_]:
-        """Say which frames show no motion against the one before, one value a frame; the second judges the first."""
-        flow = self.flow.copy()
-        known = np.flatnonzero(np.isfinite(flow))
-        if known.size and known[0] > 0:
-            flow[: known[0]] = flow[known[0]]
-        return np.nan_to_num(flow, nan=np.inf) < min_flow
-
-
-def cuts(change: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Say which frames begin another scene (a cut, a loop, the next recording), given the change to the one before."""
-    known = np.nan_to_num(change)
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(known, 2), 5)[:, [0, 1, 3, 4]]
-    # The second largest: next to a cut there may be another one, as around a single black frame.
-    return np.asarray((known >= CUT) & (known > PEAK * np.sort(around)[:, -2]))
-
-
-def relative_change(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
-    """Return the mean difference of two images, h x w x 3, over the second's standard deviation."""
-    return float(np.abs(before.astype(np.float32) - after).mean() / max(1.0, float(after.std())))
-
-
-def shrink(image: NDArray[np.uint8], crop: Sequence[float | int] = (0, 0, 0, 0)) -> NDArray[np.uint8]:
-    """Return an image, h x w x 3, cut by shares of its top, bottom, left and right, and made 320 pixels wide."""
-    height, width = image.shape[:2]
-    top, bottom, left, right = crop
-    rows = slice(round(top * height), height - round(bottom * height))
-    cut = image[rows, round(left * width) : width - round(right * width)]
-    return np.asarray(resize(cut, max(32, round(cut.shape[0] * FLOW_WIDTH / cut.shape[1])), FLOW_WIDTH))
-
-
-def measure(
-    paths: Sequence[Path],
-    crop: Sequence[float | int],
-    *,
-    skip_unreadable: bool = False,
-    cache: Path | None = None,
-    advance: Callable[[], None] = lambda: None,
-) -> Motion:
-    """Measure the motion between consecutive images, each decoded once."""
-    file = cache / f"motion-{_motion_key(paths, crop)}.json" if cache else None
-    known = _read_motion(file, len(paths)) if file else None
-    if known is not None and (skip_unreadable or not known.unreadable):
-        return known
-    flow, change = np.full(len(paths), np.nan), np.full(len(paths), np.nan)
-    unreadable, before = [], None
-    for place, path in enumerate(paths):
-        try:
-            after = shrink(read_image(path), crop)
-        except DataError:
-            if not skip_unreadable:
-                raise
-            unreadable.append(place)
-        else:
-            if before is not None and before.shape == after.shape:
-                flow[place], change[place] = median_flow(before, after), relative_change(before, after)
-            before = after
-        advance()
-    if file:
-        remove_partial_files(file.parent, ".*.partial*")
-        rounded = {
-            key: [None if np.isnan(value) else round(value, 4) for value in values.tolist()]
-            for key, values in (("flow", flow), ("change", change))
-        }
-        write_json(file, {**rounded, "unreadable": unreadable}, FramesCacheError, indent=None)
-    return Motion(flow, change, tuple(unreadable))
-
-
-def even_steps(flow: NDArray[np.float64], parallax: float) -> NDArray[np.bool_]:
-    """Choose frames so that the picture moves by about ``parallax`` from each to the next; the first is one."""
-    chosen, gathered = np.zeros(len(flow), dtype=bool), 0.0
-    for place, step in enumerate(np.nan_to_num(flow)):
-        gathered += step
-        if place == 0 or gathered >= parallax:
-            chosen[place], gathered = True, 0.0
-    return chosen
-
-
-def _motion_key(paths: Sequence[Path], crop: Sequence[float | int]) -> str:
-    text = [str([round(float(share), 6) for share in crop])]
-    for path in paths:
-        try:
-            state = path.stat()
-            text.append(f"{path.absolute()}|{state.st_size}|{state.st_mtime_ns}")
-        except OSError:
-            text.append(f"{path.absolute()}|gone")
-    return short_hash("\n".join(text))
-
-
-def _read_motion(file: Path, count: int) -> Motion | None:
-    """Return a kept measurement; None where there is none that fits, and then it is made anew."""
-    try:
-        plain = read_json(file)
-        flow, change = (np.array(plain[key], dtype=np.float64) for key in ("flow", "change"))
-        unreadable = tuple(int(place) for place in plain["unreadable"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return Motion(flow, change, unreadable) if len(flow) == len(change) == count else None

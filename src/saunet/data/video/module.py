@@ -25,16 +25,13 @@ from saunet.data.video.camera import Lens, check_crop
 from saunet.data.video.clips import (
     Clip,
     FramesCacheError,
-    Motion,
     Recording,
-    cuts,
     default_cache,
-    even_steps,
     find_clips,
-    measure,
     read_clip,
     short_hash,
 )
+from saunet.data.video.motion import Motion, cuts, even_steps, measure
 from saunet.errors import ConfigError, DataError, in_range, one_of, positive
 from saunet.io.images import read_image
 from saunet.io.progress import bar
@@ -163,11 +160,11 @@ def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tup
         usable = chosen
     places: dict[int, int] = {}
     number, before = 0, None
+    losses = np.cumsum(broken | cut).tolist()  # from one usable frame to the next it grows where time or scene is lost
     for place in usable.tolist():
         if before is not None:
             seconds = (recording.numbers[place] - recording.numbers[before]) / (recording.fps or math.inf)
-            lost = broken[before:place].any() or cut[before + 1 : place + 1].any()
-            apart = lost or (place - before > 1 and seconds > LONGEST_STEP)
+            apart = losses[place] > losses[before] or (place - before > 1 and seconds > LONGEST_STEP)
             number += 2 if apart else 1
         places[number] = before = place
     return places, left_out
@@ -324,9 +321,10 @@ class VideoDataModule(DepthDataModule):
             motion = measure(
                 recording.paths,
                 self.crop or clip.camera.crop,
+                exact=self.parallax > 0,
                 skip_unreadable=self.on_error == "skip",
                 cache=self.frames_cache,
-                advance=lambda: shown.advance(task),
+                advance=lambda count: shown.advance(task, count),
             )
             shown.update(task, visible=False)
         settings = f"fps={self.fps} parallax={self.parallax} static={self.static}"

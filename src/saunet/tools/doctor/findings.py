@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from saunet.data.loading.selecting import MIN_FLOW, UNREADABLE, Manifest
-from saunet.data.video.clips import CUT, PEAK, SAME_PICTURE
+from saunet.data.video.motion import CUT, PEAK, SAME_PICTURE
 from saunet.errors import UnreadableError
 from saunet.tools.doctor.survey import ABSENT, BANDS, CameraFacts, FrameFacts, Survey
 

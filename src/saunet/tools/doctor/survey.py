@@ -19,7 +19,7 @@ from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.sampling import evenly
 from saunet.data.loading.selecting import optical_flow
 from saunet.data.loading.windows import WindowDataset
-from saunet.data.video.clips import relative_change, shrink
+from saunet.data.video.motion import relative_change, shrink
 from saunet.errors import DataError, SaunetError
 
 SPLITS = ("train", "val", "test")
