@@ -27,7 +27,7 @@ from saunet.weights.locate import locate
 if TYPE_CHECKING:
     from saunet.prediction.odometer import Odometer
 
-CLIP_OUTPUTS: tuple[str, ...] = ("mp4", "html", "trajectory")
+CLIP_OUTPUTS: tuple[str, ...] = ("mp4", "html", "trajectory", "rrd")
 """What can be written for a recording as a whole, besides `OUTPUTS` for each of its frames."""
 
 
@@ -47,8 +47,9 @@ class PredictOptions:
         output: The folder of the results, made if missing; names follow the inputs.
         outputs: ``color`` (disparity in colors), ``png16`` (depth x 256), ``npy`` (depth in float32), ``ply`` (points),
             ``pairs`` (images and depth in meters, to train on) for each image; ``mp4`` (image and disparity), ``html``
-            (points to orbit) and ``trajectory`` (from above, as KITTI poses, and where times are known for TUM's tools)
-            for the whole. By default color and png16 of images, mp4 of videos.
+            (points to orbit), ``trajectory`` (from above, as KITTI poses, and where times are known for TUM's tools)
+            and ``rrd`` (all of it for Rerun's viewer) for the whole. By default color and png16 of images, mp4 of
+            videos.
         colormap: magma, inferno, viridis, turbo or gray.
         camera: True intrinsics, which ``ply`` and ``html`` need: a camera.yaml; fx, fy, cx, cy in pixels of the first
             image; the nine numbers of K; or one number, the horizontal field of view in degrees.
@@ -311,6 +312,11 @@ def _clip_sinks(
         found.append(sinks.ViewerSink(path, style.camera, fps, options.max_depth, recording.title))
     if "trajectory" in outputs and odometer is not None:
         found.append(sinks.TrajectorySink(Path(f"{stem}trajectory.png"), odometer, recording.timed))
+    if "rrd" in outputs:
+        from saunet.prediction.rerun import RerunSink
+
+        path = odometer if "trajectory" in outputs else None
+        found.append(RerunSink(Path(f"{stem}rerun.rrd"), style.camera, options.max_depth, path))
     return found
 
 
