@@ -36,10 +36,10 @@ from saunet.data.video.camera import read_camera
 from saunet.errors import SaunetError
 from saunet.io.images import read_depth, read_image, write_image
 from saunet.io.plain import read_array, read_arrays, read_json, read_yaml
+from saunet.io.speeds import read_speeds
 from saunet.io.trajectories import read_kitti
 from saunet.runs.checkpoint import read_checkpoint
 from saunet.runs.folder import read_run
-from saunet.scale.recorded import read_speeds
 from saunet.weights.files import read_model
 
 SLOW = 2.0

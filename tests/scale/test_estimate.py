@@ -12,9 +12,10 @@ import torch
 
 from saunet.errors import ConfigError, DataError
 from saunet.geometry.pose import pose_matrix
+from saunet.io.speeds import read_speeds
 from saunet.runs.record import Scale
 from saunet.scale import MetricDepth, MetricMotion, ScaleEstimate, estimate_scale
-from saunet.scale.recorded import clip_batches, read_speeds
+from saunet.scale.recorded import clip_batches
 from saunet.types import DepthPyramid
 
 

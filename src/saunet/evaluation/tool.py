@@ -30,6 +30,7 @@ from saunet.evaluation.scoring import Buckets, Shapes, score, score_views
 from saunet.evaluation.statistics import drive_of, with_statistics
 from saunet.evaluation.team import Team, joined
 from saunet.io.atomic import check_folder
+from saunet.io.speeds import read_speeds
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
 from saunet.metrics.protocols import Protocol as Rules
 from saunet.metrics.protocols import protocol
@@ -40,7 +41,6 @@ from saunet.registry import Spec
 from saunet.runs.record import ModelRecord
 from saunet.scale.estimate import MetricDepth, MetricMotion, estimate_scale, keep_scale
 from saunet.scale.options import ScaleOptions
-from saunet.scale.recorded import read_speeds
 from saunet.types import EvalBatch
 from saunet.weights.files import read_model
 from saunet.weights.locate import locate

@@ -59,7 +59,8 @@ def apply_scale(
 def _batches(
     options: ScaleOptions, predictor: ImagePredictor, source: Input, camera: Camera | None, offsets: Sequence[int]
 ) -> Iterator[Iterator[TrainBatch]]:
-    from saunet.scale.recorded import clip_batches, read_speeds
+    from saunet.io.speeds import read_speeds
+    from saunet.scale.recorded import clip_batches
 
     method, more = options.method, dict[str, Any]()
     if live_source(source) is not None:

@@ -1,29 +1,21 @@
-"""What the scale is measured from: frames of a folder or video as batches, and the speeds in a table."""
+"""What the scale is measured from: frames of a folder or video as batches."""
 
 from __future__ import annotations
 
-import csv
 import itertools
-import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from saunet.errors import DataError, positive
+from saunet.errors import DataError
 from saunet.io.images import network_input
 from saunet.types import TrainBatch
 
 Image = UInt8[np.ndarray, "_ _ 3"]
-_FORMAT = (
-    "expected columns 'time' (seconds) or 'frame' (number), 'speed' (meters per second), and for several drives 'drive'"
-)
 
 
 def clip_batches(
@@ -84,89 +76,3 @@ def clip_batches(
         yielded += 1
         if yielded == most:
             return
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SpeedTable:
-    """Speed over time of one drive, called '', or of several."""
-
-    path: Path
-    unit: Literal["time", "frame"]
-    drives: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
-    """Ascending ticks, and the speed at each."""
-
-    def distance(
-        self, drive: str, first: int, second: int, fps: float | int, times: Sequence[float | None] | None = None
-    ) -> float:
-        """Return the meters traveled between two frames, speed being linear in between; NaN outside the table."""
-        positive("fps", fps)
-        start, end = sorted((first, second))
-        low, high = (start / fps, end / fps) if times is None else (times[start] or 0.0, times[end] or 0.0)
-        seconds = (end - start) / fps if times is None else high - low
-        if self.unit == "frame":
-            low, high = float(start), float(end)
-        known = self.drives.get(drive) or self.drives.get("")
-        if known is None or low < known[0][0] - 1e-6 or high > known[0][-1] + 1e-6:
-            return math.nan
-        if high <= low:
-            return 0.0
-        ticks, speeds = known
-        at = np.array([low, *ticks[(ticks > low) & (ticks < high)], high])
-        speeds = np.interp(at, ticks, speeds)
-        mean = float(np.sum(np.diff(at) * (speeds[1:] + speeds[:-1]) / 2)) / (high - low)
-        return mean * seconds
-
-    def check_drives(self, names: Sequence[str]) -> None:
-        """Check that at least one drive has speeds."""
-        if not {"", *names} & set(self.drives):
-            expected = f"call them {_some(names)}, or leave" if names else "a single recording has no name, so leave"
-            raise DataError(
-                f"{self.path} gives speeds of the drives {_some(list(self.drives))}, which are not asked for; "
-                f"{expected} the column 'drive' out"
-            )
-
-
-def read_speeds(path: str | Path) -> SpeedTable:
-    """Read a CSV file of speeds."""
-    rows: dict[str, dict[float, float]] = {}
-    try:
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            table = csv.DictReader(file, skipinitialspace=True)
-            table.fieldnames = columns = [name.strip() for name in table.fieldnames or ()]
-            if "speed" not in columns or not {"time", "frame"} & set(columns):
-                raise DataError(f"{path} has the columns {', '.join(columns)[:100] or 'none'}; {_FORMAT}")
-            unit: Literal["time", "frame"] = "time" if "time" in columns else "frame"
-            for number, row in enumerate(table, 2):
-                tick, speed = _numbers(row, f"{path}, line {number}", unit)
-                drive = (row.get("drive") or "").strip()
-                of_drive = rows.setdefault(drive, {})
-                if tick in of_drive:
-                    raise DataError(
-                        f"{path}, line {number} gives a second speed at {unit} {tick:g}"
-                        f"{f' of {drive}' if drive else ''}; keep one line of each"
-                    )
-                of_drive[tick] = speed
-    except OSError as reason:
-        raise DataError(f"cannot read {path}: {reason.strerror or reason}") from reason
-    except (UnicodeDecodeError, csv.Error) as reason:
-        raise DataError(f"{path} is not a CSV file of text ({reason}); {_FORMAT}") from reason
-    if not rows:
-        raise DataError(f"{path} holds no line of numbers; {_FORMAT}")
-    sorted_rows = {drive: np.array(sorted(of_drive.items())) for drive, of_drive in rows.items()}
-    return SpeedTable(Path(path), unit, {drive: (each[:, 0], each[:, 1]) for drive, each in sorted_rows.items()})
-
-
-def _numbers(row: Mapping[str, str | None], where: str, unit: str) -> tuple[float, float]:
-    try:
-        speed, tick = float(row["speed"] or ""), float(row[unit] or "")
-    except ValueError:
-        speed = tick = math.nan
-    if not (math.isfinite(speed) and math.isfinite(tick) and speed >= 0):
-        given = ", ".join(f"{key}={value}" for key, value in row.items())
-        raise DataError(f"{where} is not a time and a speed of at least 0 ({given[:100]}); {_FORMAT}")
-    return tick, speed
-
-
-def _some(names: Sequence[str]) -> str:
-    """Name the first three."""
-    return ", ".join([*names[:3], *(["..."] if len(names) > 3 else [])])

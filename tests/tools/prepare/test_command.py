@@ -51,7 +51,7 @@ def test_each_job_runs_and_leaves_only_its_results(command, tree, tmp_path):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["densfy"], "job is 'densfy'; did you mean 'densify'? allowed: densify, teacher, cache"),
+        (["densfy"], "job is 'densfy'; did you mean 'densify'? allowed: densify, teacher, cache, import"),
         ([], "job is not set; add job=..."),
         (["densify"], "root is not set; add root=..."),
         (["cache", "data=synthetic", "folder=c"], "SyntheticDataModule reads no copies made by saunet prepare; use"),

@@ -20,7 +20,7 @@ from saunet.data.drive import GAP, Drive
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
 from saunet.data.loading.selecting import divide
-from saunet.data.loading.windows import Selection, reach
+from saunet.data.loading.windows import Selection, measured_distance, reach
 from saunet.data.video.camera import Lens, check_crop
 from saunet.data.video.clips import (
     Clip,
@@ -35,8 +35,11 @@ from saunet.data.video.motion import Motion, cuts, even_steps, measure
 from saunet.errors import ConfigError, DataError, in_range, one_of, positive
 from saunet.io.images import read_image
 from saunet.io.progress import bar
+from saunet.io.speeds import SpeedTable, read_speeds
 from saunet.registry import datamodules
 
+SPEEDS = "speeds.csv"
+"""A clip's speeds: in its folder, or beside a video as ``NAME.speeds.csv``."""
 LONGEST_STEP = 5.0
 """Seconds between two frames beyond which they are no neighbors: too much has moved meanwhile."""
 
@@ -107,6 +110,30 @@ class ClipDrive(Drive):
             for before, after in itertools.pairwise(self._indices)
             if lost[self._places[before]] != lost[self._places[after]]
         )
+
+    @functools.cached_property
+    def _speeds(self) -> SpeedTable | None:
+        path = self.clip.path
+        file = path / SPEEDS if path.is_dir() else path.with_suffix(f".{SPEEDS}")
+        return read_speeds(file) if file.is_file() else None
+
+    def _tick(self, index: int) -> float:
+        """Return where a frame is in the table of speeds; NaN if unknown."""
+        at = self.recorded(index) if self._speeds and self._speeds.unit == "frame" else self.time(index)
+        return math.nan if at is None else float(at)
+
+    def speed(self, index: int) -> float | None:
+        tick = self._tick(index)
+        value = self._speeds.mean(tick, tick) if self._speeds else math.nan
+        return None if math.isnan(value) else value
+
+    def distance(self, first: int, second: int) -> float | None:
+        times = self.time(first), self.time(second)
+        if self._speeds is None or times[0] is None or times[1] is None:
+            return None
+        low, high = sorted((self._tick(first), self._tick(second)))
+        mean = self._speeds.mean(low, high)
+        return None if math.isnan(mean) else mean * abs(times[1] - times[0])
 
     def static(self) -> frozenset[int]:
         """Return the numbers of the frames in which the picture does not move."""
@@ -193,6 +220,7 @@ class VideoDataModule(DepthDataModule):
         crop: Shares to cut off at the [top, bottom, left, right], such as ``[0,0.12,0,0]`` for a bonnet; by default
             those of the camera file.
         camera_height: Meters from the road to the camera, for clips whose camera file does not say.
+        with_speed: Batches carry the way traveled by a clip's ``speeds.csv``, for the velocity term.
         frames_cache: Folder for decoded videos and measurements; by default in the user's cache folder.
         max_width: Frames of videos are kept at most this wide.
         **loading: Loader settings, as in `LoadOptions`.
@@ -222,6 +250,7 @@ class VideoDataModule(DepthDataModule):
         static: Literal["drop", "keep"] = "drop",
         crop: Sequence[float] | None = None,
         camera_height: float | None = None,
+        with_speed: bool = False,
         frames_cache: str | None = None,
         max_width: int = 1280,
         cache: str | None = None,
@@ -241,6 +270,7 @@ class VideoDataModule(DepthDataModule):
         self._height = None if camera_height is None else float(positive("camera_height", camera_height))
         self.frames_cache = default_cache() if frames_cache is None else Path(frames_cache).expanduser()
         self.max_width = int(positive("max_width", max_width))
+        self.odometer = measured_distance if with_speed else None
         self._drives: list[ClipDrive] | None = None
         self._broken: list[str] = []
 

@@ -18,17 +18,19 @@ from saunet.prediction.foreign import NOTHING, ForeignOptions, ForeignPredictor
 from saunet.prediction.prediction import load
 from saunet.registry import Spec
 from saunet.threads import available_cores
+from saunet.tools.prepare.bags import ImportReport, import_bags
 from saunet.tools.prepare.cache import CacheReport, build_cache
 from saunet.tools.prepare.pool import Done, OnError
 from saunet.tools.prepare.targets import DenseKind, FileTeacher, ModelTeacher, Recording, Values, densify, teach
 
-Job = Literal["densify", "teacher", "cache"]
+Job = Literal["densify", "teacher", "cache", "import"]
 _KITTI = ("root", "cameras", "drives", "split")
 _SHARED = ("job", *_KITTI, "folder", "on_error")
 KEYS: dict[str, tuple[str, ...]] = {
     "densify": (*_SHARED, "kinds", "depth", "workers"),
     "teacher": (*_SHARED, "checkpoint", "foreign", "input", "values", "device"),
     "cache": (*_SHARED, "data", "height", "width", "format", "quality", "workers"),
+    "import": ("job", "folder", "on_error", "input", "topics", "camera"),
 }
 """Job -> the options that it reads."""
 
@@ -36,7 +38,7 @@ KEYS: dict[str, tuple[str, ...]] = {
 @checked
 @dataclass(frozen=True, kw_only=True)
 class PrepareOptions:
-    """What `prepare` does: one of three jobs, each with options of its own.
+    """What `prepare` does: one of four jobs, each with options of its own.
 
     Raises:
         ConfigError: for a wrong value, or an option that the job does not have.
@@ -48,7 +50,8 @@ class PrepareOptions:
     """
 
     job: Job
-    """``densify`` (dense depth maps from LiDAR), ``teacher`` (another model's depth) or ``cache`` (smaller images)."""
+    """``densify`` (dense depth maps from LiDAR), ``teacher`` (another model's depth), ``cache`` (smaller images) or
+    ``import`` (bags as clips)."""
     data: Spec | None = None
     """``cache``: the data module to make copies for; None reads the KITTI raw tree at ``root``."""
     root: str | None = None
@@ -70,7 +73,12 @@ class PrepareOptions:
     foreign: ForeignOptions = NOTHING
     """``teacher``: what an ONNX or TorchScript model of another system takes and gives."""
     input: str | None = None
-    """``teacher``: a folder of depth that another system predicted."""
+    """``teacher``: a folder of depth that another system predicted. ``import``: a bag of ROS 1 or 2, an MCAP file, or
+    a folder of them."""
+    topics: Sequence[str] = ()
+    """``import``: only these image topics; all if empty."""
+    camera: str | None = None
+    """``import``: a camera file for images of which the bag has no CameraInfo."""
     values: Values = "depth"
     """``teacher``: what those files hold, ``depth`` or ``disparity``."""
     device: str = "auto"
@@ -89,7 +97,7 @@ class PrepareOptions:
     """For a broken file: ``raise`` stops and names it, ``skip`` continues without the frame."""
 
     def __post_init__(self) -> None:
-        for key in ("cameras", "drives", "kinds"):
+        for key in ("cameras", "drives", "kinds", "topics"):
             object.__setattr__(self, key, tuple(getattr(self, key)))
         one_of("job", self.job, KEYS)
         given = [each.name for each in fields(self) if getattr(self, each.name) != each.default]
@@ -99,9 +107,13 @@ class PrepareOptions:
                 raise ConfigError(f"{key} belongs to the job {owners}, not to {self.job}; leave it out")
             if self.data is not None and key in _KITTI:
                 raise ConfigError(f"{key} is for KITTI raw trees; with data=..., set data.{key} or leave it out")
+        one_of("on_error", self.on_error, get_args(OnError))
+        if self.job == "import":
+            if self.input is None or self.folder is None:
+                raise ConfigError("import needs input=... (a bag, or a folder of bags) and folder=... (for the clips)")
+            return
         if self.data is None and self.root is None:
             raise ConfigError("root is not set; add root=... (a KITTI raw tree)")
-        one_of("on_error", self.on_error, get_args(OnError))
         if self.workers is not None:
             positive("workers", self.workers, allow_zero=True)
         for camera in self.cameras:
@@ -120,7 +132,7 @@ class PrepareOptions:
             CacheSettings(self.height, self.width, self.format, self.quality)
 
 
-def prepare(options: PrepareOptions) -> Done | CacheReport:
+def prepare(options: PrepareOptions) -> Done | CacheReport | ImportReport:
     """Do one preparation; what exists already is checked and kept, so an interrupted job resumes.
 
     Args:
@@ -140,6 +152,8 @@ def prepare(options: PrepareOptions) -> Done | CacheReport:
         Traceback (most recent call last):
         saunet.errors.DataError: no data root at /nowhere...
     """
+    if options.job == "import":
+        return import_bags(str(options.input), str(options.folder), options.topics, options.camera, options.on_error)
     workers = available_cores() if options.workers is None else options.workers
     if options.data is not None:
         skips = options.on_error == "skip" and "on_error" in options.data.parameters
