@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from saunet.geometry.pose import pose_matrix
-from saunet.geometry.warp import backproject, project, synthesize
+from saunet.geometry.warp import BEHIND, backproject, project, synthesize, visible
 
 Load = Callable[[str], Mapping[str, Any]]
 K_SMALL = torch.tensor([[20.0, 0.0, 7.3], [0.0, 18.0, 5.1], [0.0, 0.0, 1.0]])
@@ -103,6 +103,15 @@ def test_behind_or_in_the_camera_is_invalid_and_gradients_stay_finite(z: float) 
     assert depth.grad.isfinite().all()
     assert motion.grad is not None
     assert motion.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_point_that_is_no_number_is_outside_and_invalid(axis: int) -> None:
+    moved = torch.eye(4)[None]
+    moved[0, axis, 3] = torch.nan  # of a pose network that has diverged
+    pixels, z = project(backproject(torch.full((1, 1, 12, 16), 4.0), K_SMALL[None]), K_SMALL[None], moved)
+    assert (pixels == BEHIND).all()
+    assert not visible(pixels, z, 12, 16).any()
 
 
 def test_out_of_view_is_invalid_and_takes_the_border_color() -> None:
