@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol, get_args, runtime_checkable
 
 import torch
@@ -235,13 +236,19 @@ def runs_alone(options: EvaluateOptions) -> bool:
     return alone
 
 
-def evaluate_network(network: nn.Module, data: EvaluationData) -> EvaluationResult:
-    """Score a depth network, on its device, beside the trivial predictors on test images of its size."""
+def evaluate_network(
+    network: nn.Module,
+    data: EvaluationData,
+    others: Mapping[str, Predictor] = MappingProxyType({}),
+    shapes: Shapes | None = None,
+) -> EvaluationResult:
+    """Score a depth network, on its device, beside others and the trivial predictors on test images of its size."""
     _set_up(data, "test")
-    predictors: dict[str, Predictor] = {"model": NetworkPredictor(network), **trivial(data)}
+    predictors: dict[str, Predictor] = {"model": NetworkPredictor(network), **others, **trivial(data)}
     batches = data.batches("test", next(network.parameters()).device)
     rules = [protocol(name) for name in _fitting(data, motion=False)]
-    return score(predictors, batches, rules, ground_truth=data.ground_truth, total=len(data.datasets["test"]))
+    total = len(data.datasets["test"])
+    return score(predictors, batches, rules, ground_truth=data.ground_truth, shapes=shapes, total=total)
 
 
 def _resized(data: Spec, record: ModelRecord) -> Spec:

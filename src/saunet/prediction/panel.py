@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -48,26 +49,28 @@ def depth_panel(
     tile_width: int = 640,
     colormap: str = "magma",
     note: str = "",
+    others: Mapping[str, Float[np.ndarray, "_ _"]] = MappingProxyType({}),
 ) -> UInt8[np.ndarray, "hp wp 3"]:
     """Show an image, its disparity, and, where the true depth is known, the truth and the relative error.
 
     The prediction is scaled to the truth by the ratio of medians before the comparison, as in evaluation, and both are
-    painted with the truth's colors.
+    painted with the truth's colors. ``others`` are further predictions by name, shown before it in the same way.
     """
     tiles = {"input": image}
-    shown = resize(np.asarray(disparity, dtype=np.float32), *image.shape[:2])
-    name = f"disparity{' ' + note if note else ''}"
+    predictions = {**others, f"disparity{' ' + note if note else ''}": disparity}
+    shown = {name: resize(np.asarray(each, dtype=np.float32), *image.shape[:2]) for name, each in predictions.items()}
     if truth is None or not (truth > 0).any():
-        tiles[name] = colorize(shown, colormap=colormap)
+        tiles |= {name: colorize(each, colormap=colormap) for name, each in shown.items()}
         return panel(tiles, columns, tile_width)
     known = truth > 0
     true_disparity = np.where(known, 1 / np.where(known, truth, 1), 0).astype(np.float32)
-    predicted = resize(shown, *truth.shape)
-    predicted = predicted * (np.median(1 / predicted[known]) / np.median(truth[known]))
     limits = value_range(true_disparity[known])
+    for name, each in shown.items():
+        predicted = resize(each, *truth.shape)
+        predicted = predicted * (np.median(1 / predicted[known]) / np.median(truth[known]))
+        tiles[name] = colorize(predicted, limits, colormap)
     error = np.where(known, np.abs(1 / predicted - truth) / np.where(known, truth, 1), 0).astype(np.float32)
     dot = max(1, round(truth.shape[1] / tile_width * 3)) if known.mean() < 0.3 else 1
-    tiles[name] = colorize(predicted, limits, colormap)
     tiles["ground truth"] = _dots(colorize(true_disparity, limits, colormap, known), dot)
     tiles["relative error: dark 0, bright 30 % or more"] = _dots(colorize(error, (0.0, 0.3), "inferno", known), dot)
     return panel(tiles, columns, tile_width)
