@@ -27,6 +27,7 @@ COMMANDS = {
     "components": (["components"], ["components"]),
     "one key by Tab": (["--complete", "saunet train data.ba"], ["train", "-sc", "query=bash"]),
     "predict a picture": 2 * (["predict", "input=road.png", "checkpoint=run/checkpoints/last.ckpt", "output=out"],),
+    "predict with street": 2 * (["predict", "input=road.png", "checkpoint=street", "output=out"],),
 }
 """What is typed -> the words here, and the words for the other checkout."""
 

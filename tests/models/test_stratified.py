@@ -134,6 +134,33 @@ def test_compiles_as_one_graph_for_any_batch_and_size_and_traces(backend: str) -
     assert done.returncode == 0, done.stderr
 
 
+TRACE = """
+import torch
+from saunet.models.encoders.stratified import StratifiedTransformer
+
+torch.manual_seed(0)
+encoder = StratifiedTransformer(dim=8, depths=(2, 2), heads=(1, 2), window=WINDOW).eval()
+for grad in (False, True):
+    with torch.set_grad_enabled(grad):
+        traced = torch.jit.trace(encoder, torch.rand(2, 3, 32, 48))  # it checks its graph against a second trace
+        image = torch.rand(2, 3, 32, 48)
+        for one, other in zip(traced(image), encoder(image), strict=True):
+            torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
+        for shape in ((2, 3, 32, 64), (2, 3, 64, 48), (2, 3, 32, 32), (1, 3, 32, 48), (3, 3, 32, 48)):
+            try:
+                traced(torch.rand(shape))
+            except (RuntimeError, IndexError):
+                continue
+            raise AssertionError(f"a trace for one shape took {shape}")
+"""
+
+
+@pytest.mark.parametrize("window", ["(8, 4)", "(5, 3)"])
+def test_a_trace_is_right_and_refuses_other_shapes(window: str) -> None:
+    done = python("-c", TRACE.replace("WINDOW", window))
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize("warm", [False, True])
 def test_exports_with_constant_plans_and_leaves_no_traces(warm: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(window, "_KEPT", {})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -181,3 +182,16 @@ def test_a_resized_camera_is_that_of_the_geometry() -> None:
 def test_what_names_no_model_is_refused(source: Any) -> None:
     with pytest.raises(CheckpointError, match=r"saunet\.load got .*; give the path of a checkpoint"):
         saunet.load(source)
+
+
+def test_predicting_does_not_import_the_compiler() -> None:
+    """Neither the window encoders' index tensors nor the bound on what a file may ask for need it."""
+    code = (
+        "import sys, torch, saunet\n"
+        "with torch.no_grad():\n"
+        "    saunet.build('encoder', 'stratified_nano').eval()(torch.rand(1, 3, 32, 64))\n"
+        "saunet.load('street').predict(torch.rand(3, 32, 64))\n"
+        "print('torch._dynamo' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

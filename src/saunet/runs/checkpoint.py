@@ -76,6 +76,11 @@ class _Counted(TorchDispatchMode):  # type: ignore[no-untyped-call]
         super().__init__()  # type: ignore[no-untyped-call]
         self.numbers = self.left = numbers
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Do without the guard against being compiled: it imports the whole compiler, seconds for each prediction."""
+        return False
+
     def count(self, numbers: int) -> None:
         self.left -= numbers
         if self.left < 0:

@@ -12,7 +12,8 @@ costs more than the arithmetic.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,6 +53,8 @@ def axis_windows(size: int, window: int, shift: int) -> list[tuple[int, int]]:
     A shifted axis starts with a window of ``shift`` tokens; the last window ends at the border. An axis that fits in
     one window is not shifted: the shift would only cut it in two.
     """
+    if isinstance(size, Tensor):  # from torch.jit.trace: equal lengths must be equal keys of `window_groups`
+        size = int(size)
     first = shift if size > window else 0
     starts = [0, *range(first, size, window)] if first else list(range(0, size, window))
     return [(start, stop - start) for start, stop in zip(starts, [*starts[1:], size], strict=True)]
@@ -80,22 +83,48 @@ def window_order(
 
 def relative_position_index(height: int, width: int, window: int, device: torch.device) -> Int[Tensor, " n2"]:
     """Return the row of the ``(2 window - 1)**2`` bias table for each (query, key) of a ``height x width`` window."""
-    index: Tensor = _plan("relative", height, width, window, str(device))
-    return index
+    return _plan("relative", height, width, window, str(device))
 
 
-@torch.compiler.allow_in_graph  # type: ignore[untyped-decorator]
 def _plan(kind: str, *arguments: Any) -> Tensor:
     """Return an index tensor, made once: ``arguments`` are sizes, which a tracer may wrap, and last the device."""
+    if torch.compiler.is_dynamo_compiling():
+        _mark_for_compiler()
+    return _kept_plan(kind, *arguments)
+
+
+def _mark_for_compiler() -> bool:
+    """Tell the compiler to call `_kept_plan`, not to look into it."""
+    torch.compiler.allow_in_graph(_kept_plan)
+    return True
+
+
+# What torch.compiler.assume_constant_result sets: the compiler calls the function when it meets it. Marking either by
+# torch.compiler's functions here would import the whole compiler with the network, seconds for each prediction.
+_mark_for_compiler._dynamo_marked_constant = True  # type: ignore[attr-defined]
+
+
+def _kept_plan(kind: str, *arguments: Any) -> Tensor:
     *sizes, device = arguments
     key = (kind, *map(int, sizes), device)
     if key not in _KEPT:
         while len(_KEPT) >= _KEPT_AT_MOST:
             _KEPT.pop(next(iter(_KEPT)))
         # made outside of whatever mode is on: an index made for a prediction or a trace must serve everyone
-        with torch.inference_mode(False), _disable_current_modes():
+        with torch.inference_mode(False), _disable_current_modes(), _untraced():
             _KEPT[key] = torch.from_numpy(_BUILDERS[kind](*key[1:-1])).to(device)
     return torch.ops.aten.lift_fresh.default(_KEPT[key])  # type: ignore[no-any-return]  # a tracer takes it as a constant
+
+
+@contextlib.contextmanager
+def _untraced() -> Iterator[None]:
+    """Keep from torch.jit.trace, which would otherwise find another graph when it checks itself, what is done."""
+    state = torch._C._get_tracing_state()  # type: ignore[no-untyped-call]
+    torch._C._set_tracing_state(None)
+    try:
+        yield
+    finally:
+        torch._C._set_tracing_state(state)
 
 
 def _build_order(batch: int, height: int, width: int, window: int, shift: int) -> np.ndarray:
@@ -138,7 +167,7 @@ class _Reorder(torch.autograd.Function):
 
 def reorder(rows: Float[Tensor, "n c"], order: Int[Tensor, " n"], inverse: Int[Tensor, " n"]) -> Float[Tensor, "n c"]:
     """Return ``rows[order]`` for a permutation whose inverse is known."""
-    if not torch.is_grad_enabled():
+    if not torch.is_grad_enabled() or torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
         return F.embedding(order, rows)
     out: Tensor = _Reorder.apply(rows, order, inverse)  # type: ignore[no-untyped-call]
     return out
@@ -177,7 +206,7 @@ class WindowAttention(nn.Module):
         qkv = torch.split(self.qkv(tokens), [batch * group.windows * group.area for group in groups])
         parts = [self.attend(part, group) for part, group in zip(qkv, groups, strict=True)]
         attended = self.proj(parts[0] if len(parts) == 1 else torch.cat(parts))
-        out = reorder(attended, inverse, order).view(batch, rows, columns, self.dim)
+        out = reorder(attended, inverse, order).view(x.shape)  # which a trace, made for one size, refuses for others
         return out if (rows, columns) == (height, width) else out[:, :height, :width]
 
     def _attend_each(self, x: Float[Tensor, "b h w c"]) -> Float[Tensor, "b h w c"]:
