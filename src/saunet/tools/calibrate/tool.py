@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from saunet.data.video.calibrations import EXPORTS, SUFFIXES, export_camera, split_name
-from saunet.data.video.camera import Lens, read_camera, write_camera
+from saunet.data.video.camera import CameraFile, Lens, read_camera, write_camera
+from saunet.data.video.clips import frame_paths
 from saunet.data.video.lens_models import WIDEST
-from saunet.errors import ConfigError, checked, in_range, one_of, positive
+from saunet.errors import ConfigError, DataError, checked, in_range, one_of, positive
 from saunet.io.atomic import check_folder
-from saunet.io.images import write_image
+from saunet.io.images import read_image, write_image
 from saunet.io.progress import bar
+from saunet.io.video import VideoReader
+from saunet.tools.calibrate.driving import KNOWN, WINDOW, estimate_focal, small_gray
 from saunet.tools.calibrate.solve import Board, Calibration, check_picture, solve
 
 
@@ -33,6 +40,9 @@ class CalibrateOptions:
     input: str | None = None
     """A video, or a folder of pictures, of the board held in many places and tilts; or a calibration ``FILE[:camera]``
     of another tool, to convert."""
+    video: str | None = None
+    """In place of ``input``: a driving video with turns, or a folder of its frames. Gives the focal length, if it can
+    be known; the center is taken to be the middle, and the lens to be straight."""
     output: str = "camera.yaml"
     """The camera file to write; a picture to check it by is written beside it."""
     board: Literal["chessboard", "charuco"] = "chessboard"
@@ -70,9 +80,10 @@ class CalibrateOptions:
         self.target()
         if self.print_board:
             return
-        if self.input is None:
+        if (self.input is None) == (self.video is None):
             raise ConfigError(
-                "input is not set; add input=board.mp4 (a video or a folder of pictures), or print_board=..."
+                "set one of input and video: input=board.mp4 (a video or a folder of pictures of a board), "
+                "video=drive.mp4 (a driving video), or print_board=..."
             )
         if self.export is not None:
             one_of("export", self.export, EXPORTS)
@@ -135,20 +146,21 @@ def calibrate(
         write_image(options.print_board, board.picture())
         how = "print it, glue it to something flat, and measure a square"
         return CalibrateResult(Path(options.print_board), f"{board}: {options.print_board}; {how}")
-    assert options.input is not None
     check_folder(Path(options.output).parent)
     result = None
-    if split_name(options.input)[0].suffix.lower() in SUFFIXES:
-        camera = read_camera(options.input)
+    if options.video is not None:
+        camera, note = _from_driving(options.video)
+    elif split_name(str(options.input))[0].suffix.lower() in SUFFIXES:
+        camera = read_camera(str(options.input))
         note = f"from {options.input}"
     else:
         with bar() as shown:
             task = shown.add_task("looking for the board", total=None)
             advance = advance or (lambda done, total: shown.update(task, completed=done, total=total))
             k3 = options.export != "kalibr"  # which has no such number
-            result = solve(options.input, board, options.lens, options.views, options.max_error, advance, k3)
+            result = solve(str(options.input), board, options.lens, options.views, options.max_error, advance, k3)
         camera = result.camera
-        note = f"from {len(result.views)} views of a {board} in {Path(options.input).name}"
+        note = f"from {len(result.views)} views of a {board} in {Path(str(options.input)).name}"
     own: dict[str, Any] = {"camera_height": options.camera_height, "condition": options.condition, "fov": options.fov}
     camera = replace(camera, **{key: value for key, value in own.items() if value is not None})
     if camera.image_size:
@@ -175,3 +187,36 @@ def calibrate(
         lines.append(f"the board was seen in {result.coverage:.0%} of the image only: hold it into the corners too")
     lines.append(f"{files}; look at {picture}: straight lines must be straight on its right side")
     return CalibrateResult(output, "\n".join(lines), result)
+
+
+def _from_driving(source: str) -> tuple[CameraFile, str]:
+    """Estimate the focal length from a drive; refused where it cannot be known."""
+    path, size = Path(source).expanduser(), list[tuple[int, int]]()
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        if path.is_dir():
+            yield from map(read_image, frame_paths(path))
+        else:
+            with VideoReader(path) as reader:
+                yield from (frame.image for frame in reader.frames(10.0))
+
+    def windows() -> Iterator[list[NDArray[np.uint8]]]:
+        frames = deque[NDArray[np.uint8]](maxlen=WINDOW)
+        for number, image in enumerate(pictures()):
+            size[:] = [(image.shape[0], image.shape[1])]
+            frames.append(small_gray(image))
+            if len(frames) == WINDOW and number % (WINDOW // 2) == 0:
+                yield list(frames)
+
+    found = estimate_focal(windows())
+    film = "film a minute with turns at 15 to 30 km/h: corners, a roundabout, a winding road"
+    if found is None or not found.is_known:
+        known = "nothing says it" if found is None else f"it is known to {found.uncertainty:.1%} only"
+        raise DataError(f"the focal length cannot be known from {source}: {known}, {KNOWN:.1%} is required; {film}")
+    height, width = size[0]
+    focal = found.focal * width
+    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    about = (
+        f"from {found.windows} windows of {WINDOW} frames of {path.name}: focal length known to {found.uncertainty:.2%}"
+    )
+    return CameraFile(path, K, size[0]), f"{about}; the center and a straight lens are assumed"

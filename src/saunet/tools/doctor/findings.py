@@ -120,6 +120,10 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
         views = [round(camera.view) for camera in survey.cameras]
         low, high = min(views), max(views)
         yield Finding("note", f"horizontal field of view {low}{f' to {high}' if high > low else ''} degrees")
+    known = [camera for camera in survey.cameras if camera.estimate is not None and camera.estimate.is_known]
+    if known:
+        text = f"the focal lengths of {len(known)} of {len(survey.cameras)} drives were compared with turns in them"
+        yield Finding("note", text)
     heights = {camera.height for camera in survey.cameras}
     if heights and None not in heights:
         listed = ", ".join(map(str, sorted({round(height or 0, 2) for height in heights})))
@@ -135,6 +139,13 @@ def _camera(camera: CameraFacts) -> Iterator[Finding]:
         yield Finding("error", text, "give K in pixels of the image size it was calibrated for")
     elif abs(fx / fy - 1) > 0.1:
         yield Finding("warning", f"{told}: the focal lengths differ", "were images stretched after calibration?")
+    found = camera.estimate
+    if found is not None and found.contradicts(fx / width):
+        text = (
+            f"{told} contradicts the pictures: turns in them say a focal length of {found.focal * width:.0f}, known to "
+            f"{found.uncertainty:.1%}"
+        )
+        yield Finding("error", text, "calibrate with saunet calibrate, or give the K of this camera and this mode")
     if not (0.35 < (cx + 0.5) / width < 0.65 and 0.2 < (cy + 0.5) / height < 0.8):
         text = f"{told}: the center is far from the middle of the image"
         yield Finding("warning", text, "is K that of uncropped or differently sized images?")

@@ -21,6 +21,7 @@ from saunet.data.loading.selecting import optical_flow
 from saunet.data.loading.windows import WindowDataset
 from saunet.data.video.motion import relative_change, shrink
 from saunet.errors import DataError, SaunetError
+from saunet.tools.calibrate.driving import WINDOW, FocalEstimate, estimate_focal, small_gray
 
 SPLITS = ("train", "val", "test")
 ABSENT = "in absent recordings"
@@ -30,6 +31,8 @@ BANDS = 32
 _TRUTHS = 16
 """Ground-truth maps that are looked at."""
 _PICTURES = 8
+_FOCALS = 3
+"""Cameras whose focal length is estimated."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,8 @@ class CameraFacts:
     fps: float | None
     height: float | None
     """Meters above the road."""
+    estimate: FocalEstimate | None = None
+    """The focal length that the pictures themselves tell; None if it was not looked for or nothing tells it."""
 
     @property
     def view(self) -> float:
@@ -168,6 +173,7 @@ def survey(
     _read_frames(found, drives, plan, advance)
     for name in wanted:
         _look_at_camera(found, name, drives[name], min(wanted[name]))
+    _estimate_focal(found, drives, min(frames or found.known, found.known))
     for split in ("test", "val"):
         if split in datasets and not found.truths:
             _read_truths(found, datasets[split])
@@ -289,6 +295,32 @@ def _look_at_camera(found: Survey, name: str, drive: Drive, index: int) -> None:
         return
     if sizes:
         found.cameras.append(CameraFacts(name, K, sizes.most_common(1)[0][0], drive.fps, drive.camera_height))
+
+
+def _estimate_focal(found: Survey, drives: Mapping[str, Drive], frames: int) -> None:
+    """Look at a few seconds of each camera, if many frames may be read; the ones that turn most tell the most."""
+    groups: dict[bytes, list[int]] = {}
+    for place, camera in enumerate(found.cameras):
+        groups.setdefault(camera.K.tobytes(), []).append(place)
+    for places in list(groups.values())[:_FOCALS]:
+        camera, several = found.cameras[places[0]], [drives[found.cameras[place].drive] for place in places]
+        starts = [
+            (drive, start)
+            for drive in several
+            for start in range(0, len(drive.indices) - WINDOW + 1, WINDOW // 2)
+            if drive.indices[start + WINDOW - 1] - drive.indices[start] == WINDOW - 1
+        ]
+        center = (camera.K[0, 2] + 0.5) / camera.size[1], (camera.K[1, 2] + 0.5) / camera.size[1]
+        chosen = [starts[place] for place in evenly(len(starts), min(20, frames // 12))]
+
+        def windows(chosen: Sequence[tuple[Drive, int]] = chosen) -> Iterator[list[NDArray[np.uint8]]]:
+            for drive, start in chosen:
+                with suppress(DataError):  # broken frames are reported elsewhere
+                    yield [small_gray(drive.image(each)) for each in drive.indices[start : start + WINDOW]]
+
+        estimate = estimate_focal(windows(), most=6, center=center)
+        for place in places:
+            found.cameras[place] = replace(found.cameras[place], estimate=estimate)
 
 
 def _read_truths(found: Survey, dataset: WindowDataset) -> None:

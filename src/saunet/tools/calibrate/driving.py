@@ -1,0 +1,265 @@
+"""The focal length from a driving video itself: tracked points, bundle adjustment over short windows, and how sure.
+
+Two views never tell it for a car on a steady curve, and straight motion tells it hardly: windows of several frames are
+solved with the focal length free, each says how well it knows it, and only what the windows agree on counts.
+"""
+
+from __future__ import annotations
+
+import functools
+import heapq
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+WINDOW = 12
+"""Frames that are solved together, about a second of them."""
+WIDTH = 620
+"""Pictures are made this narrow."""
+KNOWN = 0.015
+"""Relative standard deviation up to which a focal length counts as known."""
+_START = 0.8
+"""Focal length to start from, in picture widths."""
+_SYSTEMATIC = 0.003
+"""What one window is not better than, whatever its residuals say: the center and the lens are assumed."""
+_SCALES, _ITERATIONS = (0.05, 0.01, 0.002, 0.0006), 15
+"""Residuals, in widths, from which Cauchy's weights fall: large ones first, so that a far start finds its way."""
+_FEWEST = 60
+"""Points that a window needs."""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowFocal:
+    """What one window says."""
+
+    focal: float
+    """In picture widths."""
+    uncertainty: float
+    """Relative standard deviation."""
+    error: float
+    """Root mean square of the residuals, pixels."""
+
+
+def track(frames: Sequence[NDArray[np.uint8]]) -> tuple[F64, NDArray[np.bool_]]:
+    """Track points of the last frame backwards, in which direction a driving camera keeps seeing them.
+
+    Returns pixels (n, frames, 2) and where they are known (n, frames), the last frame first.
+    """
+    gray = frames[::-1]
+    corners: Any = cv2.goodFeaturesToTrack(gray[0], 600, 0.005, 7)
+    if corners is None or len({each.shape for each in frames}) > 1:
+        return np.zeros((0, len(frames), 2)), np.zeros((0, len(frames)), dtype=bool)
+    points = np.asarray(corners, np.float32).reshape(-1, 1, 2)
+    found, known = [points[:, 0].astype(np.float64)], [np.ones(len(points), dtype=bool)]
+    flow: Any = functools.partial(cv2.calcOpticalFlowPyrLK, nextPts=None, winSize=(15, 15), maxLevel=4)
+    for before, after in itertools.pairwise(gray):
+        moved = flow(before, after, points)[0]
+        back = flow(after, before, moved)[0]
+        good = np.linalg.norm((back - points)[:, 0], axis=1) < 0.3
+        inside = (moved[:, 0] > 2).all(1) & (moved[:, 0] < np.array(after.shape[::-1]) - 3).all(1)
+        points = moved
+        found.append(moved[:, 0].astype(np.float64))
+        known.append(known[-1] & good & inside)
+    return np.stack(found, axis=1), np.stack(known, axis=1)
+
+
+def solve_window(
+    pixels: F64, known: NDArray[np.bool_], size: tuple[int, int], center: tuple[float, float] | None = None
+) -> WindowFocal | None:
+    """Bundle-adjust a window: poses, inverse depths along the rays of the first view, and one focal length.
+
+    ``center`` is the principal point in pixels, by default the picture's middle. None if too few points are tracked.
+    """
+    use = known.sum(1) >= 5
+    if use.sum() < _FEWEST:
+        return None
+    height, width = size
+    middle = np.array(center or ((width - 1) / 2, (height - 1) / 2))
+    fit = _adjust((pixels[use] - middle) / width, known[use], _START)
+    return fit and WindowFocal(fit[0], fit[1], fit[2] * width)
+
+
+@dataclass(frozen=True, slots=True)
+class FocalEstimate:
+    """What all windows say together."""
+
+    focal: float
+    """In picture widths."""
+    uncertainty: float
+    """Relative standard deviation, larger where windows disagree."""
+    windows: int
+
+    @property
+    def is_known(self) -> bool:
+        return self.windows >= 3 and self.uncertainty <= KNOWN
+
+    def contradicts(self, focal: float) -> bool:
+        """Return whether a given focal length, in picture widths, cannot be the one of the pictures."""
+        return self.is_known and abs(math.log(focal / self.focal)) > max(4 * self.uncertainty, 0.08)
+
+
+def combined(found: Sequence[WindowFocal]) -> FocalEstimate | None:
+    """Return the weighted mean of windows, without those that contradict the others; None if there is none."""
+    logs = np.log([each.focal for each in found])
+    spread = np.maximum([each.uncertainty for each in found], _SYSTEMATIC)
+    keep = np.isfinite(spread)
+    if not keep.any():
+        return None
+    order = np.argsort(logs)
+    order = order[keep[order]]
+    share = np.cumsum(1 / spread[order] ** 2)
+    middle = logs[order[int(np.searchsorted(share, share[-1] / 2))]]  # the weighted median
+    keep &= np.abs(logs - middle) < 4 * spread + 0.02
+    weights = 1 / spread[keep] ** 2
+    mean = float((weights * logs[keep]).sum() / weights.sum())
+    doubt = float((weights * (logs[keep] - mean) ** 2).sum() / max(1, keep.sum() - 1))
+    return FocalEstimate(float(np.exp(mean)), float(np.sqrt(max(1.0, doubt) / weights.sum())), int(keep.sum()))
+
+
+def small_gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an RGB picture, h x w x 3, in gray, at most `WIDTH` wide."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    width = min(WIDTH, gray.shape[1])
+    size = (width, round(gray.shape[0] * width / gray.shape[1]))
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def turning(pixels: F64, known: NDArray[np.bool_]) -> float:
+    """Return how far a window's points move sideways together, in pixels: much in turns, little on straights."""
+    steps = (pixels[:, 1:, 0] - pixels[:, :-1, 0])[known[:, 1:]]
+    return abs(float(np.median(steps))) if len(steps) else 0.0
+
+
+def estimate_focal(
+    windows: Iterable[Sequence[NDArray[np.uint8]]], most: int = 16, center: tuple[float, float] | None = None
+) -> FocalEstimate | None:
+    """Estimate the focal length from windows of gray frames; the ``most`` that turn most are solved.
+
+    ``center`` is the principal point in picture widths. None if no window has enough points to follow.
+    """
+    best: list[tuple[float, int, Any]] = []
+    for number, frames in enumerate(windows):
+        pixels, known = track(frames)
+        heapq.heappush(best, (turning(pixels, known), number, (pixels, known, frames[0].shape[:2])))
+        if len(best) > most:
+            heapq.heappop(best)
+    solved = []
+    for _, _, (pixels, known, size) in best:
+        at = None if center is None else (center[0] * size[1], center[1] * size[1])
+        solved.append(solve_window(pixels, known, size, at))
+    return combined([each for each in solved if each])
+
+
+def _adjust(x: F64, known: NDArray[np.bool_], focal: float) -> tuple[float, float, float] | None:
+    """Return the focal length, its relative deviation, and the error; coordinates are in widths."""
+    count, views = known.shape
+    t = np.zeros((views, 3))
+    t[:, 2] = np.arange(views)  # earlier views lie behind: points are farther from them
+    state: Any = np.tile(np.eye(3), (views, 1, 1)), t, np.full(count, 1 / 15), focal
+    seen = known.copy()
+    seen[:, 0] = False
+    for scale in _SCALES:
+        damping, cost = 1e-3, _cost(x, seen, state, scale)
+        for _ in range(_ITERATIONS):
+            A, b, B, C, d, r = _normal(x, seen, state, scale)
+            after = np.inf
+            while damping < 1e6:
+                Cd = C * (1 + damping)
+                S = A + damping * np.diag(np.diag(A) + 1e-6 * A.max()) - (B / Cd[:, None]).T @ B
+                delta = np.linalg.solve(S, B.T @ (d / Cd) - b)
+                trial = _moved(state, np.asarray(delta, np.float64), np.asarray(-(d + B @ delta) / Cd, np.float64))
+                after = _cost(x, seen, trial, scale)
+                if after < cost:
+                    break
+                damping *= 6
+            if not after < cost:
+                break
+            gain, cost, state, damping = cost - after, after, trial, max(damping / 6, 1e-9)
+            if gain < 1e-5 * cost:
+                break
+    A, b, B, C, d, r = _normal(x, seen, state, scale)
+    far = np.linalg.norm(r, axis=2)
+    inliers, focal = seen & (far < 3 * scale), state[3]
+    if not 0.2 < focal < 10 or inliers.sum() < 0.5 * seen.sum():
+        return None
+    rows = 2 * int(inliers.sum())
+    squares = float((far[inliers] ** 2).sum())
+    values, vectors = np.linalg.eigh(A - (B / C[:, None]).T @ B)
+    variance = squares / max(1, rows - len(A) - count)
+    deviation = np.sqrt(variance * (vectors[-1, 1:] ** 2 / values[1:].clip(values[-1] * 1e-15)).sum())  # 0: the scale
+    return float(focal), float(deviation / focal), float(np.sqrt(squares / rows))
+
+
+def _normal(x: F64, seen: NDArray[np.bool_], state: Any, scale: float) -> tuple[F64, F64, F64, F64, F64, F64]:
+    """Return the normal equations: of poses and focal length, across, and of the points, each with its right side."""
+    count, views = seen.shape
+    r, Jc, Jd = _residuals(x, *state)
+    w = np.where(seen, 1 / (1 + (r**2).sum(2) / scale**2), 0.0)
+    H, g = (
+        np.einsum("nvka,nvkb,nv->vab", Jc, Jc, w, optimize=True),
+        np.einsum("nvka,nvk,nv->va", Jc, r, w, optimize=True),
+    )
+    cross = np.einsum("nvka,nvk,nv->nva", Jc, Jd, w, optimize=True)
+    C, d = np.einsum("nvk,nvk,nv->n", Jd, Jd, w) + 1e-12, np.einsum("nvk,nvk,nv->n", Jd, r, w)
+    dims = 6 * (views - 1) + 1
+    A, b, B = np.zeros((dims, dims)), np.zeros(dims), np.zeros((count, dims))
+    for view in range(1, views):
+        at = slice(6 * (view - 1), 6 * view)
+        A[at, at], A[at, -1], b[at], B[:, at] = H[view, :6, :6], H[view, :6, 6], g[view, :6], cross[:, view, :6]
+    A[-1] = A[:, -1]
+    A[-1, -1], b[-1], B[:, -1] = H[:, 6, 6].sum(), g[:, 6].sum(), cross[:, :, 6].sum(1)
+    return A, b, B, C, d, r
+
+
+def _project(x: F64, R: F64, t: F64, depth: F64, focal: float) -> tuple[F64, F64]:
+    rays = np.concatenate([x[:, 0] / focal, np.ones((len(x), 1))], axis=1)
+    turned = np.einsum("vij,nj->nvi", R, rays)
+    return turned, turned + depth[:, None, None] * t[None]
+
+
+def _cost(x: F64, seen: NDArray[np.bool_], state: Any, scale: float) -> float:
+    R, t, depth, focal = state
+    if not 0.1 < focal < 20:
+        return np.inf
+    _, Y = _project(x, R, t, depth, focal)
+    with np.errstate(all="ignore"):
+        size = np.linalg.norm(focal * Y[..., :2] / Y[..., 2:] - x, axis=2)
+    size = np.where(Y[..., 2] > 0.05, size, 1.0)
+    return float((np.log1p((size / scale) ** 2) * seen).sum())
+
+
+def _residuals(x: F64, R: F64, t: F64, depth: F64, focal: float) -> tuple[F64, F64, F64]:
+    """Return residuals (n, views, 2), and what they change by per pose and focal length (.., 7), and per depth."""
+    turned, Y = _project(x, R, t, depth, focal)
+    z = np.maximum(Y[..., 2], 0.05)
+    seen = focal * Y[..., :2] / z[..., None]
+    P = np.zeros((*Y.shape[:2], 2, 3))
+    P[..., 0, 0] = P[..., 1, 1] = focal / z
+    P[..., :, 2] = -seen / z[..., None]
+    cross = np.zeros((*Y.shape[:2], 3, 3))
+    cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = turned[..., 2], -turned[..., 1], turned[..., 0]
+    cross -= np.swapaxes(cross, -1, -2)
+    Jc = np.zeros((*Y.shape[:2], 2, 7))
+    Jc[..., :3] = P @ cross
+    Jc[..., 3:6] = P * depth[:, None, None, None]
+    bent = np.concatenate([-x[:, 0] / focal**2, np.zeros((len(x), 1))], axis=1)
+    Jc[..., 6] = np.einsum("nvki,nvi->nvk", P, np.einsum("vij,nj->nvi", R, bent)) + seen / focal
+    Jd = np.einsum("nvki,vi->nvk", P, t)
+    return seen - x, Jc, Jd
+
+
+def _moved(state: Any, delta: F64, inverse: F64) -> Any:
+    R, t, depth, focal = state
+    R, t = R.copy(), t.copy()
+    for view in range(1, len(R)):
+        turn, shift = delta[6 * (view - 1) : 6 * view][:3], delta[6 * (view - 1) : 6 * view][3:]
+        R[view] = cv2.Rodrigues(turn)[0] @ R[view]
+        t[view] += shift
+    return R, t, np.maximum(depth + inverse, 1e-6), focal + float(delta[-1])

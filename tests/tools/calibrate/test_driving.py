@@ -1,0 +1,123 @@
+"""The focal length from a drive: exact on made points, within 3 % on rendered turns, refused where nothing says it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from videos import write_video
+
+import saunet
+from saunet.data.video.camera import read_camera
+from saunet.errors import ConfigError, DataError
+from saunet.io.images import write_image
+from saunet.synthetic import SyntheticDrive
+from saunet.synthetic.world import turn
+from saunet.tools.calibrate.driving import WINDOW, WindowFocal, combined, solve_window
+from saunet.tools.calibrate.tool import CalibrateOptions, calibrate
+from saunet.tools.doctor.findings import diagnose
+from saunet.tools.doctor.survey import survey
+
+SIZE = (188, 620)  # height, width
+
+
+def made(focal: float, degrees: float, seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Points seen from a car that turns by so many degrees a frame; 0.2 px of noise, and a tenth of them move."""
+    rng = np.random.default_rng(seed)
+    height, width = SIZE
+    ends = np.stack([rng.uniform(0, width, 300), rng.uniform(0, height, 300)], axis=1)
+    depth = 1 / rng.uniform(1 / 50, 1 / 5, 300)
+    f = focal * width
+    center = np.array([(width - 1) / 2, (height - 1) / 2])
+    points = np.concatenate([(ends - center) / f, np.ones((300, 1))], axis=1) * depth[:, None]
+    pixels, T = [], np.eye(4)
+    back = np.eye(4)
+    back[:3, :3], back[2, 3] = turn(np.radians(degrees)), 0.8  # the camera a frame earlier is behind
+    for _ in range(WINDOW):
+        seen = points @ T[:3, :3].T + T[:3, 3]
+        pixels.append(f * seen[:, :2] / seen[:, 2:] + center)
+        T = back @ T
+    found = np.stack(pixels, axis=1) + rng.normal(0, 0.2, (300, WINDOW, 2))
+    found[:30] += np.arange(WINDOW)[None, :, None] * rng.normal(0, 1.5, (30, 1, 2))  # other cars
+    known = np.logical_and.accumulate((found > 0).all(2) & (found < np.array(SIZE[::-1])).all(2), axis=1)
+    return found, known
+
+
+@pytest.mark.parametrize("focal", [0.4, 0.58, 1.2])
+def test_turns_tell_the_focal_length_and_straights_say_that_they_do_not(focal: float) -> None:
+    curve = solve_window(*made(focal, 2.0), SIZE)
+    assert curve is not None
+    assert curve.focal == pytest.approx(focal, rel=max(4 * curve.uncertainty, 0.005))
+    assert curve.uncertainty < 0.012
+    assert 0.1 < curve.error < 0.4
+    straight = solve_window(*made(focal, 0.0), SIZE)
+    assert straight is None or straight.uncertainty > 0.03
+
+
+def test_windows_are_weighted_and_a_wrong_one_is_left_out() -> None:
+    said = [WindowFocal(0.58, 0.01, 0.2), WindowFocal(0.585, 0.01, 0.2), WindowFocal(0.578, 0.02, 0.2)]
+    both = combined([*said, WindowFocal(2.0, 3.0, 0.2), WindowFocal(0.9, 0.01, 0.2)])
+    assert both is not None
+    assert both.focal == pytest.approx(0.582, abs=0.002)
+    assert both.is_known
+    assert both.contradicts(0.582 * 1.2)
+    assert both.contradicts(0.582 / 1.2)
+    assert not both.contradicts(0.582 * 1.03)
+    vague = combined([WindowFocal(0.58, 0.1, 0.2)] * 5)
+    assert vague is not None
+    assert not vague.contradicts(2.0)
+    assert combined([]) is None
+
+
+def test_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="set one of input and video"):
+        CalibrateOptions(input="a.mp4", video="b.mp4")
+    drive = write_video(tmp_path / "drive.mp4", 30)  # a picture that only shifts
+    with pytest.raises(DataError, match=r"cannot be known from .*film a minute with turns"):
+        calibrate(CalibrateOptions(video=str(drive), output=str(tmp_path / "camera.yaml")))
+    assert not (tmp_path / "camera.yaml").exists()
+
+
+class Winding(SyntheticDrive):
+    """A rendered street driven in bends of 30 degrees to both sides."""
+
+    def pose(self, index: int) -> NDArray[np.float64]:
+        heading = np.radians(30) * np.sin(2 * np.pi * np.arange(index + 1) / 40)
+        T = super().pose(0).copy()
+        T[:3, :3] = turn(heading[-1]) @ T[:3, :3]
+        T[0, 3] += 0.45 * np.sin(heading).sum()
+        T[2, 3] += 0.45 * np.cos(heading).sum()
+        return T
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "focal"), [(3, 0.58), (5, 0.9)])
+def test_rendered_turns(seed: int, focal: float, tmp_path: Path) -> None:
+    """Within 3 %; the doctor names a K that is 20 % off in either direction, and never the right one."""
+    drive = Winding(seed=seed, frames=60, height=180, width=480, focal=focal)
+    for index in drive.indices:
+        write_image(tmp_path / "clips" / "a" / f"{index:06d}.png", drive.image(index))
+    output = tmp_path / "camera.yaml"
+    said = calibrate(CalibrateOptions(video=str(tmp_path / "clips" / "a"), output=str(output)))
+    found = read_camera(output).K[0, 0] / 480
+    print(said, f"true {focal * 480:.1f}")
+    assert found == pytest.approx(focal, rel=0.03)
+    for factor, named in ((1.0, False), (1.2, True), (1 / 1.2, True)):
+        f = focal * 480 * factor
+        text = f"image_size: [480, 180]\nK: [{f}, {f}, 239.5, {0.46 * 179}]\nfps: 10\n"
+        (tmp_path / "clips" / "camera.yaml").write_text(text)
+        data = saunet.build(
+            "data", "video", root=str(tmp_path / "clips"), fps=None, workers=0, frames_cache=str(tmp_path / "cache")
+        )
+        findings = diagnose(survey(data, ("train",), 3000))
+        assert any("contradicts the pictures" in each.text for each in findings) == named, findings
+
+
+@pytest.mark.data
+def test_real_straight_drives_are_refused(kitti_mini: Path, tmp_path: Path) -> None:
+    """KITTI's mini drives have no turns: nothing is claimed about their focal length."""
+    for folder in ("raw/2011_09_26/2011_09_26_drive_9005_sync/image_02/data", "odometry/sequences/06/image_0"):
+        with pytest.raises(DataError, match=r"known to .* only"):
+            calibrate(CalibrateOptions(video=str(kitti_mini / folder), output=str(tmp_path / "camera.yaml")))
