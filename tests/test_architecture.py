@@ -44,6 +44,7 @@ ALLOWED: dict[str, set[str]] = {
         "data",
         "losses",
         "prediction",
+        "reporting",
         "runs",
         "weights",
     },

@@ -17,8 +17,9 @@ from made_runs import make_run
 
 import saunet
 from saunet.errors import ConfigError, DataError
+from saunet.io.images import read_image
 from saunet.reporting.page import as_html
-from saunet.reporting.run import page_of
+from saunet.reporting.run import page_of, write_results
 from saunet.reporting.watch import WatchOptions, serving
 
 
@@ -117,3 +118,16 @@ def test_the_open_page_renews_itself_in_a_browser(browser: Any, folder: Path) ->
         page.get_by_role("button", name="Pause").click()
         assert page.locator("#live").inner_text() == "paused"
     assert all(url.startswith((address, "data:")) for url in requests)
+
+
+def test_the_results_of_a_training_are_one_picture(folder: Path) -> None:
+    (folder / "pictures" / "epoch_010.png").unlink()
+    cv2.imwrite(str(folder / "pictures" / "epoch_010.png"), np.full((40, 100, 3), (0, 0, 250), np.uint8))
+    path = write_results(folder)
+    assert path == folder / "results.png"
+    picture = read_image(path).astype(int)
+    red = (picture[..., 0] > 240) & (picture[..., 1] < 10)
+    assert red.mean() > 0.2, "the last panel"
+    blue = (picture[..., 2] > 150) & (picture[..., 0] < 60)
+    assert blue.any(axis=1)[: len(picture) // 2].any(), "the curves above it"
+    assert write_results(make_run(folder.parent / "mute", status="finished", abs_rel=())) is None

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from saunet.errors import DataError
+from saunet.io.images import read_image
 from saunet.published import published
 from saunet.reporting.page import Missing
 from saunet.reporting.scenes import Seen
@@ -14,17 +15,48 @@ from saunet.reporting.tables import Groups, chosen, comparable
 from saunet.runs.folder import Run, read_mapping
 from saunet.runs.sweep import RATIO, ratio
 from saunet.tables import Row, Table, columns
-from saunet.tables.drawing import COLORS, Point, colors, new_figure, svg
+from saunet.tables.drawing import COLORS, Point, colors, new_figure, stacked_figure, svg
 
 
 def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, ordered: bool = False) -> bytes | None:
     """Draw columns of the runs' logs against epochs, one panel a column, one line a run."""
-    drawn = [(key, title) for key, title in panels if any(curve(run.history, key)[0] for run in runs.values())]
+    drawn = logged(runs, panels)
     if not drawn:
         return None
     figure, axes = new_figure(len(drawn), 11.7 if len(drawn) > 1 else 7.6, 3.8 if len(runs) > 1 else 3.3)
+    plot_curves(axes, runs, drawn, ordered=ordered)
+    if len(runs) > 1:
+        _legend(figure, axes)
+    return svg(figure)
+
+
+def draw_results(run: Run, groups: Sequence[Sequence[tuple[str, str]]], picture: Path | None) -> Any:
+    """Draw each group of columns of a run's log as a row of curves, above a picture; None if nothing was logged."""
+    named = {run.name: run}
+    drawn = [found for group in groups if (found := logged(named, group))]
+    if not drawn:
+        return None
+    image = None if picture is None else read_image(picture)
+    last = [] if image is None else [(1, 11.7 * image.shape[0] / image.shape[1])]
+    figure, rows = stacked_figure(11.7, [(len(group), 2.9) for group in drawn] + last)
+    for axes, group in zip(rows, drawn, strict=False):
+        plot_curves(axes, named, group)
+    if image is not None:
+        rows[-1][0].imshow(image)
+        rows[-1][0].set_axis_off()
+    figure.suptitle(run.name, x=0.01, ha="left")
+    return figure
+
+
+def logged(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    return [(key, title) for key, title in panels if any(curve(run.history, key)[0] for run in runs.values())]
+
+
+def plot_curves(
+    axes: Sequence[Any], runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, ordered: bool = False
+) -> None:
     tints = colors(len(runs), ordered=ordered)
-    for axis, (key, title) in zip(axes, drawn, strict=True):
+    for axis, (key, title) in zip(axes, panels, strict=True):
         few = max(len(curve(run.history, key)[0]) for run in runs.values()) <= 25
         for (name, run), color in zip(runs.items(), tints, strict=True):
             x, y = curve(run.history, key)
@@ -35,9 +67,6 @@ def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, o
         axis.set_xlim(left=0)
         if axis.get_xlim()[1] > 2:
             axis.xaxis.get_major_locator().set_params(integer=True)
-    if len(runs) > 1:
-        _legend(figure, axes)
-    return svg(figure)
 
 
 def draw_ratio(runs: Mapping[str, Run]) -> bytes | None:

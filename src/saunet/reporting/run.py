@@ -13,7 +13,7 @@ from saunet import __version__
 from saunet.errors import DataError, checked, require_matplotlib
 from saunet.io.display import display
 from saunet.io.images import natural_order
-from saunet.reporting.figures import draw_curves
+from saunet.reporting.figures import draw_curves, draw_results
 from saunet.reporting.inputs import collect
 from saunet.reporting.page import Document, Figure, Missing, Picture, Section, as_html
 from saunet.reporting.tables import runs_table
@@ -21,8 +21,9 @@ from saunet.runs import folder
 from saunet.runs.folder import read_mapping
 from saunet.runs.sweep import labels
 from saunet.tables import Column, Row, Table, columns
-from saunet.tables.drawing import Drawing
+from saunet.tables.drawing import Drawing, save
 
+RESULTS = "results.png"
 _CURVES = (
     ("train/loss", "training loss"),
     ("val/loss", "validation loss"),
@@ -99,6 +100,22 @@ class Run(folder.Run):
         return self.table.html() + (drawn or b"").decode()
 
 
+def write_results(folder: Path) -> Path | None:
+    """Draw curves, health and the last picture of a training into ``results.png``; None if it logged nothing.
+
+    Raises:
+        ConfigError: if matplotlib is missing.
+        DataError: if the system refuses to write.
+    """
+    require_matplotlib("results.png needs", "nothing, and look with saunet watch")
+    run = Run(folder)
+    figure = draw_results(run, (_CURVES, _health_panels()), _last_picture(run))
+    if figure is None:
+        return None
+    save(figure, folder / RESULTS)
+    return folder / RESULTS
+
+
 def page_of(path: str | Path) -> Document:
     """Return the page of what a path names: a run, a sweep, or a folder with several of them."""
     inputs = collect([path])
@@ -138,11 +155,19 @@ def _overview(name: str, title: str, runs: Mapping[str, folder.Run], *, swept: b
     return Section(title[0].upper() + title[1:] if len(runs) > 1 else "Progress", tuple(blocks))
 
 
+def _last_picture(run: folder.Run) -> Path | None:
+    found = sorted((run.path / "pictures").glob("*.png"), key=natural_order)
+    return found[-1] if found else None
+
+
+def _health_panels() -> list[tuple[str, str]]:
+    return [(f"health/{name}", what.split(",")[0]) for name, what in list(_HEALTH.items())[:3]]
+
+
 def _pictures(run: folder.Run) -> Section:
     """Return the last picture of the validation; what its tiles are is written above each."""
-    found = sorted((run.path / "pictures").glob("*.png"), key=natural_order)[-1:] if run.path.is_dir() else []
-    blocks = []
-    for file in found:
+    file, blocks = _last_picture(run), []
+    if file is not None:
         epoch = int("".join(filter(str.isdigit, file.stem)) or 0) + 1
         alt = "validation images with disparity, warped neighbor, photometric error and mask"
         caption = "Input, disparity, the neighbor warped into it, where the two differ (bright), what the mask keeps."
@@ -164,8 +189,7 @@ def _health(run: folder.Run, draw: bool) -> Section:
         return Section("Health", (), "nothing was logged yet")
     verdict = f"Noticed: {', '.join(said)}" if said else "Nothing unusual was seen"
     blocks: list[Table | Figure] = [Table("health", verdict, columns("figure", "now|.4g"), tuple(rows))]
-    panels = [(f"health/{name}", what.split(",")[0]) for name, what in list(_HEALTH.items())[:3]]
-    if draw and (drawn := draw_curves({run.name: run}, panels)):
+    if draw and (drawn := draw_curves({run.name: run}, _health_panels())):
         picture = Picture("health.svg", drawn, "figures of health against epochs")
         blocks.append(Figure("Figures of health", picture, "Against epochs."))
     return Section("Health", tuple(blocks))

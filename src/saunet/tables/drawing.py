@@ -58,6 +58,19 @@ def new_figure(panels: int, width: float, height: float, **options: Any) -> tupl
     return figure, list(axes)
 
 
+def stacked_figure(width: float, rows: Sequence[tuple[int, float]]) -> tuple[Any, list[list[Any]]]:
+    """Return a figure with a row of so many panels, and so high, below the other, and the panels of each row."""
+    from matplotlib import style
+    from matplotlib.figure import Figure
+
+    heights = [height for _, height in rows]
+    with style.context(_STYLE):
+        figure = Figure(figsize=(width, sum(heights)), layout="constrained")
+        parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
+        panels = [list(part.subplots(1, n, squeeze=False)[0]) for part, (n, _) in zip(parts, rows, strict=True)]
+    return figure, panels
+
+
 def svg(figure: Any) -> bytes:
     """Return a figure as SVG, the same bytes each time."""
     from matplotlib import style

@@ -264,11 +264,22 @@ def train(
                     raise SaunetError(f"{lost}; {way_on(folder / 'checkpoints')}") from error
                 raise
     if trainer.is_global_zero:
+        _draw(folder)
         print(f"results: {folder}")
     kept = [each for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint)]
     best = next((Path(each.best_model_path) for each in kept if each.best_model_path), None)
     cost = next((each.cost for each in kept if each.cost is not None), None)
     return TrainResult(folder=folder, best=best, cost=cost, data=data, model=model)
+
+
+def _draw(folder: Path) -> None:
+    """Draw how the training went; what prevents it is said, for the training itself has ended well."""
+    from saunet.reporting.run import write_results
+
+    try:
+        write_results(folder)
+    except SaunetError as reason:
+        print(f"no picture of the results: {reason}")
 
 
 def assemble(options: TrainOptions, data: DepthDataModule, pretrained: bool = True) -> SelfSupervisedDepth:
