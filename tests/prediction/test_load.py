@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -17,6 +18,7 @@ import torch
 
 import saunet
 from saunet.errors import CheckpointError, ConfigError
+from saunet.exporting.tool import ExportOptions, export
 from saunet.prediction.pointcloud import Camera
 from saunet.runs.checkpoint import atomic_save, build_networks
 from saunet.runs.record import ModelRecord
@@ -157,6 +159,55 @@ class TestHub:
         text = str(error.value)
         assert "cannot fetch 'someone/depth' from the hub (ConnectionError: no route to host); check" in text
         assert "\n" not in text
+
+    def test_an_export_is_pushed_and_loaded_again(
+        self, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        hub = pytest.importorskip("huggingface_hub", reason="huggingface_hub is not installed")
+        remote = tmp_path / "hub"
+
+        def create_repo(self: Any, name: str, *, private: bool, exist_ok: bool) -> str:
+            assert private
+            assert exist_ok
+            (remote / name).mkdir(parents=True)
+            return f"https://hub/{name}"
+
+        def upload_folder(
+            self: Any, *, repo_id: str, folder_path: Path, allow_patterns: list[str], commit_message: str
+        ) -> None:
+            for name in allow_patterns:
+                if (folder_path / name).is_file():
+                    shutil.copy(folder_path / name, remote / repo_id)
+
+        monkeypatch.setattr(hub.HfApi, "create_repo", create_repo)
+        monkeypatch.setattr(hub.HfApi, "upload_folder", upload_folder)
+        monkeypatch.setattr(hub, "snapshot_download", lambda name, **_: str(remote / name))
+        out = tmp_path / "out"
+        done = export(ExportOptions(checkpoint=exported, output=out, formats=["safetensors"], push="someone/depth"))
+        assert done.address == "https://hub/someone/depth"
+        files = {path.name for path in (remote / "someone/depth").iterdir()}
+        assert files == {"config.json", "model.safetensors", "README.md"}
+        assert 'saunet.load("someone/depth")' in (remote / "someone/depth/README.md").read_text()
+        assert saunet.load("someone/depth").fingerprint == saunet.load(out).fingerprint
+
+    def test_a_push_that_fails_leaves_the_export(
+        self, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        hub = pytest.importorskip("huggingface_hub", reason="huggingface_hub is not installed")
+
+        def offline(*_: object, **__: object) -> str:
+            raise ConnectionError("no route to host\nand many more lines")
+
+        monkeypatch.setattr(hub.HfApi, "create_repo", offline)
+        with pytest.raises(CheckpointError, match=r"ConnectionError: no route to host\).*hf upload a/b") as error:
+            export(ExportOptions(checkpoint=exported, output=tmp_path / "out", formats=["safetensors"], push="a/b"))
+        assert "\n" not in str(error.value)
+        assert saunet.load(tmp_path / "out").height > 0
+        for wrong, words in (("ab", "organization/name"), ("a/b@v1", "organization/name")):
+            with pytest.raises(ConfigError, match=words):
+                ExportOptions(checkpoint=exported, output=tmp_path / "x", push=wrong)
+        with pytest.raises(ConfigError, match="safetensors or onnx"):
+            ExportOptions(checkpoint=exported, output=tmp_path / "x", push="a/b", formats=["program"])
 
     def test_package_that_is_missing(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "huggingface_hub", None)

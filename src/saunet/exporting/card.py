@@ -16,7 +16,11 @@ from saunet.tables import Column, Row, Table
 
 
 def model_card(
-    record: ModelRecord, reports: Sequence[Parity], metrics: Mapping[str, Any] | None, splits: Mapping[str, str]
+    record: ModelRecord,
+    reports: Sequence[Parity],
+    metrics: Mapping[str, Any] | None,
+    splits: Mapping[str, str],
+    source: str | None = None,
 ) -> str:
     """Return the card of an exported model as Markdown."""
     scale = "Depth has no unit: training on one camera's video leaves one factor unknown."
@@ -27,6 +31,7 @@ def model_card(
         "card.md",
         record,
         scale=scale,
+        source=source or "path/to/this/folder",
         fingerprint=fingerprint(record.to_plain()["data"]),
         splits="".join(f"Fingerprint of the frames of split '{key}': `{value}`.\n" for key, value in splits.items()),
         quality=quality if metrics is None else quality_table(metrics).markdown(),

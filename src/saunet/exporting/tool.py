@@ -30,7 +30,7 @@ from saunet.prediction.sources import find_sources
 from saunet.runs.record import ModelRecord
 from saunet.tables import show
 from saunet.weights.files import read_model, restored, write_safetensors
-from saunet.weights.locate import CARD, CONFIG, POSE, WEIGHTS
+from saunet.weights.locate import CARD, CONFIG, POSE, WEIGHTS, check_push, push
 
 FORMATS: tuple[str, ...] = ("onnx", "program", "compiled", "safetensors")
 """``onnx``: for onnxruntime, TensorRT and others. ``program`` (torch.export): for torch without saunet. ``compiled``
@@ -60,6 +60,7 @@ class ExportOptions:
         batch: How many images the files take at once: ``any``, ``one``, or ``auto``: any where the network allows it.
         opset: Of ONNX: 20, or 18 or 17 for older runtimes.
         evaluation: A ``metrics.json`` of an evaluation, or the folder that holds it; goes into the model card.
+        push: Upload the folder to this repository of the Hugging Face hub, ``organization/name``; a new one is private.
         overwrite: Replace what an earlier export left in the folder.
 
     Raises:
@@ -77,6 +78,7 @@ class ExportOptions:
     batch: str = "auto"
     opset: int = exporters.OPSETS[-1]
     evaluation: str | Path | None = None
+    push: str | None = None
     overwrite: bool = False
 
     def __post_init__(self) -> None:
@@ -84,6 +86,12 @@ class ExportOptions:
             one_of("formats", name, FORMATS)
         if not self.formats:
             raise ConfigError(f"formats is empty; allowed: {', '.join(FORMATS)}")
+        if self.push is not None:
+            check_push(self.push)
+            if not {"safetensors", "onnx"} & set(self.formats):
+                raise ConfigError(
+                    f"formats is [{','.join(self.formats)}]; push needs safetensors or onnx, which saunet.load reads"
+                )
         one_of("batch", self.batch, exporters.BATCHES)
         one_of("opset", str(self.opset), map(str, exporters.OPSETS))
 
@@ -95,6 +103,8 @@ class ExportResult:
     output: Path
     reports: tuple[Parity, ...]
     """How each file compares with the network, in the order of the formats."""
+    address: str | None = None
+    """Where it was uploaded to."""
 
     def show(self) -> None:
         """Print the comparisons as a table."""
@@ -102,6 +112,8 @@ class ExportResult:
             print("images is not set, so only random images were compared", file=sys.stderr)
         show([parity_table(self.reports)])
         print(f"exported, with report.json and a model card: {self.output}")
+        if self.address:
+            print(f"uploaded: {self.address}")
 
 
 def export(options: ExportOptions) -> ExportResult:
@@ -166,9 +178,10 @@ def export(options: ExportOptions) -> ExportResult:
         about["opset"] = options.opset
     content = {"tolerance": TOLERANCE, **about, "files": [asdict(report) for report in reports]}
     write_json(folder / REPORT, content)
-    write_bytes(folder / CARD, model_card(record, reports, metrics, splits).encode())
+    write_bytes(folder / CARD, model_card(record, reports, metrics, splits, options.push).encode())
     write_json(folder / CONFIG, record.to_plain())  # last: with it, the folder is a model
-    return ExportResult(output=folder, reports=tuple(reports))
+    address = push(folder, options.push) if options.push else None
+    return ExportResult(output=folder, reports=tuple(reports), address=address)
 
 
 def read_metrics(path: str | Path) -> Mapping[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 from saunet.errors import CheckpointError, ConfigError
@@ -50,6 +51,38 @@ def locate(source: str | Path) -> Path:
     return path if local or not _HUB_ID.fullmatch(text) else _fetch(text)
 
 
+def check_push(name: str) -> None:
+    """Check a hub id to upload to, and that there is a package which can."""
+    if not _HUB_ID.fullmatch(name) or "@" in name:
+        raise ConfigError(f"push is '{name}'; give a repository of the hub as organization/name")
+    if find_spec("huggingface_hub") is None:
+        raise ConfigError("push needs huggingface_hub; run: pip install 'saunet[hub]'")
+
+
+def push(folder: Path, name: str) -> str:
+    """Upload a model's files, and no others of its folder, to a repository; return its address.
+
+    A repository that is new is private.
+    """
+    from huggingface_hub import HfApi
+
+    try:
+        api = HfApi()
+        address = api.create_repo(name, private=True, exist_ok=True)
+        api.upload_folder(repo_id=name, folder_path=folder, allow_patterns=_WANTED, commit_message="Upload by saunet")
+    except Exception as reason:  # as in `_fetch`
+        raise CheckpointError(
+            f"{folder} is complete, but cannot be uploaded to '{name}' ({_first_line(reason)}); check the connection, "
+            f"and that `hf auth login` has your token, then run: hf upload {name} {folder}"
+        ) from reason
+    return str(address)
+
+
+def _first_line(reason: Exception) -> str:
+    first = next((line.strip() for line in str(reason).splitlines() if line.strip()), "")
+    return f"{type(reason).__name__}: {first[:200]}"
+
+
 def _fetch(name: str) -> Path:
     try:
         from huggingface_hub import snapshot_download
@@ -62,8 +95,7 @@ def _fetch(name: str) -> Path:
     try:
         return Path(snapshot_download(repository, revision=revision or None, allow_patterns=_WANTED))
     except Exception as reason:  # the hub's errors, the network's and the HTTP client's share no base class
-        first = next((line.strip() for line in str(reason).splitlines() if line.strip()), "")
         raise CheckpointError(
-            f"cannot fetch '{name}' from the hub ({type(reason).__name__}: {first[:200]}); check the name and the "
+            f"cannot fetch '{name}' from the hub ({_first_line(reason)}); check the name and the "
             "connection; what was fetched once is used without one"
         ) from reason
