@@ -99,6 +99,11 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     return as_rgb_bytes(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), str(path), bits)
 
 
+def decode_image(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the content of an image file of 8 bits as `read_image` does; ``name`` is for messages."""
+    return as_rgb_bytes(cv2.cvtColor(_decoded(np.frombuffer(data, np.uint8), name, _COLOR), cv2.COLOR_BGR2RGB), name, 8)
+
+
 def read_depth(path: str | Path, steps: float | int = 256) -> Float32[np.ndarray, "h w"]:
     """Return a depth map stored as 16-bit PNG, 0 where unknown, with so many steps a meter (KITTI's 256)."""
     stored = read_unchanged(path)
@@ -247,7 +252,10 @@ def write_image(path: str | Path, image: Shaped[np.ndarray, "..."]) -> None:
 
 def _decode(path: str | Path, flags: int) -> NDArray[Any]:
     """Read and decode an image file with OpenCV's flags, refusing what is not whole."""
-    data = read_bytes(path)
+    return _decoded(read_bytes(path), path, flags)
+
+
+def _decoded(data: UInt8[np.ndarray, " n"], path: str | Path, flags: int) -> NDArray[Any]:
     if not _complete(data.tobytes()):
         raise UnreadableError(
             f"{path} is truncated ({data.size} bytes, the end of the image is missing); copy it again"

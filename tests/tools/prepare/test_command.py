@@ -72,7 +72,10 @@ def test_what_cannot_work_is_one_sentence(command, tree, tmp_path, words, senten
     [
         ({"job": "densify", "root": None}, "root is not set"),
         ({"job": "cache", "data": Spec.of("data", "video", root="raw"), "folder": "c"}, "root is for KITTI raw trees"),
-        ({"job": "densify", "data": Spec.of("data", "video", root="raw")}, "data belongs to the job cache, not to de"),
+        (
+            {"job": "densify", "data": Spec.of("data", "video", root="raw")},
+            "data belongs to the job cache and pack",
+        ),
         ({"job": "densify", "quality": 3}, "quality belongs to the job cache, not to densify"),
         ({"job": "densify", "device": "cpu"}, "device belongs to the job teacher"),
         ({"job": "cache"}, "a cache needs a folder of its own"),

@@ -20,10 +20,11 @@ from saunet.registry import Spec
 from saunet.threads import available_cores
 from saunet.tools.prepare.bags import ImportReport, import_bags
 from saunet.tools.prepare.cache import CacheReport, build_cache
+from saunet.tools.prepare.pack import PackReport, pack
 from saunet.tools.prepare.pool import Done, OnError
 from saunet.tools.prepare.targets import DenseKind, FileTeacher, ModelTeacher, Recording, Values, densify, teach
 
-Job = Literal["densify", "teacher", "cache", "import"]
+Job = Literal["densify", "teacher", "cache", "import", "pack"]
 _KITTI = ("root", "cameras", "drives", "split")
 _SHARED = ("job", *_KITTI, "folder", "on_error")
 KEYS: dict[str, tuple[str, ...]] = {
@@ -31,6 +32,7 @@ KEYS: dict[str, tuple[str, ...]] = {
     "teacher": (*_SHARED, "checkpoint", "foreign", "input", "values", "device"),
     "cache": (*_SHARED, "data", "height", "width", "format", "quality", "workers"),
     "import": ("job", "folder", "on_error", "input", "topics", "camera"),
+    "pack": ("job", "folder", "data", "shard_mb", "workers"),
 }
 """Job -> the options that it reads."""
 
@@ -38,7 +40,7 @@ KEYS: dict[str, tuple[str, ...]] = {
 @checked
 @dataclass(frozen=True, kw_only=True)
 class PrepareOptions:
-    """What `prepare` does: one of four jobs, each with options of its own.
+    """What `prepare` does: one of five jobs, each with options of its own.
 
     Raises:
         ConfigError: for a wrong value, or an option that the job does not have.
@@ -50,10 +52,10 @@ class PrepareOptions:
     """
 
     job: Job
-    """``densify`` (dense depth maps from LiDAR), ``teacher`` (another model's depth), ``cache`` (smaller images) or
-    ``import`` (bags as clips)."""
+    """``densify`` (dense depth maps from LiDAR), ``teacher`` (another model's depth), ``cache`` (smaller images),
+    ``import`` (bags as clips), or ``pack`` (a data set in a few large files, for ``data=packed``)."""
     data: Spec | None = None
-    """``cache``: the data module to make copies for; None reads the KITTI raw tree at ``root``."""
+    """``cache``, ``pack``: the data module to read; for ``cache``, None reads the KITTI raw tree at ``root``."""
     root: str | None = None
     """Root of a KITTI raw tree."""
     folder: str | None = None
@@ -91,6 +93,8 @@ class PrepareOptions:
     """``cache``: ``jpg`` or ``webp``."""
     quality: int = 95
     """``cache``: of the compression, 1 to 100."""
+    shard_mb: int = 256
+    """``pack``: most megabytes a file."""
     workers: int | None = None
     """Processes; 0 works in this one, None takes one per core."""
     on_error: OnError = "raise"
@@ -112,6 +116,9 @@ class PrepareOptions:
             if self.input is None or self.folder is None:
                 raise ConfigError("import needs input=... (a bag, or a folder of bags) and folder=... (for the clips)")
             return
+        if self.job == "pack" and (self.data is None or self.folder is None):
+            raise ConfigError("a pack needs data=... (what to pack) and folder=... (a new one)")
+        positive("shard_mb", self.shard_mb)
         if self.data is None and self.root is None:
             raise ConfigError("root is not set; add root=... (a KITTI raw tree)")
         if self.workers is not None:
@@ -132,7 +139,7 @@ class PrepareOptions:
             CacheSettings(self.height, self.width, self.format, self.quality)
 
 
-def prepare(options: PrepareOptions) -> Done | CacheReport | ImportReport:
+def prepare(options: PrepareOptions) -> Done | CacheReport | ImportReport | PackReport:
     """Do one preparation; what exists already is checked and kept, so an interrupted job resumes.
 
     Args:
@@ -155,6 +162,9 @@ def prepare(options: PrepareOptions) -> Done | CacheReport | ImportReport:
     if options.job == "import":
         return import_bags(str(options.input), str(options.folder), options.topics, options.camera, options.on_error)
     workers = available_cores() if options.workers is None else options.workers
+    if options.job == "pack":
+        assert options.data is not None
+        return pack(options.data.build(), str(options.folder), options.shard_mb, workers)
     if options.data is not None:
         skips = options.on_error == "skip" and "on_error" in options.data.parameters
         changes = {"on_error": "skip"} if skips else {}

@@ -1,0 +1,87 @@
+"""The files of a packed data set, wherever they are: shards, of which parts are read, and a description.
+
+A shard is a tar archive without compression, so that any tool can look into it. What training reads are byte ranges
+of it: every order of samples costs the same, and nothing is downloaded that is not used.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import fsspec
+
+from saunet.errors import DataError, UnreadableError
+from saunet.io.atomic import write_bytes
+
+DESCRIPTION, FORMAT = "pack.json", 1
+
+
+class Part(NamedTuple):
+    """Where bytes are: number of the shard, first byte and length."""
+
+    shard: int
+    start: int
+    length: int
+
+
+def shard_name(number: int) -> str:
+    return f"shard_{number:06d}.tar"
+
+
+class Store:
+    """Reads whole files and parts of shards below a folder or an address such as ``s3://bucket/name``.
+
+    ``sizes`` are those of the shards. The first ``keep`` bytes of the pack are kept in the folder ``cache`` once they
+    were read: with shuffled epochs that serves as many reads as replacing the oldest would serve few, and needs no
+    agreement between processes.
+    """
+
+    def __init__(self, root: str, cache: Path | None = None, keep: int = 0) -> None:
+        self.root, self.cache, self.keep = root.rstrip("/"), cache, keep
+        self.sizes: list[int] = []
+        self._opened: tuple[int, Any, str] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_opened": None}
+
+    def file(self, name: str) -> bytes:
+        return self._read(name, None, None)
+
+    def part(self, part: Part) -> bytes:
+        name = shard_name(part.shard)
+        kept = None
+        if self.cache is not None and sum(self.sizes[: part.shard]) + part.start + part.length <= self.keep:
+            kept = self.cache / name / str(part.start)
+            if kept.is_file() and kept.stat().st_size == part.length:
+                return kept.read_bytes()
+        data = self._read(name, part.start, part.start + part.length)
+        if len(data) != part.length:
+            raise UnreadableError(
+                f"{self.root}/{name} ends before byte {part.start + part.length}; copy the packed data again"
+            )
+        if kept is not None:
+            write_bytes(kept, data)
+        return data
+
+    def _read(self, name: str, start: int | None, end: int | None) -> bytes:
+        if self._opened is None or self._opened[0] != os.getpid():  # connections do not survive a fork
+            try:
+                system, base = fsspec.core.url_to_fs(self.root, skip_instance_cache=True)
+            except (ImportError, ValueError) as reason:
+                raise DataError(
+                    f"{self.root} cannot be read ({reason}); for s3:// run pip install 'saunet[stream]'"
+                ) from reason
+            self._opened = os.getpid(), system, base
+        _, system, base = self._opened
+        try:
+            return bytes(system.cat_file(f"{base}/{name}", start=start, end=end))
+        except FileNotFoundError as reason:
+            raise DataError(
+                f"{self.root}/{name} does not exist; set data.root to what saunet prepare pack has written completely"
+            ) from reason
+        except Exception as reason:  # each kind of store has errors of its own
+            raise UnreadableError(
+                f"cannot read {self.root}/{name} ({type(reason).__name__}: {reason}); check connection and rights"
+            ) from reason
