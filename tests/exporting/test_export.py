@@ -49,7 +49,7 @@ TRACED: dict[str, Any] = {}
 
 def exported_files(checkpoint: Path, output: Path, formats: Any = None, **more: Any) -> list[Parity]:
     """Export `checkpoint`, whose network is traced only the first time: that takes longest."""
-    trace = exporters._program
+    trace = exporters.depth_program
 
     def traced(network: DepthNet, record: ModelRecord, batch: str) -> Any:
         if batch not in TRACED:
@@ -57,7 +57,7 @@ def exported_files(checkpoint: Path, output: Path, formats: Any = None, **more: 
         return TRACED[batch]
 
     chosen = {} if formats is None else {"formats": formats}
-    with mock.patch.object(exporters, "_program", traced):
+    with mock.patch.object(exporters, "depth_program", traced):
         return list(export(ExportOptions(checkpoint=checkpoint, output=output, **chosen, **more)).reports)
 
 
@@ -271,7 +271,7 @@ def test_full_disk(exported: tuple[Path, list[Parity]], checkpoint: Path, tmp_pa
         "from saunet.errors import DataError\n"
         "from saunet.exporting import ExportOptions, export, exporters\n"
         "program = torch.export.load(sys.argv[3])\n"
-        "exporters._program = lambda *_: (program, 'any')\n"
+        "exporters.depth_program = lambda *_: (program, 'any')\n"
         "def compiled(program, package_path):\n"
         "    package_path.write(bytes(50000))\n"
         "torch._inductor.aoti_compile_and_package = compiled\n"

@@ -59,7 +59,7 @@ def export_onnx(
             raise ConfigError(f"ONNX export needs the package {package}; run: pip install 'saunet[export]'")
     # Attention in its plain form: what the fused kernel returns has strides that the exporter's own run of it has not.
     with sdpa_kernel(SDPBackend.MATH):
-        program, takes = _program(network, record, batch)
+        program, takes = depth_program(network, record, batch)
     try:
         with _quiet():
             written = max(opset, 18)  # the exporter knows none before
@@ -115,7 +115,7 @@ def _lower_to_17(model: Any) -> bool:
 
 def export_program(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> Batch:
     """Write a depth network as a torch.export program: ``torch.export.load(path).module()(image)`` needs no saunet."""
-    program, takes = _program(network, record, batch)
+    program, takes = depth_program(network, record, batch)
     content = io.BytesIO()  # torch's own writer, on a full disk, cannot even be closed and ends the process
     with _quiet():
         torch.export.save(program, content, extra_files={METADATA: json.dumps(record.to_plain())})
@@ -130,7 +130,7 @@ def export_compiled(network: DepthNet, record: ModelRecord, path: str | Path, ba
     """
     if shutil.which("g++") is None and shutil.which("clang++") is None and shutil.which("cl") is None:
         raise ConfigError("the format 'compiled' needs a C++ compiler and found none; install g++, or leave it out")
-    program, takes = _program(network, record, batch)
+    program, takes = depth_program(network, record, batch)
     content = io.BytesIO()
     try:
         with torch.no_grad(), _quiet():
@@ -172,7 +172,8 @@ def _run(module: Callable[[Tensor], Tensor]) -> Run:
     return run
 
 
-def _program(network: DepthNet, record: ModelRecord, batch: str) -> tuple[torch.export.ExportedProgram, Batch]:
+def depth_program(network: DepthNet, record: ModelRecord, batch: str) -> tuple[torch.export.ExportedProgram, Batch]:
+    """Return a depth network's finest disparity as a torch.export program, and how many images it takes."""
     one_of("batch", batch, BATCHES)
     module = FinestDisparity(network).eval()
     if batch != "one":

@@ -7,7 +7,7 @@ import json
 import math
 import platform
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -32,14 +32,23 @@ from saunet.tables import show
 from saunet.weights.files import read_model, restored, write_safetensors
 from saunet.weights.locate import CARD, CONFIG, POSE, WEIGHTS, check_push, push
 
-FORMATS: tuple[str, ...] = ("onnx", "program", "compiled", "safetensors")
-"""``onnx``: for onnxruntime, TensorRT and others. ``program`` (torch.export): for torch without saunet. ``compiled``
-(AOTInductor): machine code, for torch or C++. ``safetensors``: the weights, for saunet and the hub."""
+FORMATS: tuple[str, ...] = ("onnx", "openvino", "program", "compiled", "safetensors")
+"""``onnx``: for onnxruntime, TensorRT and others. ``openvino``: for Intel's runtime. ``program`` (torch.export): for
+torch without saunet. ``compiled`` (AOTInductor): machine code, for torch or C++. ``safetensors``: the weights, for
+saunet and the hub."""
 DEFAULT_FORMATS: tuple[str, ...] = ("onnx", "program", "safetensors")
 TOLERANCE = 1e-4
 """Largest difference to the original network that passes, as a fraction of the range of disparity."""
-FILES = {"onnx": "model.onnx", "program": "model.pt2", "compiled": "model.aoti.pt2", "safetensors": WEIGHTS}
+FILES = {
+    "onnx": "model.onnx",
+    "openvino": "model.xml",
+    "program": "model.pt2",
+    "compiled": "model.aoti.pt2",
+    "safetensors": WEIGHTS,
+}
 REPORT = "report.json"
+OPENVINO_WEIGHTS = "model.bin"
+"""Goes with ``model.xml``."""
 
 _REAL_AT_MOST = 8
 _PLACES = ("root", "cache")
@@ -54,7 +63,7 @@ class ExportOptions:
     Args:
         checkpoint: The model: a checkpoint, an exported folder, or a shipped model's name.
         output: The folder for the model's files, ``config.json``, ``report.json`` and ``README.md``.
-        formats: ``onnx``, ``program`` (torch.export), ``compiled`` (AOTInductor), ``safetensors``.
+        formats: ``onnx``, ``openvino``, ``program`` (torch.export), ``compiled`` (AOTInductor), ``safetensors``.
         images: Real images to compare on, besides random ones: a file, a folder or a pattern, in Python also several;
             at most eight are taken, evenly.
         batch: How many images the files take at once: ``any``, ``one``, or ``auto``: any where the network allows it.
@@ -138,7 +147,9 @@ def export(options: ExportOptions) -> ExportResult:
     """
     formats, folder = tuple(dict.fromkeys(options.formats)), Path(options.output)
     read = read_model(options.checkpoint)
-    earlier = check_target(folder, read.path, (CONFIG, *FILES.values(), POSE, REPORT, CARD), options.overwrite)
+    earlier = check_target(
+        folder, read.path, (CONFIG, *FILES.values(), OPENVINO_WEIGHTS, POSE, REPORT, CARD), options.overwrite
+    )
     metrics = read_metrics(options.evaluation) if options.evaluation is not None else None
     splits = _splits(read.path)
     network, pose = read.networks()
@@ -153,14 +164,15 @@ def export(options: ExportOptions) -> ExportResult:
         task = shown.add_task("exporting", total=len(formats))
         for name in formats:
             path = folder / FILES[name]
-            with replacing(path) as temporary:
+            with replacing(path) as temporary, _weights_beside(folder, name) as weights:
                 if name == "safetensors":
                     takes, parts = "any", {"depth": network} if pose is None else {"depth": network, "pose": pose}
                     write_safetensors(named_state(parts), temporary)
                 else:
-                    takes = _EXPORTERS[name](network, record, temporary, options)
-                run = _RUNNERS[name](temporary, record)
-                report = compare(path.name, eager, run, random, real, span, takes, temporary.stat().st_size / 2**20)
+                    takes = _EXPORTERS[name](network, record, temporary, options, weights)
+                run = _RUNNERS[name](temporary, record, weights)
+                size = sum(each.stat().st_size for each in (temporary, weights) if each is not None)
+                report = compare(path.name, eager, run, random, real, span, takes, size / 2**20)
                 found = f"{report.difference:.2g} of the disparity range, more than {TOLERANCE:g}"
                 wrong = "gives NaN where the network gives disparity"
                 if not math.isnan(report.difference):
@@ -182,6 +194,16 @@ def export(options: ExportOptions) -> ExportResult:
     write_json(folder / CONFIG, record.to_plain())  # last: with it, the folder is a model
     address = push(folder, options.push) if options.push else None
     return ExportResult(output=folder, reports=tuple(reports), address=address)
+
+
+@contextlib.contextmanager
+def _weights_beside(folder: Path, name: str) -> Iterator[Path | None]:
+    """Yield where a format's weights go that are a file of their own; None for the others."""
+    if name != "openvino":
+        yield None
+        return
+    with replacing(folder / OPENVINO_WEIGHTS) as temporary:
+        yield temporary
 
 
 def read_metrics(path: str | Path) -> Mapping[str, Any]:
@@ -261,20 +283,34 @@ def named_state(parts: Mapping[str, torch.nn.Module]) -> dict[str, torch.Tensor]
 
 def _versions() -> dict[str, str]:
     found = {}
-    for package in ("saunet", "torch", "onnx", "onnxruntime", "onnxscript", "safetensors"):
+    for package in ("saunet", "torch", "onnx", "onnxruntime", "onnxscript", "openvino", "safetensors"):
         with contextlib.suppress(PackageNotFoundError):
             found[package] = version(package)
     return found
 
 
-_EXPORTERS: dict[str, Callable[[DepthNet, ModelRecord, Path, ExportOptions], str]] = {
-    "onnx": lambda network, record, path, how: exporters.export_onnx(network, record, path, how.batch, how.opset),
-    "program": lambda network, record, path, how: exporters.export_program(network, record, path, how.batch),
-    "compiled": lambda network, record, path, how: exporters.export_compiled(network, record, path, how.batch),
+def _openvino(network: DepthNet, record: ModelRecord, path: Path, how: ExportOptions, weights: Path | None) -> str:
+    from saunet.exporting.openvino import export_openvino
+
+    return export_openvino(network, record, path, weights or path.with_suffix(".bin"), how.batch)
+
+
+def _run_openvino(path: Path, record: ModelRecord, weights: Path | None) -> Run:
+    from saunet.exporting.openvino import run_openvino
+
+    return run_openvino(path, weights or path.with_suffix(".bin"))
+
+
+_EXPORTERS: dict[str, Callable[[DepthNet, ModelRecord, Path, ExportOptions, Path | None], str]] = {
+    "onnx": lambda network, record, path, how, _: exporters.export_onnx(network, record, path, how.batch, how.opset),
+    "openvino": _openvino,
+    "program": lambda network, record, path, how, _: exporters.export_program(network, record, path, how.batch),
+    "compiled": lambda network, record, path, how, _: exporters.export_compiled(network, record, path, how.batch),
 }
-_RUNNERS: dict[str, Callable[[Path, ModelRecord], Run]] = {
-    "onnx": lambda path, record: exporters.run_onnx(path),
-    "program": lambda path, record: exporters.run_program(path),
-    "compiled": lambda path, record: exporters.run_compiled(path),
-    "safetensors": lambda path, record: exporters.run_eager(restored(path, record).networks()[0].eval()),
+_RUNNERS: dict[str, Callable[[Path, ModelRecord, Path | None], Run]] = {
+    "onnx": lambda path, record, _: exporters.run_onnx(path),
+    "openvino": _run_openvino,
+    "program": lambda path, record, _: exporters.run_program(path),
+    "compiled": lambda path, record, _: exporters.run_compiled(path),
+    "safetensors": lambda path, record, _: exporters.run_eager(restored(path, record).networks()[0].eval()),
 }

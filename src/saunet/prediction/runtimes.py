@@ -1,0 +1,176 @@
+"""Which program runs the network: torch, or on a CPU another that is installed, faster, and gives the same depth."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.util
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from saunet.errors import CheckpointError, ConfigError, one_of
+from saunet.exporting import exporters
+from saunet.exporting.openvino import export_openvino, has_bf16, run_openvino
+from saunet.exporting.parity import Run, milliseconds
+from saunet.io.atomic import replacing
+from saunet.metrics.functional import flip_blend
+from saunet.prediction.prediction import ImagePredictor
+from saunet.prediction.predictor import Predictor
+from saunet.weights.files import read_model
+
+LIMITS = {"f32": 1e-4, "bf16": 2e-3}
+"""Largest Abs Rel change of depth against torch, by precision, with which a runtime is used."""
+WORTH_FRAMES = 200
+"""Frames that are worth a conversion, which takes as long as about so many frames."""
+_PACKAGES = {"openvino": ("openvino",), "onnx": ("onnxruntime", "onnx", "onnxscript")}
+
+
+class ConvertedPredictor(Predictor):
+    """A predictor whose network another runtime runs; on the first images it is compared with torch once more.
+
+    Args:
+        predictor: The original.
+        run: The converted network: one image to its disparity.
+        limit: Largest Abs Rel change of depth.
+    """
+
+    def __init__(self, predictor: Predictor, run: Run, limit: float) -> None:
+        about = (predictor.device, predictor.scale, predictor.flip, predictor.keep_aspect)
+        super().__init__(predictor.network, predictor.height, predictor.width, *about)
+        self._converted, self._limit, self._compared = run, limit, False
+
+    def disparity(self, images: Float32[np.ndarray, "b 3 h w"]) -> Float32[np.ndarray, "b h w"]:
+        """Run the network: RGB in [0, 1] to disparity at the same size, before any scale."""
+        if not self._compared:
+            self._compared, change = True, depth_change(exporters.run_eager(self.network), self._converted, images[:1])
+            if not change <= self._limit:
+                raise CheckpointError(
+                    f"in this runtime, depth of the first image changes by {change:.2g} (Abs Rel), more than "
+                    f"{self._limit:g}; set runtime=torch"
+                )
+        found = self._each(images)
+        if self.flip:
+            turned = self._each(np.ascontiguousarray(images[..., ::-1]))
+            found = flip_blend(torch.from_numpy(found), torch.from_numpy(turned)).numpy()
+        return found[:, 0]
+
+    def _each(self, images: Float32[np.ndarray, "b 3 h w"]) -> Float32[np.ndarray, "b 1 h w"]:
+        return np.concatenate([self._converted(image[None]) for image in images])
+
+
+def depth_change(eager: Run, converted: Run, image: Float32[np.ndarray, "1 3 h w"]) -> float:
+    """Return the mean relative change of depth (Abs Rel) of an image."""
+    wanted, got = eager(image), converted(image)
+    return float(np.abs(wanted / got - 1).mean())
+
+
+def choose_runtime(
+    predictor: ImagePredictor, checkpoint: str | Path, runtime: str = "auto", frames: float | int = math.inf
+) -> ImagePredictor:
+    """Return a predictor in a runtime, and print one line if it is not torch.
+
+    A network is converted once and kept in torch's cache folder. It is used if it changes depth by at most `LIMITS`.
+
+    Args:
+        predictor: A loaded model.
+        checkpoint: Where it came from.
+        runtime: ``torch``, ``openvino``, ``onnx``; or ``auto``, the first of the installed ones that is faster than
+            torch, if ``frames`` are worth a conversion or there has been one.
+        frames: How many frames will be predicted, at most.
+
+    Raises:
+        ConfigError: if a runtime is asked for that is missing, does not fit, or changes depth too much.
+    """
+    one_of("runtime", runtime, ("auto", "torch", *_PACKAGES))
+    if runtime == "torch":
+        return predictor
+    auto, wrong = runtime == "auto", _why_not(predictor)
+    if wrong or not isinstance(predictor, Predictor):
+        if auto:
+            return predictor
+        raise ConfigError(f"runtime={runtime} {wrong}; leave runtime out")
+    found = [name for name in (_PACKAGES if auto else [runtime]) if all(map(importlib.util.find_spec, _PACKAGES[name]))]
+    if not found:
+        if auto:
+            return predictor
+        raise ConfigError(f"runtime={runtime} is not installed; run: pip install 'saunet[{_EXTRAS[runtime]}]'")
+    name = found[0]
+    path = _cached(predictor, name)
+    if auto and frames < WORTH_FRAMES and not path.is_file():
+        return predictor
+    try:
+        precision, run = _open(name, path, predictor, checkpoint)
+    except (ConfigError, CheckpointError) as reason:
+        if auto:
+            print(f"runtime: torch ({name} cannot be used: {reason})")
+            return predictor
+        raise
+    images = np.random.default_rng(0).random((2, 1, 3, predictor.height, predictor.width), dtype=np.float32)
+    eager = exporters.run_eager(predictor.network)
+    changes = [depth_change(eager, run, image) for image in images]
+    change = max(changes) if all(map(math.isfinite, changes)) else math.inf
+    if not change <= LIMITS[precision] and precision != "f32":
+        precision, run = "f32", run_openvino(path, path.with_suffix(".bin"))
+        change = max(depth_change(eager, run, image) for image in images)
+    if not change <= LIMITS[precision]:
+        found_it = f"{name} changes depth by {change:.2g} (Abs Rel), more than {LIMITS[precision]:g}"
+        if not auto:
+            raise ConfigError(f"{found_it}; set runtime=torch")
+        print(f"runtime: torch ({found_it})")
+        return predictor
+    before, after = milliseconds([eager, run], images[0], repeats=3)
+    about = f"{name} {precision}, {after / before:.2f} of torch's time, depth changes by {change:.1g} (Abs Rel)"
+    if auto and after >= before:
+        print(f"runtime: torch ({about})")
+        return predictor
+    print(f"runtime: {about}")
+    return ConvertedPredictor(predictor, run, LIMITS[precision])
+
+
+_EXTRAS = {"openvino": "openvino", "onnx": "export"}
+
+
+def _why_not(predictor: ImagePredictor) -> str:
+    """Return why a model runs in no other runtime; empty if it may."""
+    if type(predictor) is not Predictor:
+        return "is for checkpoints and safetensors"
+    if predictor.device.type != "cpu":
+        return f"is for the CPU, not for device={predictor.device.type}"
+    return "takes one size of images, which does not go with keep_aspect" if predictor.keep_aspect else ""
+
+
+def _cached(predictor: Predictor, name: str) -> Path:
+    """Return where a conversion of exactly these weights at this size by these versions is kept."""
+    versions = [f"{package} {version(package)}" for package in ("torch", *_PACKAGES[name])]
+    text = repr((predictor.fingerprint, predictor.height, predictor.width, versions))
+    key = hashlib.sha256(text.encode()).hexdigest()[:24]
+    return Path(torch.hub.get_dir()) / "saunet" / f"{key}{'.xml' if name == 'openvino' else '.onnx'}"
+
+
+def _open(name: str, path: Path, predictor: Predictor, checkpoint: str | Path) -> tuple[str, Run]:
+    """Return a converted network and its precision; convert it if that was not done before, or cannot be read."""
+    precision = "bf16" if name == "openvino" and has_bf16() else "f32"
+    openers: dict[str, Callable[[], Run]] = {
+        "openvino": lambda: run_openvino(path, path.with_suffix(".bin"), precision),
+        "onnx": lambda: exporters.run_onnx(path),
+    }
+    if path.is_file():
+        with contextlib.suppress(CheckpointError):  # damaged: made again
+            return precision, openers[name]()
+    print(f"converting the network for {name}, once")
+    record = replace(read_model(checkpoint).record, height=predictor.height, width=predictor.width)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if name == "onnx":
+        with replacing(path) as temporary:
+            exporters.export_onnx(predictor.network, record, temporary, batch="one")
+    else:  # the weights first: with the graph, the conversion is there
+        with replacing(path) as temporary, replacing(path.with_suffix(".bin")) as weights:
+            export_openvino(predictor.network, record, temporary, weights, batch="one")
+    return precision, openers[name]()

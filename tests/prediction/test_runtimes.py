@@ -1,0 +1,163 @@
+"""Another runtime than torch gives the same depth, is converted once, and is refused where depth would change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import saunet
+from saunet.errors import CheckpointError, ConfigError
+from saunet.exporting import exporters
+from saunet.prediction import runtimes
+from saunet.prediction.predictor import Predictor
+from saunet.runs.checkpoint import atomic_save, build_networks
+from saunet.runs.record import ModelRecord
+
+Run = Callable[[np.ndarray], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def checkpoint(node: Callable[..., dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    encoder = {**node("encoder", "resnet18"), "blocks": [1, 1, 1, 1]}
+    decoder = {**node("decoder", "unet"), "channels": [8] * 5}
+    record = ModelRecord(encoder, decoder, None, min_depth=0.1, max_depth=100.0, height=32, width=64)
+    depth, _ = build_networks(record)
+    path = tmp_path_factory.mktemp("model") / "x.ckpt"
+    atomic_save({"state_dict": dict(nn.ModuleDict({"depth": depth}).state_dict()), "saunet": record.to_plain()}, path)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "cache"))
+    return tmp_path / "cache" / "saunet"
+
+
+@pytest.fixture
+def pretend(monkeypatch: pytest.MonkeyPatch, checkpoint: Path) -> Callable[[float, float], Predictor]:
+    """Install a runtime that changes disparity by a factor and takes a fraction of torch's time."""
+
+    def pretending(factor: float, time: float) -> Predictor:
+        predictor = Predictor.from_checkpoint(checkpoint)
+        eager = exporters.run_eager(predictor.network)
+        monkeypatch.setattr(runtimes, "_PACKAGES", {"onnx": ("numpy",)})
+        monkeypatch.setattr(runtimes, "_open", lambda *_: ("f32", lambda image: factor * eager(image)))
+        monkeypatch.setattr(runtimes, "milliseconds", lambda *_, **__: [1.0, time])
+        return predictor
+
+    return pretending
+
+
+def image() -> np.ndarray:
+    return np.random.default_rng(1).integers(0, 255, (50, 100, 3), np.uint8)
+
+
+def test_what_is_faster_and_the_same_is_chosen(
+    pretend: Callable[[float, float], Predictor], checkpoint: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    original = pretend(1.00001, 0.5)
+    chosen = runtimes.choose_runtime(original, checkpoint)
+    assert isinstance(chosen, runtimes.ConvertedPredictor)
+    assert "onnx f32, 0.50 of torch's time, depth changes by 1e-05" in capsys.readouterr().out
+    assert chosen.fingerprint == original.fingerprint
+    one, other = chosen.predict(image()).depth, original.predict(image()).depth
+    np.testing.assert_allclose(one, other, rtol=2e-5)
+    assert not np.array_equal(one, other)
+
+
+@pytest.mark.parametrize(("factor", "time"), [(1.01, 0.5), (float("nan"), 0.5), (1.0, 1.2)])
+def test_what_is_slower_or_gives_other_depth_is_not(
+    factor: float,
+    time: float,
+    pretend: Callable[[float, float], Predictor],
+    checkpoint: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    original = pretend(factor, time)
+    assert runtimes.choose_runtime(original, checkpoint) is original
+    assert "runtime: torch" in capsys.readouterr().out
+    if time < 1:
+        with pytest.raises(ConfigError, match="changes depth"):
+            runtimes.choose_runtime(original, checkpoint, "onnx")
+
+
+def test_few_frames_are_not_worth_a_conversion(
+    pretend: Callable[[float, float], Predictor], checkpoint: Path, cache: Path
+) -> None:
+    original = pretend(1.0, 0.5)
+    assert runtimes.choose_runtime(original, checkpoint, frames=3) is original
+    assert runtimes.choose_runtime(original, checkpoint, "torch") is original
+    path = runtimes._cached(original, "onnx")
+    path.parent.mkdir(parents=True)
+    path.touch()
+    assert runtimes.choose_runtime(original, checkpoint, frames=3) is not original
+
+
+def test_the_first_image_is_compared_too(checkpoint: Path) -> None:
+    original = Predictor.from_checkpoint(checkpoint)
+    eager = exporters.run_eager(original.network)
+    wrong = runtimes.ConvertedPredictor(original, lambda images: 1.01 * eager(images), 1e-4)
+    with pytest.raises(CheckpointError, match="runtime=torch"):
+        wrong.predict(image())
+
+
+def test_what_cannot_be_converted_is_said(checkpoint: Path) -> None:
+    for made in (Predictor.from_checkpoint(checkpoint, keep_aspect=True),):
+        assert runtimes.choose_runtime(made, checkpoint) is made
+        with pytest.raises(ConfigError, match="keep_aspect"):
+            runtimes.choose_runtime(made, checkpoint, "openvino")
+
+
+@pytest.mark.parametrize(("runtime", "package"), [("openvino", "openvino"), ("onnx", "onnxscript")])
+def test_converted_once_with_the_same_depth(
+    runtime: str, package: str, checkpoint: Path, cache: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip(package, reason=f"runtime={runtime} needs its extra")
+    original = Predictor.from_checkpoint(checkpoint, flip=True)
+    chosen = runtimes.choose_runtime(original, checkpoint, runtime)
+    assert "converting" in capsys.readouterr().out
+    one, two = (each.predict_batch([image(), image()[::-1]]) for each in (original, chosen))
+    tolerance = 10 * runtimes.LIMITS["bf16" if runtime == "openvino" and runtimes.has_bf16() else "f32"]
+    for wanted, got in zip(one, two, strict=True):
+        np.testing.assert_allclose(got.depth, wanted.depth, rtol=tolerance)
+    runtimes.choose_runtime(original, checkpoint, runtime)
+    assert "converting" not in capsys.readouterr().out
+    for path in cache.iterdir():
+        path.write_bytes(b"damaged")
+    runtimes.choose_runtime(original, checkpoint, runtime)
+    assert "converting" in capsys.readouterr().out
+
+
+def test_openvino_refuses_weights_that_are_not_finite(checkpoint: Path) -> None:
+    pytest.importorskip("openvino", reason="needs the extra openvino")
+    original = Predictor.from_checkpoint(checkpoint)
+    with torch.no_grad():
+        next(original.network.parameters())[0, 0, 0, 0] = torch.nan
+    with pytest.raises(CheckpointError, match="not finite"):
+        runtimes.choose_runtime(original, checkpoint, "openvino")
+
+
+@pytest.mark.parametrize("encoder", ["resnet18", "stratified_nano"])
+def test_exported_for_openvino_with_a_report(encoder: str, node: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+    openvino = pytest.importorskip("openvino", reason="needs the extra openvino")
+    chosen = {"resnet18": {"blocks": [1, 1, 1, 1]}, "stratified_nano": {"depths": [2, 1, 1, 1], "dim": 8}}[encoder]
+    decoder = {**node("decoder", "unet"), "channels": [8] * 5}
+    record = ModelRecord({**node("encoder", encoder), **chosen}, decoder, None, 0.1, 100.0, 64, 96)
+    depth, _ = build_networks(record)
+    state = {f"depth.{name}": value for name, value in depth.state_dict().items()}
+    atomic_save({"state_dict": state, "saunet": record.to_plain()}, tmp_path / "x.ckpt")
+    options = saunet.ExportOptions(checkpoint=tmp_path / "x.ckpt", output=tmp_path / "out", formats=["openvino"])
+    (report,) = saunet.export(options).reports
+    assert (report.file, report.batch) == ("model.xml", "any")
+    assert report.difference < 1e-5
+    compiled = openvino.compile_model(str(tmp_path / "out" / "model.xml"), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    images = np.random.default_rng(0).random((3, 3, 64, 96), dtype=np.float32)
+    np.testing.assert_allclose(
+        compiled({"image": images})["disparity"], exporters.run_eager(depth.eval())(images), rtol=1e-3, atol=1e-4
+    )
