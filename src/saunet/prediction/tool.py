@@ -211,8 +211,8 @@ def predict(
             if options.runtime != "torch" and device == "cpu":
                 from saunet.prediction.runtimes import choose_runtime
 
-                frames = min(options.max_frames or math.inf, recording.declared or math.inf)
-                predictor = choose_runtime(predictor, options.checkpoint, options.runtime, frames)
+                most = min(options.max_frames or math.inf, recording.declared or math.inf)
+                predictor = choose_runtime(predictor, options.checkpoint, options.runtime, most)
         camera, height = _camera(options, recording, predictor)
         apply_scale(options.scale, predictor, options.input, camera, folder, options.checkpoint, height)
         print(f"depth is {predictor.unit}")

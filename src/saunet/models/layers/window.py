@@ -53,8 +53,8 @@ def axis_windows(size: int, window: int, shift: int) -> list[tuple[int, int]]:
     A shifted axis starts with a window of ``shift`` tokens; the last window ends at the border. An axis that fits in
     one window is not shifted: the shift would only cut it in two.
     """
-    if isinstance(size, Tensor):  # from torch.jit.trace: equal lengths must be equal keys of `window_groups`
-        size = int(size)
+    if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
+        size = int(size)  # which is a tensor there: equal lengths must be equal keys of `window_groups`
     first = shift if size > window else 0
     starts = [0, *range(first, size, window)] if first else list(range(0, size, window))
     return [(start, stop - start) for start, stop in zip(starts, [*starts[1:], size], strict=True)]
@@ -95,7 +95,7 @@ def _plan(kind: str, *arguments: Any) -> Tensor:
 
 def _mark_for_compiler() -> bool:
     """Tell the compiler to call `_kept_plan`, not to look into it."""
-    torch.compiler.allow_in_graph(_kept_plan)
+    torch.compiler.allow_in_graph(_kept_plan)  # type: ignore[no-untyped-call]
     return True
 
 
@@ -119,12 +119,12 @@ def _kept_plan(kind: str, *arguments: Any) -> Tensor:
 @contextlib.contextmanager
 def _untraced() -> Iterator[None]:
     """Keep from torch.jit.trace, which would otherwise find another graph when it checks itself, what is done."""
-    state = torch._C._get_tracing_state()  # type: ignore[no-untyped-call]
-    torch._C._set_tracing_state(None)
+    state = torch._C._get_tracing_state()
+    torch._C._set_tracing_state(None)  # type: ignore[attr-defined]
     try:
         yield
     finally:
-        torch._C._set_tracing_state(state)
+        torch._C._set_tracing_state(state)  # type: ignore[attr-defined]
 
 
 def _build_order(batch: int, height: int, width: int, window: int, shift: int) -> np.ndarray:
