@@ -327,8 +327,8 @@ def _clip_sinks(
     if "rrd" in outputs:
         from saunet.prediction.rerun import RerunSink
 
-        path = odometer if "trajectory" in outputs else None
-        found.append(RerunSink(Path(f"{stem}rerun.rrd"), style.camera, options.max_depth, path))
+        moves = odometer if "trajectory" in outputs else None
+        found.append(RerunSink(Path(f"{stem}rerun.rrd"), style.camera, options.max_depth, moves))
     return found
 
 
