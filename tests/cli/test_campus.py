@@ -186,7 +186,7 @@ def test_data_sets_are_mixed_by_config(tool: Tool, raw_root: Path, tmp_path: Pat
 def test_a_board_is_printed_and_found(tool: Tool, tmp_path: Path) -> None:
     assert tool("calibrate", "print_board=board.png").code == 0
     assert np.array_equal(read_image(tmp_path / "board.png")[..., 0], Board().picture())
-    tool("calibrate").says("input is not set; add input=board.mp4")
+    tool("calibrate").says("set one of input and video", "input=board.mp4")
     (tmp_path / "pictures").mkdir()
     cv2.imwrite(str(tmp_path / "pictures" / "a.png"), cv2.resize(Board().picture(), (480, 360)))
     outcome = tool("calibrate", "input=pictures", "output=camera.yaml")

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 import yaml
 
@@ -187,6 +188,15 @@ def test_a_finished_run_is_not_replaced_by_mistake(tool: Tool, smoke_run: Path, 
     outcome = tool("train", *QUICK, "trainer.limit_train_batches=1", "hydra.run.dir=run", "overwrite=true")
     assert outcome.code == 0, outcome.err
     assert (run / "checkpoints" / "best.ckpt").read_bytes() != before[run / "checkpoints" / "best.ckpt"]
+
+
+def test_a_training_of_some_length_ends_with_a_picture(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="the extra 'plot' is not installed")
+    few = ("trainer.limit_train_batches=1", "trainer.limit_val_batches=0", "trainer.log_every_n_steps=1")
+    outcome = tool("train", "experiment=smoke", *SMALL, *few, "trainer.max_epochs=10", "hydra.run.dir=run")
+    assert outcome.code == 0, outcome.err
+    assert cv2.imread(str(tmp_path / "run" / "results.png")).shape[1] > 500
+    assert not (smoke_run / "results.png").exists()  # two steps are no curve
 
 
 def test_a_job_whose_config_is_refused_is_recorded(tool: Tool, tmp_path: Path) -> None:

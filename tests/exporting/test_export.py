@@ -226,7 +226,7 @@ def test_a_file_that_gives_nan_is_not_written(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runners = module._RUNNERS
-    monkeypatch.setitem(runners, "safetensors", lambda path, record: lambda image: image[:, :1] * np.float32("nan"))
+    monkeypatch.setitem(runners, "safetensors", lambda *_: lambda image: image[:, :1] * np.float32("nan"))
     with pytest.raises(CheckpointError, match=r"model\.safetensors gives NaN where .*so it is not written"):
         exported_files(checkpoint, tmp_path / "out", ["safetensors"])
     assert list((tmp_path / "out").iterdir()) == []
@@ -242,7 +242,7 @@ def test_settings_that_the_folder_cannot_hold(checkpoint: Path, tmp_path: Path) 
 
 
 def test_a_file_that_differs_is_not_written(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(module._RUNNERS, "safetensors", lambda path, record: lambda image: image[:, :1] * 0 + 1)
+    monkeypatch.setitem(module._RUNNERS, "safetensors", lambda *_: lambda image: image[:, :1] * 0 + 1)
     with pytest.raises(
         CheckpointError, match=r"model\.safetensors differs from the network by .* so it is not written"
     ):

@@ -10,6 +10,7 @@ import numpy as np
 
 import saunet
 from saunet.data.drive import Drive
+from saunet.data.synthetic import SyntheticDataModule
 from saunet.evaluation import write_results
 from saunet.evaluation.predictors import NetworkPredictor, PredictorNetwork
 from saunet.evaluation.scoring import Shapes
@@ -18,7 +19,6 @@ from saunet.io.images import write_image
 from saunet.prediction.panel import depth_panel
 from saunet.prediction.predictor import Predictor
 from saunet.prediction.tool import PredictOptions, predict
-from saunet.synthetic import SyntheticDrive
 from saunet.tables import show
 from saunet.training.tool import TrainOptions, train
 
@@ -47,8 +47,11 @@ def demo(
     others = {SHIPPED: NetworkPredictor(PredictorNetwork(shipped))}
     result = evaluate_network(trained.network, data, others, Shapes(boundaries=True))
     write_results(result, folder)
-    drive = data.datasets["test"].drives[0]
-    draw(trained, shipped, drive, folder)
+    drive = large = data.datasets["test"].drives[0]
+    if isinstance(data, SyntheticDataModule):
+        rendered = data.drives("test")[0]
+        large = replace(rendered, height=round(data.height * WIDTH / data.width), width=WIDTH, cache=None)
+    draw(trained, shipped, drive, large, folder)
     show(result.tables())
     print("The camera moved through a street that neither network had seen; 'model' was trained without any depth.")
     print(f"pictures  {folder / 'depth.png'}")
@@ -57,12 +60,9 @@ def demo(
     print(f"model     {checkpoint}")
 
 
-def draw(trained: Predictor, shipped: Predictor, drive: Drive, folder: Path) -> None:
-    """Write ``depth.png`` (a few frames with truth and error) and ``depth.mp4`` (the whole drive, which has depth)."""
+def draw(trained: Predictor, shipped: Predictor, drive: Drive, large: Drive, folder: Path) -> None:
+    """Write ``depth.png`` (a few large frames with truth and error) and ``depth.mp4`` (the whole drive)."""
     frames, panels = list(drive.indices), []
-    large = drive
-    if isinstance(drive, SyntheticDrive):
-        large = replace(drive, height=round(drive.height * WIDTH / drive.width), width=WIDTH, cache=None)
     for place in np.linspace(0, len(frames) - 1, PICTURES + 2)[1:-1]:
         frame = frames[round(place)]
         image, truth = large.image(frame), large.depth(frame)

@@ -59,6 +59,8 @@ CALLBACKS: Mapping[str, tuple[str, dict[str, str]]] = {
 }
 """The usual callbacks by name, with the folders that they are given, below the run's own."""
 LOGGERS = {"csv": "CSVLogger", "tensorboard": "TensorBoardLogger"}
+DRAWN_FROM = 10
+"""Steps of a training from which its curves are worth a picture."""
 _TRUSTED = ("lightning.", "torch.", "saunet.")
 """Packages that nested nodes of callbacks, loggers and the trainer may name."""
 
@@ -264,7 +266,8 @@ def train(
                     raise SaunetError(f"{lost}; {way_on(folder / 'checkpoints')}") from error
                 raise
     if trainer.is_global_zero:
-        _draw(folder)
+        if trainer.global_step >= DRAWN_FROM:
+            _draw(folder)
         print(f"results: {folder}")
     kept = [each for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint)]
     best = next((Path(each.best_model_path) for each in kept if each.best_model_path), None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,11 +15,6 @@ from saunet.data.loading.windows import measured_distance
 from saunet.data.packed.store import Part, Store
 from saunet.io.images import decode_image
 from saunet.io.plain import read_arrays
-
-FACTS = ("fps", "numbering", "origin", "camera_height", "condition")
-"""Members of a recording that are kept as they are."""
-PER_FRAME = {"pose": (4, 4), "time": (), "speed": ()}
-"""Members that take a frame -> shape; NaN where unknown."""
 
 
 class PackedDrive(Drive):
@@ -34,6 +29,29 @@ class PackedDrive(Drive):
     @property
     def name(self) -> str:
         return str(self._facts["name"])
+
+    @property
+    def fps(self) -> float | None:
+        fps: float | None = self._facts["fps"]
+        return fps
+
+    @property
+    def numbering(self) -> str:
+        return str(self._facts["numbering"])
+
+    @property
+    def origin(self) -> str:
+        return str(self._facts["origin"])
+
+    @property
+    def camera_height(self) -> float | None:
+        height: float | None = self._facts["camera_height"]
+        return height
+
+    @property
+    def condition(self) -> str | None:
+        condition: str | None = self._facts["condition"]
+        return condition
 
     @property
     def indices(self) -> Sequence[int]:
@@ -119,14 +137,6 @@ class PackedDrive(Drive):
         return self._arrays["scene_mask"] if self.has_scene_mask else None
 
 
-def _fact(name: str) -> Any:
-    return property(lambda self: self._facts[name], doc=getattr(Drive, name).__doc__)
-
-
-for _name in FACTS:
-    setattr(PackedDrive, _name, _fact(_name))
-
-
 @dataclass(frozen=True)
 class _Absent(Drive):
     """A recording without frames."""
@@ -147,7 +157,15 @@ def describe(drive: Drive, frames: Sequence[int], offsets: Sequence[int], ways: 
     if not frames:  # one that a split names and that is not there: nothing can be asked of it
         drive = _Absent(drive.name)
     T_stereo_cam, gaps = drive.T_stereo_cam, drive.gaps
-    facts = {name: getattr(drive, name) for name in FACTS} | {"name": drive.name, "frame_size": drive.frame_size}
+    facts: dict[str, Any] = {
+        "name": drive.name,
+        "fps": drive.fps,
+        "numbering": drive.numbering,
+        "origin": drive.origin,
+        "camera_height": drive.camera_height,
+        "condition": drive.condition,
+        "frame_size": drive.frame_size,
+    }
     # A gap lies between frames, of which not all may be packed.
     lost = [max((frame for frame in frames if frame <= gap), default=None) for gap in gaps]
     facts |= {"gaps": sorted({frame for frame in lost if frame is not None})}
@@ -157,8 +175,10 @@ def describe(drive: Drive, frames: Sequence[int], offsets: Sequence[int], ways: 
         "intrinsics": np.array([drive.intrinsics(frame) for frame in frames], np.float64).reshape(-1, 3, 3),
         "recorded": np.array([drive.recorded(frame) for frame in frames], np.int64),
     }
-    for key, shape in PER_FRAME.items():
-        values = [getattr(drive, key)(frame) for frame in frames]
+    told: dict[str, tuple[Callable[[int], Any], tuple[int, ...]]]
+    told = {"pose": (drive.pose, (4, 4)), "time": (drive.time, ()), "speed": (drive.speed, ())}
+    for key, (ask, shape) in told.items():
+        values = [ask(frame) for frame in frames]
         if any(each is not None for each in values):
             arrays[key] = np.array([np.full(shape, np.nan) if each is None else each for each in values], np.float64)
     if len(frames) and (arrays["intrinsics"] == arrays["intrinsics"][0]).all():
