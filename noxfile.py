@@ -24,7 +24,7 @@ def install(session: nox.Session, *packages: str) -> None:
 
 @nox.session
 def demo(session: nox.Session) -> None:
-    """Train, evaluate, and draw depth on the built-in synthetic drive (about five minutes on two cores)."""
+    """Train, evaluate, and draw depth on the built-in synthetic drive (five to ten minutes on two cores)."""
     install(session, "-e", ".[weights]")
     session.run("python", "-m", "saunet", "demo", *session.posargs)
 
