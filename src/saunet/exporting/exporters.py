@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch._dynamo.exc import UserError
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from saunet.errors import ConfigError, one_of
@@ -36,7 +35,8 @@ _IR_VERSIONS = {17: 8, 18: 8, 20: 10}
 """The file format's version that runtimes of an opset's time read."""
 
 _LARGEST_BATCH = 256
-_TRACING_ERRORS = (UserError, RuntimeError, ValueError)
+_TRACING_ERRORS = (RuntimeError, ValueError)
+"""The first holds all of the compiler's own."""
 
 
 class FinestDisparity(nn.Module):

@@ -82,6 +82,7 @@ class Recording:
             self.declared = len(self.images)
         else:
             assert not isinstance(source, int)
+            self.declared = len(source) if isinstance(source, Sequence) else None
             arrays = iter(source)
             first = list(itertools.islice(arrays, 1))
             self._size = as_image(first[0]).shape[:2] if first else None
