@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import nn
+from tiny_checkpoint import write_checkpoint
 
 import saunet
 from saunet.errors import CheckpointError, ConfigError
@@ -23,13 +23,9 @@ Run = Callable[[np.ndarray], np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def checkpoint(node: Callable[..., dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    encoder = {**node("encoder", "resnet18"), "blocks": [1, 1, 1, 1]}
-    decoder = {**node("decoder", "unet"), "channels": [8] * 5}
-    record = ModelRecord(encoder, decoder, None, min_depth=0.1, max_depth=100.0, height=32, width=64)
-    depth, _ = build_networks(record)
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "x.ckpt"
-    atomic_save({"state_dict": dict(nn.ModuleDict({"depth": depth}).state_dict()), "saunet": record.to_plain()}, path)
+    write_checkpoint(path, height=32, width=64)
     return path
 
 

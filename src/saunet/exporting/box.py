@@ -19,11 +19,11 @@ from torch import Tensor, nn
 
 from saunet.errors import CheckpointError, SaunetError
 from saunet.exporting.card import filled, quality_table
+from saunet.exporting.parity import random_images
 from saunet.exporting.tool import (
     check_target,
     named_state,
     public_record,
-    random_images,
     read_metrics,
     real_images,
     remove,
@@ -90,7 +90,9 @@ def pack(
         if before is not None and after is not None:
             states[file] = {key: _half(key, value) for key, value in named_state({part: before}).items()}
             after.load_state_dict({key.removeprefix(f"{part}."): value for key, value in states[file].items()})
-    inputs = [torch.from_numpy(image) for image in (*random_images(record), *real_images(record, images))]
+    inputs = [
+        torch.from_numpy(image) for image in (*random_images(record.height, record.width), *real_images(record, images))
+    ]
     largest, mean = _depth_change(whole[0], halved[0], inputs)
     if not mean <= DEPTH_TOLERANCE:  # NaN too
         raise CheckpointError(

@@ -39,6 +39,11 @@ class Parity:
     """Median time of the exported file for one image, on the CPU."""
 
 
+def random_images(height: int, width: int) -> list[NDArray[np.float32]]:
+    """Return two images of random colors, each 1 3 h w, always the same."""
+    return list(np.random.default_rng(0).random((2, 1, 3, height, width), dtype=np.float32))
+
+
 def compare(
     file: str,
     eager: Run,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from saunet.errors import CheckpointError, ConfigError, DataError, checked, one_of
 from saunet.exporting import exporters
 from saunet.exporting.card import model_card
-from saunet.exporting.parity import Parity, Run, compare, parity_table, timed
+from saunet.exporting.parity import Parity, Run, compare, parity_table, random_images, timed
 from saunet.io.atomic import remove_partial_files, replacing, write_bytes, write_json
 from saunet.io.images import network_input, read_image
 from saunet.io.plain import read_json
@@ -155,7 +155,7 @@ def export(options: ExportOptions) -> ExportResult:
     network, pose = read.networks()
     record = public_record(read.record)
     network.eval()
-    random, real = random_images(record), real_images(record, options.images or ())
+    random, real = random_images(record.height, record.width), real_images(record, options.images or ())
     remove(earlier)
     remove_partial_files(folder)
     eager, span = exporters.run_eager(network), 1 / record.min_depth - 1 / record.max_depth
@@ -261,11 +261,6 @@ def public_record(record: ModelRecord) -> ModelRecord:
     except ValueError as reason:
         raise ConfigError(f"{CONFIG} cannot hold the model's settings ({reason}); give finite numbers") from reason
     return record
-
-
-def random_images(record: ModelRecord) -> list[NDArray[np.float32]]:
-    """Return two images of random colors at the network's size, each 1 3 h w, always the same."""
-    return list(np.random.default_rng(0).random((2, 1, 3, record.height, record.width), dtype=np.float32))
 
 
 def real_images(record: ModelRecord, images: str | Path | Sequence[str | Path]) -> list[NDArray[np.float32]]:

@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import importlib.util
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -18,11 +18,12 @@ from jaxtyping import Float32
 from saunet.errors import CheckpointError, ConfigError, one_of
 from saunet.exporting import exporters
 from saunet.exporting.openvino import export_openvino, has_bf16, run_openvino
-from saunet.exporting.parity import Run, milliseconds
+from saunet.exporting.parity import Run, milliseconds, random_images
 from saunet.io.atomic import replacing
 from saunet.metrics.functional import flip_blend
 from saunet.prediction.prediction import ImagePredictor
 from saunet.prediction.predictor import Predictor
+from saunet.prediction.tool import RUNTIMES
 from saunet.weights.files import read_model
 
 LIMITS = {"f32": 1e-4, "bf16": 2e-3}
@@ -30,6 +31,7 @@ LIMITS = {"f32": 1e-4, "bf16": 2e-3}
 WORTH_FRAMES = 200
 """Frames that are worth a conversion, which takes as long as about so many frames."""
 _PACKAGES = {"openvino": ("openvino",), "onnx": ("onnxruntime", "onnx", "onnxscript")}
+_EXTRAS = {"openvino": "openvino", "onnx": "export"}
 
 
 class ConvertedPredictor(Predictor):
@@ -88,7 +90,7 @@ def choose_runtime(
     Raises:
         ConfigError: if a runtime is asked for that is missing, does not fit, or changes depth too much.
     """
-    one_of("runtime", runtime, ("auto", "torch", *_PACKAGES))
+    one_of("runtime", runtime, RUNTIMES)
     if runtime == "torch":
         return predictor
     auto, wrong = runtime == "auto", _why_not(predictor)
@@ -112,13 +114,12 @@ def choose_runtime(
             print(f"runtime: torch ({name} cannot be used: {reason})")
             return predictor
         raise
-    images = np.random.default_rng(0).random((2, 1, 3, predictor.height, predictor.width), dtype=np.float32)
+    images = random_images(predictor.height, predictor.width)
     eager = exporters.run_eager(predictor.network)
-    changes = [depth_change(eager, run, image) for image in images]
-    change = max(changes) if all(map(math.isfinite, changes)) else math.inf
+    change = _largest_change(eager, run, images)
     if not change <= LIMITS[precision] and precision != "f32":
         precision, run = "f32", run_openvino(path, path.with_suffix(".bin"))
-        change = max(depth_change(eager, run, image) for image in images)
+        change = _largest_change(eager, run, images)
     if not change <= LIMITS[precision]:
         found_it = f"{name} changes depth by {change:.2g} (Abs Rel), more than {LIMITS[precision]:g}"
         if not auto:
@@ -134,7 +135,10 @@ def choose_runtime(
     return ConvertedPredictor(predictor, run, LIMITS[precision])
 
 
-_EXTRAS = {"openvino": "openvino", "onnx": "export"}
+def _largest_change(eager: Run, converted: Run, images: Sequence[Float32[np.ndarray, "1 3 h w"]]) -> float:
+    """Return the largest `depth_change` of several images; infinite if one of them is not finite."""
+    changes = [depth_change(eager, converted, image) for image in images]
+    return max(changes) if all(map(math.isfinite, changes)) else math.inf
 
 
 def _why_not(predictor: ImagePredictor) -> str:
