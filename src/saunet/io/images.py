@@ -236,6 +236,13 @@ def encode_jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int = 95) -> bytes:
     return bytes(data.tobytes())
 
 
+def encode_png(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """Return an RGB image as the bytes of a PNG file."""
+    done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    assert done, "an image in memory"
+    return bytes(data.tobytes())
+
+
 def write_image(path: str | Path, image: Shaped[np.ndarray, "..."]) -> None:
     """Write RGB or gray bytes, or 16-bit gray, in the format of the path's suffix, whole or not at all."""
     path = Path(path)

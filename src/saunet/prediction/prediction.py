@@ -18,7 +18,7 @@ from saunet.errors import CheckpointError, ConfigError, DataError, checked, divi
 from saunet.io.atomic import write_bytes
 from saunet.io.colormaps import colorize
 from saunet.io.display import display
-from saunet.io.images import as_rgb_bytes, network_input, read_image, write_image
+from saunet.io.images import as_rgb_bytes, encode_png, network_input, read_image, write_image
 from saunet.runs.record import Scale
 from saunet.weights.locate import locate
 
@@ -122,7 +122,7 @@ class Prediction:
 
     def _repr_png_(self) -> bytes:
         pair = np.concatenate([self.image, self.color()], axis=0)
-        return bytes(cv2.imencode(".png", cv2.cvtColor(pair, cv2.COLOR_RGB2BGR))[1].tobytes())
+        return encode_png(pair)
 
     def _repr_html_(self) -> str:
         from saunet.prediction.page import depth_figure

@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from saunet.data.loading.selecting import Manifest, write_manifest
 from saunet.errors import ConfigError, checked, one_of, positive
 from saunet.io.atomic import check_folder
-from saunet.io.images import write_image
+from saunet.io.images import encode_png, write_image
 from saunet.io.progress import bar
 from saunet.registry import Spec, datamodules
 from saunet.tools.doctor.findings import Finding, diagnose, manifest_of
@@ -89,7 +88,7 @@ class Diagnosis:
         return "\n".join(lines)
 
     def _repr_png_(self) -> bytes:
-        return bytes(cv2.imencode(".png", cv2.cvtColor(self.picture, cv2.COLOR_RGB2BGR))[1].tobytes())
+        return encode_png(self.picture)
 
 
 def doctor(options: DoctorOptions, *, advance: Callable[[int, int], None] | None = None) -> Diagnosis:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +22,7 @@ from saunet.data.packed.module import KEPT
 from saunet.data.packed.store import DESCRIPTION, FORMAT, Part, shard_name
 from saunet.errors import DataError
 from saunet.io.atomic import check_folder, write_bytes, write_json
-from saunet.io.images import decode_image
+from saunet.io.images import decode_image, encode_png
 from saunet.io.progress import bar
 
 _TOGETHER = 64  # frames in memory at a time
@@ -177,8 +176,7 @@ def _image_file(drive: Drive, frame: int) -> tuple[str, bytes]:
                 return path.suffix, data
         except DataError:  # a kind of file that is more than an image of 8 bits
             pass
-    _, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    return ".png", bytes(png.tobytes())
+    return ".png", encode_png(image)
 
 
 def _depth_file(depth: NDArray[np.float32] | None) -> tuple[str, bytes]:
