@@ -24,6 +24,7 @@ class PackedDrive(Drive):
         self._store, self._facts, self._arrays = store, facts, arrays
         self.other: PackedDrive | None = None
         """The other camera's recording, set by who loads both."""
+        self._indices: list[int] = arrays["indices"].tolist()
         self._distances = {(first, second): way for first, second, way in arrays["distances"].tolist()}
 
     @property
@@ -55,8 +56,7 @@ class PackedDrive(Drive):
 
     @property
     def indices(self) -> Sequence[int]:
-        indices: list[int] = self._arrays["indices"].tolist()
-        return indices
+        return self._indices
 
     def _at(self, key: str, index: int) -> Any:
         """Return what is stored for a frame; one entry stands for all frames, and none for unknown."""

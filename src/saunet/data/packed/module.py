@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -89,7 +90,7 @@ class PackedDataModule(DepthDataModule):
         self.neighbors = tuple(dict.fromkeys((*plain["neighbors"], *self.neighbors)))
         self.odometer = measured_distance if plain["with_speed"] else None
         self.maps = {key: _PackedMaps(key, kind) for key, kind in plain["maps"].items()}
-        self._store.sizes = plain["shards"]
+        self._store.starts = list(itertools.accumulate(plain["shards"], initial=0))
         self._facts = plain
         return plain
 

@@ -33,14 +33,14 @@ def shard_name(number: int) -> str:
 class Store:
     """Reads whole files and parts of shards below a folder or an address such as ``s3://bucket/name``.
 
-    ``sizes`` are those of the shards. The first ``keep`` bytes of the pack are kept in the folder ``cache`` once they
-    were read: with shuffled epochs that serves as many reads as replacing the oldest would serve few, and needs no
-    agreement between processes.
+    ``starts`` say where each shard begins in the pack. The first ``keep`` bytes of the pack are kept in the folder
+    ``cache`` once they were read: with shuffled epochs that serves as many reads as replacing the oldest would serve
+    few, and needs no agreement between processes.
     """
 
     def __init__(self, root: str, cache: Path | None = None, keep: int = 0) -> None:
         self.root, self.cache, self.keep = root.rstrip("/"), cache, keep
-        self.sizes: list[int] = []
+        self.starts: list[int] = []
         self._opened: tuple[int, Any, str] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -52,7 +52,7 @@ class Store:
     def part(self, part: Part) -> bytes:
         name = shard_name(part.shard)
         kept = None
-        if self.cache is not None and sum(self.sizes[: part.shard]) + part.start + part.length <= self.keep:
+        if self.cache is not None and self.starts[part.shard] + part.start + part.length <= self.keep:
             kept = self.cache / name / str(part.start)
             if kept.is_file() and kept.stat().st_size == part.length:
                 return kept.read_bytes()
