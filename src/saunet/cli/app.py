@@ -334,11 +334,7 @@ class _Reader:
             found = _OVERRIDE.fullmatch(word)
             if found is None and word.startswith("~"):
                 made.append(word)
-            elif found is None or (
-                self.tool.positional
-                and not self._is_key(found["key"])
-                and ("://" in found["key"] or Path(word).exists())
-            ):
+            elif found is None or (self.tool.positional and not self._is_key(found["key"]) and _is_place(word)):
                 plain.append(word)
             else:
                 key = self.tool.aliases.get(found["key"], found["key"])
