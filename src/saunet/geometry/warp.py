@@ -65,7 +65,7 @@ def project(
 
     Returns:
         Pixels (u, v) in the source image, and depth z in the source camera. A point less than `MIN_Z` in front of the
-        camera, or that is no number, gets a pixel outside every image, and no gradient.
+        camera, or that is NaN, gets a pixel outside every image, and no gradient.
 
     Examples:
         >>> K = torch.tensor([[[2.0, 0.0, 1.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]])
@@ -89,7 +89,7 @@ def project_each(
     columns = T_src_tgt[:, :, :3, :, None, None].unbind(3)
     moved = columns[0] * x + columns[1] * y + columns[2] * z + columns[3]
     x, y, z = moved.unbind(2)
-    front = (z > MIN_Z) & ~(x + y).isnan()  # no sampling may be asked for a place that is no number
+    front = (z > MIN_Z) & ~(x + y).isnan()  # NaN must not reach the sampler
     safe = torch.where(front, z, torch.ones_like(z))
     fx, skew, cx, fy, cy = (entry[:, None] for entry in _entries(K))
     x, y = x / safe, y / safe

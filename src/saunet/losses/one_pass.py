@@ -196,7 +196,7 @@ class _Warp:
         lowest: Any = self.front.amin().tolist()
         total: Any = self.grid.sum().tolist()
         if lowest < 1 or not math.isfinite(total):
-            for axis, place in enumerate(cameras.behind):  # and what is no number, which sampling must not be asked for
+            for axis, place in enumerate(cameras.behind):  # NaN too, which must not reach the sampler
                 self.grid[:, axis].mul_(self.front).add_(place - place * self.front).nan_to_num_(nan=place)
         self.inverse = w.reciprocal_()
         self.pixels = self.grid.permute(0, 2, 3, 1)

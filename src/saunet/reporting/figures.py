@@ -49,6 +49,7 @@ def draw_results(run: Run, groups: Sequence[Sequence[tuple[str, str]]], picture:
 
 
 def logged(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Return the panels whose column any of the runs has logged."""
     return [(key, title) for key, title in panels if any(curve(run.history, key)[0] for run in runs.values())]
 
 

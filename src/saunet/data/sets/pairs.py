@@ -25,7 +25,7 @@ from saunet.registry import datamodules
 IMAGES, DEPTHS = frozenset({"images", "image", "rgb", "color"}), frozenset({"depth", "depths"})
 """Names of folders that stand beside each other and hold the images and their depth maps."""
 VIEW = 60.0
-"""Horizontal field of view, degrees, that is assumed where nobody says; only a loss or measure of 3D shape sees it."""
+"""Horizontal field of view in degrees, assumed without a camera file; only losses and metrics of 3D shape use it."""
 _SPLITS = {"train": "train", "training": "train", "val": "val", "valid": "val", "validation": "val", "test": "test"}
 _WORD = r"(?:(?:sync_)?depth|rgb|colou?r|image|img)s?"
 _WORDS = re.compile(rf"^{_WORD}[_-]?|[_-]?{_WORD}$", re.IGNORECASE)

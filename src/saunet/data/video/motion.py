@@ -88,7 +88,7 @@ def shrink(
 
 
 class _Picture:
-    """A frame, decoded as far as it is looked at."""
+    """A frame, decoded only as far as it is needed."""
 
     def __init__(self, path: Path, crop: Sequence[float | int], exact: bool) -> None:
         self._path, self._crop = path, crop
