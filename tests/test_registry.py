@@ -71,6 +71,13 @@ def test_unknown_parameter_suggests_the_nearest(widgets: Registry) -> None:
         widgets.build("wide", dephts=(1,))
 
 
+def test_what_a_component_needs_is_asked_for() -> None:
+    with pytest.raises(ConfigError, match=r"decoder 'aunet' cannot be built without features=.*the encoder's features"):
+        saunet.build("decoder", "aunet")
+    with pytest.raises(ConfigError, match=r"attention 'eca' cannot be built without channels=\.\.\."):
+        saunet.build("attention", "eca")
+
+
 def test_unknown_kind() -> None:
     with pytest.raises(ConfigError, match="unknown kind 'encodr'; did you mean 'encoder'"):
         saunet.build("encodr", "resnet18")

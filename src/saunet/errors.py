@@ -22,6 +22,9 @@ C = TypeVar("C", bound=Callable[..., Any])
 _ENDLESS = re.compile(r"\S{500,}|(?<=')[^']{500,}(?=')")
 """A word or quotation that is longer than what anybody reads, and than the paths of most systems."""
 
+ELSEWHERE = {"learning_rate": "lr", "gpus": "devices", "num_workers": "workers", "imgsz": "size"}
+"""What other tools call a setting -> what it is called here."""
+
 if TYPE_CHECKING:
     import torch
 
@@ -77,7 +80,9 @@ class CheckpointError(SaunetError, ValueError):
 
 def suggest(name: str, allowed: Iterable[str]) -> str:
     """Return ``"; did you mean 'x'?"`` for the nearest allowed name, or an empty string when nothing is near."""
-    near = difflib.get_close_matches(name, list(allowed), n=1, cutoff=0.6)
+    words, (before, dot, last) = list(allowed), name.rpartition(".")
+    elsewhere = f"{before}{dot}{ELSEWHERE.get(last)}"
+    near = [elsewhere] if elsewhere in words else difflib.get_close_matches(name, words, n=1, cutoff=0.6)
     return f"; did you mean '{near[0]}'?" if near else ""
 
 

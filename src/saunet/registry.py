@@ -83,13 +83,18 @@ class Registry:
         """Build component ``name``; keywords override its defaults.
 
         Raises:
-            ConfigError: for an unknown name or parameter.
+            ConfigError: for an unknown name or parameter, or one that is needed and not given.
         """
         entry = self.entry(name)
         _check_keys(f"{self.kind} '{name}'", entry.target, kwargs)
-        hints = {key: each.annotation for key, each in schema.parameters(entry.target).items()}
-        check_arguments(entry.target, kwargs, hints)
-        return entry.target(**{**entry.preset, **kwargs})
+        parameters, given = schema.parameters(entry.target), {**entry.preset, **kwargs}
+        check_arguments(entry.target, kwargs, {key: each.annotation for key, each in parameters.items()})
+        missing = [key for key, each in parameters.items() if each.default is each.empty and key not in given]
+        if missing:
+            late = " (for a decoder, the encoder's features)" if missing == ["features"] else ""
+            needed = ", ".join(f"{key}=..." for key in missing)
+            raise ConfigError(f"{self.kind} '{name}' cannot be built without {needed}{late}")
+        return entry.target(**given)
 
     def partial(self, name: str, /, **kwargs: Any) -> Callable[..., Any]:
         """Return a callable that builds ``name`` once its late parameters are known."""

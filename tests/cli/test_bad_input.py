@@ -50,6 +50,16 @@ KITTI = (
     [
         ("model.encoder.dephts=[2,2]", ("unknown key 'model.encoder.dephts'", "did you mean 'depths'?")),
         ("sead=3", ("unknown key 'sead'", "did you mean 'seed'?")),
+        ("trainer.max_epoch=2", ("unknown key 'trainer.max_epoch'", "did you mean 'max_epochs'?")),
+        ("trainer.gpus=1", ("unknown key 'trainer.gpus'", "did you mean 'devices'?")),
+        ("optim.learning_rate=1e-4", ("unknown key 'optim.learning_rate'", "did you mean 'lr'?")),
+        ("max_epochs=3", ("unknown key 'max_epochs'", "did you mean 'trainer.max_epochs'?")),
+        ("learning_rate=1e-4", ("unknown key 'learning_rate'", "did you mean 'lr'?")),
+        ("imgsz=640", ("unknown key 'imgsz'", "did you mean 'size'?")),
+        ("+epochs=3", ("leave out the plus sign: trainer.max_epochs=...",)),
+        ("+dta.root=x", ("unknown key 'dta'", "did you mean 'data'?")),
+        ("model.encoder=resnet18", ("choose a component with a slash: model/encoder=resnet18",)),
+        ("--experiment selfsup", ("written without dashes: experiment=selfsup",)),
         ("objective.alpha=much", ("objective.alpha is 'much'; it must be float",)),
         ("model/encoder=resnet19", ("unknown model/encoder 'resnet19'", "did you mean 'resnet18'?", "stratified_tiny")),
         ("experiment=nope", ("unknown experiment 'nope'", "available: demo")),
@@ -78,6 +88,11 @@ KITTI = (
         ("experiment=smoke model/encoder=resnet18 model.encoder.frames=2", ("frames 2; depth comes from one image",)),
         ("-m experiment=glob(table9/*)", ("experiment=glob(table9/*) matches none of", "table3/stf_t_aunet")),
         ("experiment=smoke data.batch_size=99", ("batch_size is 99 but there are only 4 training samples",)),
+        ("experiment=smoke resume=true", ("resume is 'true'", "resume=auto")),
+        (
+            "experiment=smoke optim.fused=true trainer.precision=bf16-mixed trainer.gradient_clip_val=1",
+            ("optim.fused=true, trainer.precision=bf16-mixed", "set optim.fused=false"),
+        ),
         ("experiment=smoke resume=/nowhere/last.ckpt", ("no checkpoint at /nowhere/last.ckpt",)),
         ("experiment=smoke hydra.run.dir=/proc/nowhere/run", ("/proc/nowhere", "check the path")),
     ],
@@ -132,7 +147,8 @@ def test_a_full_gpu_is_one_sentence() -> None:
 
 
 def test_a_missing_value_is_asked_for(tool: Tool) -> None:
-    tool("predict", "input=x").says("output is not set; add output=... to the command line")
+    tool("predict").says("input is not set; add input=... to the command line")
+    tool("predict", "x.png", "camera_height=1.65").says("did you mean 'scale.camera_height'?")
     tool("odometry").says("checkpoint is not set; add checkpoint=...")
 
 
@@ -170,7 +186,7 @@ def test_a_checkpoint_of_another_model_cannot_be_resumed(tool: Tool, smoke_run: 
 def test_a_resumed_run_with_other_settings(tool: Tool, smoke_run: Path) -> None:
     last = smoke_run / "checkpoints" / "last.ckpt"
     outcome = tool("train", "experiment=smoke", "model/pose=posecnn", "data.width=128", f"resume={last}")
-    outcome.says("width 96 and this run has 128")
+    outcome.says("width 96 and this run has 128", "saunet resume")
 
 
 def test_an_empty_drive(tool: Tool, raw_root: Path) -> None:

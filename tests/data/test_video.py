@@ -36,6 +36,16 @@ def names(data, split):
     return [dataset.name(index) for index in range(len(dataset))]
 
 
+def test_one_clip_finds_the_camera_file_beside_it(tmp_path):
+    make_clip(tmp_path / "clips", "a", frames(14))
+    data = module(tmp_path / "clips" / "a", camera=None)
+    data.setup("fit")
+    assert data.datasets["train"].drives[0].name == "a"
+    (tmp_path / "clips" / "camera.yaml").unlink()
+    with pytest.raises(DataError, match=r"no camera\.yaml for .*: put one beside it or at .*clips.camera\.yaml"):
+        module(tmp_path / "clips" / "a").setup("fit")
+
+
 def test_a_folder_of_frames_trains(tmp_path):
     make_clip(tmp_path / "öffentlich unterwegs", "a clip", frames(14))
     data = module(tmp_path / "öffentlich unterwegs", crop=[0.1, 0.2, 0.0, 0.0])

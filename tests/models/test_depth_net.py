@@ -63,6 +63,20 @@ def test_size_error(size, valid):
         net(torch.zeros(1, 3, *size))
 
 
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("image", "said"),
+    [
+        (torch.zeros(3, 32, 32), r"torch.float32 of shape \(3, 32, 32\)"),
+        (torch.zeros(1, 3, 32, 32, dtype=torch.uint8), r"torch.uint8 of shape \(1, 3, 32, 32\)"),
+        (torch.zeros(1, 32, 32, 3), r"shape \(1, 32, 32, 3\)"),
+    ],
+)
+def test_what_is_no_batch_of_images_is_refused(image, said):
+    with pytest.raises(ConfigError, match=said):
+        _small()(image)
+
+
 @pytest.mark.parametrize("decoder", ["unet", "aunet"])
 def test_smallest_image(decoder):
     net = _small(decoder).eval()

@@ -63,6 +63,18 @@ def test_folder_and_checkpoint_are_the_same_model(
     assert all(torch.equal(value, state[f"pose.{name}"]) for name, value in pose.state_dict().items())
 
 
+def test_a_trainings_folder_stands_for_its_best_checkpoint(
+    record: ModelRecord, state: dict[str, torch.Tensor], tmp_path: Path
+) -> None:
+    kept = tmp_path / "run" / "checkpoints"
+    kept.mkdir(parents=True)
+    atomic_save({"state_dict": state, "saunet": record.to_plain()}, kept / "last.ckpt")
+    assert locate(tmp_path / "run") == kept / "last.ckpt"
+    shutil.copy(kept / "last.ckpt", kept / "best.ckpt")
+    assert locate(str(tmp_path / "run")) == kept / "best.ckpt"
+    assert saunet.load(tmp_path / "run").fingerprint == saunet.load(kept / "last.ckpt").fingerprint
+
+
 def test_folders_that_are_no_model(exported: Path, tmp_path: Path) -> None:
     (exported / "config.json").rename(exported / "x.json")
     with pytest.raises(CheckpointError, match=r"cannot read .*config\.json: No such file"):

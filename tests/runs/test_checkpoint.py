@@ -115,7 +115,7 @@ class TestUnreadable:
         one_sentence(error)
 
     def test_folder(self, saved: Path) -> None:
-        with pytest.raises(CheckpointError, match=r"is a folder; give the checkpoint file in it"):
+        with pytest.raises(CheckpointError, match=rf"is a folder; give the checkpoint file in it, such as {saved}"):
             read_checkpoint(saved.parent)
 
     @pytest.mark.parametrize("keep", [0, 1, 100, 0.5, 0.999])

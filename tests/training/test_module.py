@@ -35,6 +35,15 @@ def batch(walls: DepthDataModule) -> EvalBatch:
     return walls.on_after_batch_transfer(next(iter(walls.val_dataloader())), 0)  # type: ignore[return-value]
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_a_batch_as_the_loader_gives_it_is_not_trained_on(model: SelfSupervisedDepth, walls: DepthDataModule) -> None:
+    walls.setup("fit")
+    raw = next(iter(walls.train_dataloader()))
+    with pytest.raises(ConfigError, match=r"no target: .* data\.on_after_batch_transfer\(batch, 0\)"):
+        model.step(raw)
+    assert model.step(walls.on_after_batch_transfer(raw, 0))[-1].total.isfinite()
+
+
 def test_a_step_trains_every_parameter(model: SelfSupervisedDepth, batch: EvalBatch) -> None:
     _, _, views, terms = model.step(batch)
     terms.total.backward()

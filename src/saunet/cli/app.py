@@ -23,12 +23,13 @@ from typing import TYPE_CHECKING, NoReturn, Protocol, cast, runtime_checkable
 
 from saunet import __version__, plugins
 from saunet.cli.table import PLUGINS, TOOLS, Table, Tool, config_dir, imported, read
-from saunet.errors import ConfigError, SaunetError, suggest
+from saunet.errors import ELSEWHERE, ConfigError, SaunetError, suggest
 from saunet.threads import wait_briefly
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+    from saunet import schema
     from saunet.cli.compose import Composed
 
 
@@ -158,6 +159,9 @@ def _say(name: str, message: str, code: int) -> int:
 def _run(name: str, argv: Sequence[str]) -> int:
     from saunet.cli import help as help_
 
+    if {"-V", "--version"} & set(argv):
+        print(f"saunet {__version__}")
+        return 0
     if name.startswith("--"):
         print("\n".join((help_.complete if name == "--complete" else help_.completion)(argv[0] if argv else "")))
         return 0
@@ -345,6 +349,17 @@ class _Reader:
         first = re.split(r"[./@]", key)[0]
         return first == "hydra" or bool(self.table.known(self.tool.name, first)) or (self.conf / first).is_dir()
 
+    def _short(self, own: schema.Node) -> list[str]:
+        return [*self.tool.aliases, *(["size"] if own.key("data") and not own.key("size") else [])]
+
+    def _below(self, own: schema.Node) -> Iterator[str]:
+        """Yield the keys below those of the tool: of nested options, and of the components that it takes."""
+        for key in own.keys:
+            yield from (f"{key.name}.{each.name}" for each in (key.node.keys if key.node else ()))
+        for group, nodes in self.table.groups.items():
+            if own.key(group.replace("/", ".")):
+                yield from (f"{group.replace('/', '.')}.{key.name}" for node in nodes.values() for key in node.keys)
+
     def _positional(self, plain: Sequence[str], words: Sequence[str]) -> list[str]:
         if not plain:
             return []
@@ -362,7 +377,7 @@ class _Reader:
         if glob := _GLOB.fullmatch(value):
             return [f"{sign}{key}={','.join(self._matching(key, glob['pattern']))}"]
         if self.own and not sign and key != "size" and not self._is_key(key):
-            raise unknown(key, [each.name for each in own.keys])
+            raise unknown(key, [each.name for each in own.keys], [*self._short(own), *self._below(own)])
         size = re.fullmatch(r"(\d+)x(\d+)", value) if key == "size" and own.key("size") is None else None
         if size:  # of images, height x width
             return [f"data.height={size[1]}", f"data.width={size[2]}"]
@@ -439,6 +454,9 @@ def _parts(text: str) -> list[str]:
     return parts if text else []
 
 
-def unknown(key: str, known: Sequence[str]) -> ConfigError:
-    """Return the error for an unknown key, with the nearest one and all."""
-    return ConfigError(f"unknown key '{key}'{suggest(key, known) or ';'} allowed: {', '.join(known)}")
+def unknown(key: str, known: Sequence[str], further: Sequence[str] = ()) -> ConfigError:
+    """Return the error for an unknown key, with the nearest one and all; ``further`` are short and nested ones."""
+    names = (key, ELSEWHERE.get(key))
+    same = next((each for each in further if each.rpartition(".")[2] in names), None)
+    hint = f"; did you mean '{same}'?" if same else suggest(key, known)
+    return ConfigError(f"unknown key '{key}'{hint or ';'} allowed: {', '.join(known)}")

@@ -41,6 +41,7 @@ from saunet.cli.app import unknown
 from saunet.cli.table import PLUGINS, TOOLS, TRAINER, Table, Tool, config_dir, read
 from saunet.errors import ConfigError, one_of
 from saunet.registry import Spec
+from saunet.weights.locate import of_run
 
 T = TypeVar("T")
 PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "predictions", "resume", "root")
@@ -215,9 +216,9 @@ def options(cls: Callable[..., T], composed: Composed, table: Table) -> T:
             raise ConfigError(f"{key}= is empty, perhaps from a shell variable that is not set; name a path")
     for key, names in (("checkpoint", ("best", "last")), ("init_from", ("best", "last")), ("resume", ("last",))):
         if given.get(key):  # a run's folder stands for the checkpoint in it
-            folder = Path(str(given[key])).expanduser() / "checkpoints"
-            files = [folder / f"{name}.ckpt" for name in names]
-            given[key] = next((str(file) for file in files if file.is_file()), given[key])
+            folder = Path(str(given[key])).expanduser()
+            found = of_run(folder, names)
+            given[key] = given[key] if found == folder else str(found)
     return _build(cls, given, composed.choices, "")
 
 

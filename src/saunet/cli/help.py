@@ -65,9 +65,9 @@ def tool_help(tool: Tool, table: Table, given: Mapping[str, str]) -> str:
 
 def _with_folder(keys: Sequence[schema.Key], tool: Tool) -> list[schema.Key]:
     """Give the key of the folder for results the default that the tool's YAML file gives it."""
-    found = re.search(r"^    dir: (outputs/\S+)", _yaml(tool), re.MULTILINE)
+    found = re.search(r"^(?:    dir|output): (outputs/\S+)", _yaml(tool), re.MULTILINE)
     folder = found and found[1].replace("${name}", "NAME").partition("${now")[0] + "DATE_TIME"
-    return [replace(key, default=folder) if folder and key.name == "output_dir" else key for key in keys]
+    return [replace(key, default=folder) if folder and key.name in ("output", "output_dir") else key for key in keys]
 
 
 def _yaml(tool: Tool) -> str:

@@ -31,7 +31,7 @@ train: train a depth network on driving video
     train -m sweep=loss_ablation experiment=smoke
     resume outputs/train/2026-01-31_12-00-00
 predict input: depth of an image, a folder, a video or a camera, as pictures, points and videos
-    predict road.png output=out
+    predict road.png
     predict drive.mp4 checkpoint=last.ckpt output=out outputs=[mp4,html] camera=[90]
 app checkpoints*: a page in the browser: drop a picture or a video, see its depth
     app

@@ -68,8 +68,14 @@ class DepthNet(nn.Module):
             image: RGB in [0, 1].
 
         Raises:
-            ConfigError: if height or width is not a multiple of the encoder's stride.
+            ConfigError: if the image is not of this shape or not of floating point, or height or width is not a
+                multiple of the encoder's stride.
         """
+        if image.ndim != 4 or image.shape[1] != 3 or not image.dtype.is_floating_point:
+            raise ConfigError(
+                f"the image is {image.dtype} of shape {tuple(image.shape)}; a depth network takes floating-point RGB "
+                "in [0, 1] of shape batch x 3 x height x width; saunet.load(...).predict takes any picture"
+            )
         divisible(image.shape[-2], image.shape[-1], self.size_divisor)
         features = self.encoder(image.contiguous(memory_format=torch.channels_last))
         sigmoid = tuple(self.decoder(features))

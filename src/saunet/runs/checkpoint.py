@@ -204,7 +204,9 @@ def atomic_save(obj: Any, path: str | Path) -> None:
 
 def _load_plain(path: Path) -> Any:
     if path.is_dir():
-        raise CheckpointError(f"{path} is a folder; give the checkpoint file in it, such as {path / 'last.ckpt'}")
+        found = sorted(each for level in ("", "*/", "*/checkpoints/") for each in path.glob(f"{level}*.ckpt"))
+        such = f"such as {found[0]}" if found else "of which there is none"
+        raise CheckpointError(f"{path} is a folder; give the checkpoint file in it, {such}")
     if not path.exists():
         raise CheckpointError(f"no checkpoint at {path}; check the path")
     return read_torch(path, "a checkpoint")

@@ -141,7 +141,7 @@ class ModelRecord:
             if before != now:
                 raise CheckpointError(
                     f"the checkpoint was trained with {name} {before} and this run has {now}; "
-                    "a resumed run continues the same training, so give the same settings"
+                    "a resumed run continues the same training, so give the same settings, as `saunet resume RUN` does"
                 )
 
     def check_registered(self) -> None:

@@ -108,6 +108,11 @@ class SelfSupervisedDepth(LightningModule):
 
     def step(self, batch: TrainBatch) -> tuple[DepthPyramid, Float[Tensor, "b s 4 4"], Sequence[View], LossTerms]:
         """Predict depth and motion, synthesize the target from its neighbors, and compare."""
+        if "target" not in batch:
+            raise ConfigError(
+                f"the batch has {', '.join(batch)} and no target: it comes from the loader as bytes; "
+                "prepare it first: batch = data.on_after_batch_transfer(batch, 0)"
+            )
         pyramid: DepthPyramid = self.depth(batch["target"])  # Z_t
         poses = self.motion(batch)  # D_{t->t'}
         synthesize = functools.partial(self.synthesize, batch, pyramid, poses)  # H_{t'->t}, eq. (7)

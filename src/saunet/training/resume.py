@@ -39,6 +39,8 @@ def resume_path(resume: str | None, output_dir: str | Path, init_from: str | Non
             "resume= and init_from= are both set; resume= continues a training, init_from= starts a new one from "
             "its weights: leave one out"
         )
+    if resume in ("true", "True"):
+        raise ConfigError("resume is 'true'; set resume=auto for the run's own last.ckpt, or name a checkpoint")
     return str(Path(resume).expanduser().resolve()) if resume else None
 
 

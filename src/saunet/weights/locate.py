@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -30,11 +31,12 @@ def locate(source: str | Path) -> Path:
     """Return the local path of a model, fetched from the hub where ``source`` is a hub id.
 
     A text is the name of a shipped model such as ``street`` (``./street`` is a local folder of that name), a path, or a
-    hub id: ``hf://organization/name``, or short ``organization/name``, with ``@revision`` for a certain one.
+    hub id: ``hf://organization/name``, or short ``organization/name``, with ``@revision`` for a certain one. The folder
+    of a training stands for its ``best.ckpt``.
     """
     text, path = str(source), Path(source).expanduser()
     if isinstance(source, Path):
-        return path
+        return of_run(path)
     if text.startswith(HUB):
         if not _HUB_ID.fullmatch(text[len(HUB) :]):
             raise ConfigError(
@@ -48,7 +50,13 @@ def locate(source: str | Path) -> Path:
             f"no model '{DEFAULT}' comes with this installation of saunet; give checkpoint= a model of your own"
         )
     local = path.exists() or path.parent.is_dir() or path.suffix.lower() in _FILE_SUFFIXES
-    return path if local or not _HUB_ID.fullmatch(text) else _fetch(text)
+    return of_run(path) if local or not _HUB_ID.fullmatch(text) else _fetch(text)
+
+
+def of_run(path: Path, names: Sequence[str] = ("best", "last")) -> Path:
+    """Return the checkpoint that a training's folder stands for, the first there is; other paths as they are."""
+    files = (path / "checkpoints" / f"{name}.ckpt" for name in names)
+    return next((file for file in files if file.is_file()), path)
 
 
 def check_push(name: str) -> None:

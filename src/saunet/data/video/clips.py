@@ -270,13 +270,14 @@ def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
 
 def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraFile:
     folders = [path, *path.parents] if path.is_dir() else list(path.parents)
-    for folder in folders[: folders.index(base) + 1]:
+    highest = base.parent if path == base else base  # the root may be a clip itself, with the file beside it
+    for folder in folders[: folders.index(highest) + 1]:
         file = folder / FILE_NAME
         if file not in known and file.is_file():
             known[file] = read_camera(file)
         if file in known:
             return known[file]
     raise DataError(
-        f"no {FILE_NAME} for {path}: put one beside it or at {base / FILE_NAME}, or set data.camera; "
+        f"no {FILE_NAME} for {path}: put one beside it or at {highest / FILE_NAME}, or set data.camera; "
         "saunet calibrate makes one (see docs/your_camera.md)"
     )
