@@ -23,7 +23,7 @@ def model_card(
     source: str | None = None,
 ) -> str:
     """Return the card of an exported model as Markdown."""
-    scale = "Depth has no unit: training on one camera's video leaves one factor unknown."
+    scale = "Depth is relative: multiply it by one unknown factor to get meters."
     if record.scale:
         scale = f"Network depth x {record.scale.factor:g} is meters; the factor comes from {record.scale.source}."
     quality = "No evaluation was given when this was exported (`evaluation=` the folder of a saunet evaluate run)."

@@ -1,4 +1,4 @@
-"""Predictors that look at no image: a network that does not beat them has learnt nothing."""
+"""Predictors that look at no image: a network that does not beat them has not learned anything useful."""
 
 from __future__ import annotations
 

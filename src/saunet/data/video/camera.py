@@ -8,7 +8,7 @@ model: pinhole                         # or fisheye, omni ... (docs/cameras.md)
 fov: 100                               # degrees: width of the straight picture; by default as wide as it can be
 fps: 30                                # of the frames; a video file's own rate goes before it
 camera_height: 1.42                    # meters above the road, for metric depth
-condition: cloudy                      # free words, to choose and compare clips by
+condition: cloudy                      # a label; clips can be filtered and compared by it
 crop: [0, 0.12, 0, 0]                  # share to cut off at the top, bottom, left, right: sky, bonnet
 ```
 
