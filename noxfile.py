@@ -64,6 +64,21 @@ def old_runtime(session: nox.Session) -> None:
 
 
 @nox.session
+def first_hour(session: nox.Session) -> None:
+    """Run the tutorials' commands as printed, in an environment that has the wheel and its own dependencies only."""
+    install(session, "-e", ".[dev]")
+    folder = Path(session.create_tmp())
+    session.run("python", "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), ".")
+    session.run("python", "-m", "venv", "--clear", str(folder / "fresh"))
+    pip = (str(folder / "fresh" / "bin" / "pip"), "install", "-q", "-c", str(ROOT / "constraints.txt"))
+    pin = next(line for line in (ROOT / "constraints.txt").read_text().splitlines() if line.startswith("torch=="))
+    session.run(*pip, pin, external=True)
+    session.run(*pip, str(max(folder.glob("saunet-*.whl"), key=os.path.getmtime)), external=True)
+    fresh = {"SAUNET_FIRST_HOUR": str(folder / "fresh" / "bin" / "python"), "OMP_NUM_THREADS": "1"}
+    session.run("pytest", "-m", "not gpu", "tests/first_hour", *session.posargs, env=fresh)
+
+
+@nox.session
 def app(session: nox.Session) -> None:
     """Run the tests of ``saunet app``: Gradio wants older versions of some pinned packages, constraints-app.txt."""
     own = (ROOT / "constraints-app.txt").read_text().splitlines()

@@ -13,11 +13,10 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
+from pages import composed, inline, tools
 
 from saunet.cli.table import config_dir
 from saunet.registry import REGISTRIES
-
-from .pages import composed, inline, tools
 
 pytestmark = pytest.mark.usefixtures("hydra")
 

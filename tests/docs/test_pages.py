@@ -18,6 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from pages import PAGES, ROOT, blocks, commands, composed, lines, mistakes
 from processes import python
 
 import saunet
@@ -25,8 +26,6 @@ from saunet.cli import app, table
 from saunet.cli.compose import register_configs
 from saunet.cli.table import config_dir
 from saunet.registry import REGISTRIES
-
-from .pages import PAGES, ROOT, blocks, commands, composed, lines, mistakes
 
 NOT_CONFIGURED = {"components", "resume", "demo"}  # takes names, no configuration
 NOT_INSTALLED = ("hydra/launcher", "hydra/sweeper", "hydra.launcher", "hydra.sweeper")  # plugins of the sweep extra
