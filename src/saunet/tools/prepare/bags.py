@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from saunet.data.video.camera import FILE_NAME, read_camera, write_camera
@@ -270,9 +271,15 @@ def _picture(message: Any, name: str) -> tuple[bytes, str]:
             if data.startswith(magic):
                 return data, suffix
         raise DataError(f"{name} holds images of format '{message.format[:40]}'; JPEG and PNG can be read")
+    image = rgb_of(message, name)
+    return (b"", "") if image is None else (encode_jpeg(image, QUALITY), ".jpg")
+
+
+def rgb_of(message: Any, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Return the RGB picture of a raw image message of ROS 1 or 2; None of a depth map. ``name`` is the topic's."""
     encoding, height, width = message.encoding, int(message.height), int(message.width)
     if encoding in _NOT_COLOR:
-        return b"", ""
+        return None
     if encoding not in _ENCODINGS:
         raise DataError(f"{name} holds images of encoding '{encoding[:40]}'; allowed: {', '.join(_ENCODINGS)}")
     size, conversion = _ENCODINGS[encoding]
@@ -282,7 +289,7 @@ def _picture(message: Any, name: str) -> tuple[bytes, str]:
     rows = flat[: step * height].reshape(height, step)[:, : size * width]
     pixels = np.ascontiguousarray(rows.reshape(height, width, size) if size > 1 else rows)
     image: Any = pixels if conversion is None else cv2.cvtColor(pixels, conversion)
-    return encode_jpeg(image, QUALITY), ".jpg"
+    return image  # type: ignore[no-any-return]
 
 
 def _info_text(info: Any) -> str:
