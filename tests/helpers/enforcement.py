@@ -8,15 +8,18 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import importlib.machinery
 import inspect
 import types
 import typing
 from collections.abc import Callable
 from typing import Any
+from unittest import mock
 
 import jaxtyping
 from beartype import BeartypeConf, beartype
 from beartype.roar import BeartypeDecorHintException
+from jaxtyping import _import_hook as hook
 
 _with_shapes = jaxtyping.jaxtyped
 _plainly = beartype(conf=BeartypeConf(violation_type=jaxtyping.TypeCheckError))
@@ -25,6 +28,18 @@ _plainly = beartype(conf=BeartypeConf(violation_type=jaxtyping.TypeCheckError))
 def install() -> None:
     """Take the place of the decorator that jaxtyping's import hook puts on every function and class."""
     jaxtyping.jaxtyped = enforced  # type: ignore[assignment]
+    hook._JaxtypingLoader.get_code = _get_code  # type: ignore[method-assign]
+    hook._JaxtypingLoader.exec_module = importlib.machinery.SourceFileLoader.exec_module  # type: ignore[method-assign]
+
+
+def _get_code(loader: hook._JaxtypingLoader, name: str) -> types.CodeType | None:
+    """Name the hook's bytecode files apart while one is read, not while its module runs and imports other packages.
+
+    These would be looked for under the hook's name, and compiled anew: thousands of modules.
+    """
+    own = functools.partial(hook._optimized_cache_from_source, loader._typechecker.get_hash())
+    with mock.patch("importlib._bootstrap_external.cache_from_source", own):
+        return importlib.machinery.SourceFileLoader.get_code(loader, name)
 
 
 def enforced(target: Any = None, **typechecker: Callable[..., Any]) -> Any:
