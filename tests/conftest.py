@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import logging
 import os
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -37,6 +38,12 @@ for _name in [name for name in os.environ if name.startswith(("HYDRA_", "SLURM_"
     del os.environ[_name]
 for _name in ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
     os.environ.pop(_name, None)
+
+
+def pytest_collection_finish() -> None:
+    """Keep what imports have made out of the garbage collector: it goes through all there is each time it is called."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
