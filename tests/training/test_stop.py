@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import functools
 import os
 import signal
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +18,21 @@ from lightning.pytorch.loggers import CSVLogger
 from omegaconf import OmegaConf
 
 from saunet.cli.table import config_dir
+from saunet.data.loading.windows import Selection
 from saunet.runs.folder import Stopped
 from saunet.training.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
 from saunet.training.resume import keep_rows
 from saunet.training.stopping import GracefulStop
 
 BATCHES = 6  # an epoch's, of two epochs
+
+
+class FewWalls(tiny.TinyWalls):
+    """Two batches to validate on, not three."""
+
+    def select(self, split: str) -> Sequence[Selection]:
+        (*selections,) = super().select(split)
+        return [Selection(each.drive, range(1, 5)) for each in selections] if split == "val" else selections
 
 
 class Ask(Callback):
@@ -72,7 +83,7 @@ def train(
     )
     trainer.fit(
         tiny.tiny_model(tiny.RECIPE),
-        tiny.tiny_walls(batch_size=2),
+        FewWalls(height=32, width=48, batch_size=2, workers=0),
         ckpt_path=str(last) if resume else None,
         weights_only=True,
     )
@@ -94,11 +105,21 @@ def same(left: Path, right: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the uninterrupted training."""
-    folder = tmp_path_factory.mktemp("whole")
-    train(folder)
-    return folder
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Return the folder of the uninterrupted training with some settings, which is trained once."""
+
+    @functools.cache
+    def trained(**settings: Any) -> Path:
+        folder = tmp_path_factory.mktemp("whole")
+        train(folder, **settings)
+        return folder
+
+    return trained
+
+
+@pytest.fixture
+def whole(uninterrupted: Callable[..., Path]) -> Path:
+    return uninterrupted()
 
 
 @pytest.mark.parametrize(("asked", "after"), [(2, 2), (BATCHES, BATCHES)])
@@ -134,9 +155,10 @@ def test_asked_in_its_last_step_a_training_is_complete(whole: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize(("every", "after"), [(3, 4), (1, 4)])
-def test_a_validation_in_the_midst_of_an_epoch_is_made_before(every: int, after: int, tmp_path: Path) -> None:
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    train(whole, val_check_interval=every)
+def test_a_validation_in_the_midst_of_an_epoch_is_made_before(
+    every: int, after: int, uninterrupted: Callable[..., Path], tmp_path: Path
+) -> None:
+    whole, stopped = uninterrupted(val_check_interval=every), tmp_path / "stopped"
     with pytest.raises(Stopped, match=rf"after step {after}, everything is saved"):
         train(stopped, 3, val_check_interval=every)
     seen = rows(stopped)
@@ -153,10 +175,9 @@ def test_a_validation_in_the_midst_of_an_epoch_is_made_before(every: int, after:
     [(BATCHES, {}), (2 * BATCHES, {}), (3, {"val_check_interval": 3}), (BATCHES, {"val_check_interval": 3})],
 )
 def test_a_validation_that_a_kill_cut_short_is_made_up_for(
-    hook: str, step: int, settings: dict[str, Any], tmp_path: Path
+    hook: str, step: int, settings: dict[str, Any], uninterrupted: Callable[..., Path], tmp_path: Path
 ) -> None:
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    train(whole, every=1, **settings)
+    whole, killed = uninterrupted(every=1, **settings), tmp_path / "killed"
     with pytest.raises(KilledError):
         train(killed, None, False, Kill(step, hook), every=1, **settings)
     with pytest.raises(KilledError):  # and once more
@@ -176,10 +197,9 @@ def test_a_kill_after_a_warning_loses_no_validation_either(whole: Path, tmp_path
 
 @pytest.mark.parametrize("step", [1, BATCHES - 1, 2 * BATCHES - 1])
 def test_a_kill_between_saving_a_step_and_logging_it_loses_no_row(
-    step: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    step: int, uninterrupted: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    train(whole, every=1)
+    whole, killed = uninterrupted(every=1), tmp_path / "killed"
     log = CSVLogger.log_metrics
 
     def strike(self: CSVLogger, metrics: Any, **more: Any) -> None:
