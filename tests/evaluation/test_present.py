@@ -6,12 +6,16 @@ import csv
 import dataclasses
 import json
 import os
+import socket
 import subprocess
 import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import python
 from tiny_checkpoint import write_checkpoint
 
 from saunet import plugins
@@ -88,7 +92,32 @@ def rows(folder: Path) -> dict[str, dict[str, str]]:
         return {row["data set"]: row for row in csv.DictReader(file)}
 
 
-def test_one_table_of_all_that_is_present_exact_under_two_processes(place: Path, tmp_path: Path) -> None:
+def by_torchrun(overrides: list[str]) -> list[subprocess.CompletedProcess[str]]:
+    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "saunet", "evaluate"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    made = [sys.executable, *command, *overrides]
+    return [subprocess.run(made, capture_output=True, text=True, timeout=600, env=environment, check=False)]
+
+
+def by_hand(overrides: list[str]) -> list[subprocess.CompletedProcess[str]]:
+    """Start both processes as torchrun does, without the seconds that imports take."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        known = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(probe.getsockname()[1])}
+
+    def one(rank: int) -> subprocess.CompletedProcess[str]:
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", **known, "RANK": str(rank), "LOCAL_RANK": str(rank)}
+        return python("-m", "saunet", "evaluate", *overrides, env=environment, timeout=600)
+
+    python("-c", "")  # starts what both are forked from
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(one, range(2)))
+
+
+@pytest.mark.parametrize("start", [by_hand, pytest.param(by_torchrun, marks=pytest.mark.slow)])
+def test_one_table_of_all_that_is_present_exact_under_two_processes(
+    start: Callable[[list[str]], list[subprocess.CompletedProcess[str]]], place: Path, tmp_path: Path
+) -> None:
     overrides = [
         f"checkpoint={place / 'model.ckpt'}",
         "data=all_present",
@@ -101,12 +130,10 @@ def test_one_table_of_all_that_is_present_exact_under_two_processes(place: Path,
         "buckets=true",
         f"output_dir={tmp_path / 'two'}",
     ]
-    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "saunet", "evaluate"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    made = [sys.executable, *command, *overrides]
-    done = subprocess.run(made, capture_output=True, text=True, timeout=600, env=environment, check=False)
-    assert done.returncode == 0, done.stderr[:3000]
-    assert done.stdout.count("pictured_streets") == 1  # one process speaks
+    started = start(overrides)
+    for done in started:
+        assert done.returncode == 0, done.stderr[:3000]
+    assert sum(done.stdout.count("pictured_streets") for done in started) == 1  # one process speaks
 
     alone = dataclasses.replace(options(place), output_dir=str(tmp_path / "one"), buckets=True)
     result = run(alone)

@@ -21,7 +21,7 @@ def _node(kind: str, name: str) -> dict[str, Any]:
 
 def write_checkpoint(path: Path, height: int = 64, width: int = 96) -> None:
     record = ModelRecord(
-        encoder=_node("encoder", "lite_mono_tiny"),
+        encoder={**_node("encoder", "lite_mono_tiny"), "dims": [8, 16, 16], "depths": [2, 2, 2]},
         decoder=_node("decoder", "lite_mono"),
         pose=_node("pose", "posecnn"),
         min_depth=0.1,
