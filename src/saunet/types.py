@@ -28,6 +28,11 @@ class _Sample(TypedDict):
     """1 where the target shows the scene, 0 where it shows the vehicle that carries the camera."""
     T_src_tgt: NotRequired[Float[Tensor, "b s 4 4"]]
     """True motion, where the data set knows it: a target point times it is a source point, in meters."""
+    T_tracked: NotRequired[Float[Tensor, "b n 4 4"]]
+    """Motion to the neighbors in time as tracked points tell it: rotation, and a direction of length 1, or 0 where
+    there is none; NaN where unknown."""
+    track_points: NotRequired[Float[Tensor, "b n p 3"]]
+    """Column and row in the target of some of those points, and their depth in lengths of the way; NaN if none."""
     T_stereo_tgt: NotRequired[Float[Tensor, "b 4 4"]]
     """Where the stereo partner is, from the calibration: a target point times it is a partner's point, in meters.
     Where it is given, the partner's image is the last source."""
@@ -66,6 +71,8 @@ class TrainBatch(_Sample):
     """The target image without color jitter: what the loss compares."""
     loss_sources: Float[Tensor, "b s 3 h w"]
     """The source images without color jitter."""
+    T_predicted: NotRequired[Float[Tensor, "b n 4 4"]]
+    """The pose network's own answer, where ``T_tracked`` replaced it; the training step adds it."""
     source_depth: NotRequired[Float[Tensor, "b s 1 h w"]]
     """Predicted depth of the sources, with its graph; the training step adds it if `Objective.needs_source_depth`."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.losses.objectives import Monodepth2Objective, SaunetObjective
-from saunet.losses.terms import Consistency, Velocity
+from saunet.losses.terms import Consistency, TrackedMotion, Velocity
 from saunet.types import DepthPyramid
 
 Make = Callable[..., Any]
@@ -38,6 +39,23 @@ def test_velocity_has_a_gradient_of_zero_at_zero_motion() -> None:
     Velocity()(batch, EMPTY, pose_matrix(torch.zeros(1, 2, 3), translation), ()).value.backward()
     assert translation.grad is not None
     assert (translation.grad == 0).all()
+
+
+def test_tracked_motion_is_angle_and_way_where_they_are_known() -> None:
+    predicted = pose_matrix(
+        torch.tensor([[[0.0, 0.3, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 0.0]]]),
+        torch.tensor([[[0.0, 3.0, 2.0], [3.0, 0.0, 0.0], [1.0, 2.0, 3.0]]]),
+    ).requires_grad_()
+    tracked = pose_matrix(torch.zeros(1, 3, 3), torch.tensor([[[0.0, 3.0, 4.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]]))
+    tracked[:, 2] = torch.nan
+    batch: Any = {"T_predicted": predicted, "T_tracked": tracked}
+    value = TrackedMotion(angle=2.0)(batch, EMPTY, predicted, ()).value
+    chord = lambda angle: 2 * math.sin(angle / 2)
+    torch.testing.assert_close(value, torch.tensor(2 * (chord(0.3) + chord(0.1)) / 2 + 2 / 5))
+    value.backward()
+    assert predicted.grad is not None
+    assert predicted.grad.isfinite().all()
+    assert (predicted.grad[:, 2] == 0).all()
 
 
 @pytest.mark.parametrize(("scale", "expected"), [(1.0, 0.0), (1.5, 0.2), (0.5, 1 / 3)])
@@ -72,12 +90,13 @@ def test_objectives_say_whether_they_need_source_depth() -> None:
     ("term", "key", "message"),
     [
         (Velocity(), "distance", "the velocity term needs 'distance' in the batch, which the data does not give; set"),
+        (TrackedMotion(), "T_tracked", "the tracked_motion term needs 'T_tracked' in the batch.*track_motion"),
         (Consistency(), "source_depth", "the consistency term needs 'source_depth' in the batch"),
     ],
 )
 def test_missing_input_is_one_sentence(term: Any, key: str, message: str, make_inputs: Make) -> None:
     inputs = make_inputs()
-    del inputs.batch[key]
+    inputs.batch.pop(key, None)
     with pytest.raises(ConfigError, match=message) as raised:
         term(*inputs)
     assert "\n" not in str(raised.value)

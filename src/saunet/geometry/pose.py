@@ -9,6 +9,8 @@ from torch import Tensor
 from saunet.geometry import full_precision
 
 _SMALL_ANGLE_SQUARED = 1e-2
+_FAR_OFF = 1.0
+"""Logarithm of a ratio of depths from which on a point does not count."""
 
 
 @full_precision
@@ -78,6 +80,44 @@ def invert_pose(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     """
     rotation, translation = T[..., :3, :3], T[..., :3, 3]
     return _assemble(rotation.transpose(-1, -2), -(rotation * translation[..., :, None]).sum(-2))
+
+
+@full_precision
+def scaled_motion(
+    T: Float[Tensor, "b s 4 4"], points: Float[Tensor, "b s n 3"], depth: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b s 4 4"]:
+    """Make translations of length 1 so long that points move as a depth map says.
+
+    The length is the one whose parallax, length / depth, fits that of the points, 1 / z, best: near points count most,
+    as they do in images. Points whose ratio is far from the median do not count (Tukey's weights). The length is
+    differentiable in depth, so that a depth map times a factor explains images as well as before: a motion without
+    gradient would let depth chase it, ever smaller.
+
+    Args:
+        T: Motions T_src_tgt, NaN where unknown.
+        points: Pixel column and row in the target, and depth in lengths of the translation; NaN where there is none.
+        depth: Depth of the target, which gives the unit.
+
+    Returns:
+        Motions in the unit of ``depth``; NaN where T is, and where no point with a depth lies in the picture.
+    """
+    height, width = depth.shape[-2:]
+    column, row, z = points.unbind(-1)
+    inside = (column > -0.5) & (column < width - 0.5) & (row > -0.5) & (row < height - 0.5)  # false for NaN
+    place = torch.where(inside, row.round() * width + column.round(), 0).long()
+    found = depth.flatten(1)[:, None].expand(-1, points.shape[1], -1).gather(-1, place)
+    z = torch.where(inside, z, 1.0)
+    ratio = torch.where(inside, (found / z).log(), torch.nan).detach()
+    off = (ratio - ratio.nanmedian(-1, keepdim=True).values) / _FAR_OFF
+    weight = (1 - off.square()).clamp(min=0).square().where(inside, 0.0)
+    parallax = (weight / found**2).sum(-1)
+    told = parallax > 0
+    length = (weight / (found * z)).sum(-1) / parallax.where(told, 1.0)
+    still, known = (T[..., :3, 3] == 0).all(-1), T.isfinite().flatten(-2).all(-1)
+    # Nothing that is no number may be multiplied by: a gradient of 0 would become one of NaN.
+    T = torch.where(known[..., None, None], T, 0.0)
+    scaled = _assemble(T[..., :3, :3], T[..., :3, 3] * length.where(told & ~still, 0.0)[..., None])
+    return torch.where((known & (told | still))[..., None, None], scaled, torch.nan)
 
 
 def _assemble(rotation: Tensor, translation: Tensor) -> Tensor:

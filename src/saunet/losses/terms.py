@@ -290,3 +290,34 @@ class Velocity(Term):
         distance = distance[:, :predictions]
         known = distance.isfinite()
         return TermResult(value=masked_mean((predicted - distance.where(known, 0.0)).abs(), known))
+
+
+@terms.register("tracked_motion")
+class TrackedMotion(Term):
+    """How far the pose network's motion is from that of tracked points.
+
+    With ``data.track_motion`` the points' motion takes the place of the predicted one, so nothing else teaches the
+    network. Per motion: the angle between the rotations in radians times ``angle``, plus the distance between the
+    translations in lengths of the tracked one, where there is one.
+
+    Args:
+        angle: Weight of one radian.
+    """
+
+    def __init__(self, angle: float = 10.0) -> None:
+        super().__init__()
+        self.angle = positive("angle", angle)
+
+    def forward(
+        self, batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"], views: Sequence[View]
+    ) -> TermResult:
+        fix = "set data.track_motion=true, or drop the term"
+        tracked = require(batch, "T_tracked", "the tracked_motion term", fix)
+        predicted = require(batch, "T_predicted", "the tracked_motion term", fix)
+        known = tracked.isfinite().flatten(2).all(-1)
+        off = predicted - tracked.where(known[..., None, None], 0.0)
+        turn = torch.linalg.vector_norm(off[..., :3, :3].flatten(2), dim=-1) / 2**0.5
+        length = torch.linalg.vector_norm(tracked[..., :3, 3], dim=-1)
+        moves = known & (length > 0)
+        way = torch.linalg.vector_norm(off[..., :3, 3], dim=-1) / length.where(moves, 1.0)
+        return TermResult(value=self.angle * masked_mean(turn, known) + masked_mean(way, moves))

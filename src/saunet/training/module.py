@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from saunet.errors import ConfigError
 from saunet.geometry import warp
 from saunet.geometry.depth import disparity_to_depth, enlarge
+from saunet.geometry.pose import scaled_motion
 from saunet.losses.base import Objective
 from saunet.metrics.depth import DepthMetrics
 from saunet.runs.folder import RunRecord
@@ -115,6 +116,8 @@ class SelfSupervisedDepth(LightningModule):
             )
         pyramid: DepthPyramid = self.depth(batch["target"])  # Z_t
         poses = self.motion(batch)  # D_{t->t'}
+        if "T_tracked" in batch:
+            batch, poses = self._tracked(batch, pyramid, poses)
         synthesize = functools.partial(self.synthesize, batch, pyramid, poses)  # H_{t'->t}, eq. (7)
         views = synthesize() if self.speed.compile else Views(len(pyramid.disparity), synthesize)
         if self.objective.needs_source_depth:
@@ -137,6 +140,15 @@ class SelfSupervisedDepth(LightningModule):
             )
         predicted: Tensor = self.pose(batch["target"], sources[:, : sources.shape[1] - len(known)])
         return torch.cat([predicted, *known], 1) if known else predicted
+
+    @staticmethod
+    def _tracked(batch: TrainBatch, pyramid: DepthPyramid, poses: Tensor) -> tuple[TrainBatch, Tensor]:
+        """Put the motion of tracked points, with the length that depth gives it, in the place of the predicted one."""
+        tracked = scaled_motion(batch["T_tracked"], batch["track_points"], pyramid.depth[0])
+        own, rest = poses[:, : tracked.shape[1]], poses[:, tracked.shape[1] :]
+        known = tracked.isfinite().flatten(-2).all(-1)[..., None, None]
+        used = torch.where(known, tracked, own)
+        return {**batch, "T_tracked": tracked.detach(), "T_predicted": own}, torch.cat([used, rest], 1)
 
     @staticmethod
     def synthesize(batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"]) -> tuple[View, ...]:

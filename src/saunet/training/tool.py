@@ -292,6 +292,11 @@ def assemble(options: TrainOptions, data: DepthDataModule, pretrained: bool = Tr
     """
     pose = _pose(options.model.pose, data)
     objective = options.objective.build()
+    if data.track_motion and pose is not None and "tracked_motion" not in getattr(objective, "terms", {}):
+        raise ConfigError(
+            "data.track_motion is true, so the pose network learns from tracked points alone, and the objective has no "
+            "such term; add +objective.extra.tracked_motion.weight=1"
+        )
     measured = ["val/loss", *(f"val/{name}" for name in (*ERROR_NAMES, *getattr(objective, "terms", {}))), "train/loss"]
     one_of("monitor", options.monitor, measured)
     for name, node in (options.callbacks or {}).items():

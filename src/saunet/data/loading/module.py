@@ -100,6 +100,7 @@ class DepthDataModule(LightningDataModule):
         self.offsets, self.seed = tuple(options.offsets), options.seed
         self.batch_size, self.workers = options.batch_size, options.workers
         self.crop_margin, self.on_error = options.crop_margin, options.on_error
+        self.track_motion = options.track_motion
         self.target_depth, self.with_pose, self.stereo = target_depth, with_pose, stereo
         self.manifest = read_manifest(options.manifest) if options.manifest else None
         self.flip_prob, self.color_jitter_prob = options.flip_prob, options.color_jitter_prob
@@ -204,6 +205,7 @@ class DepthDataModule(LightningDataModule):
             with_depth=split in ("val", "test"),
             with_target_depth=self.target_depth and together and "target_depth" not in self.maps,
             with_pose=self.with_pose and together,
+            track_motion=self.track_motion and together,
             stereo=stereo,
             odometer=self.odometer if together else None,
             maps=self.maps if together else {},

@@ -25,6 +25,8 @@ class LoadOptions:
         crop_margin: Training frames are loaded this much larger (0.1 = 10 %) and a random window is cut; K follows.
         flip_prob: Probability of mirroring in training.
         color_jitter_prob: Probability of color jitter in training.
+        track_motion: Take the camera's motion from tracked points instead of the pose network, which then learns it
+            through ``objective.extra.tracked_motion``; see `saunet.geometry.tracks.tracked_motion`.
         seed: Decides order, augmentation, and what is held out at random.
         manifest: File of frames to leave out of training and validation, as the doctor writes it.
         on_error: A file that cannot be read: ``raise`` stops and names it; ``skip`` names and counts it and carries
@@ -42,6 +44,7 @@ class LoadOptions:
     crop_margin: float = 0.05
     flip_prob: float = 0.5
     color_jitter_prob: float = 0.5
+    track_motion: bool = False
     seed: int = 0
     manifest: str | None = None
     on_error: Literal["raise", "skip"] = "raise"
@@ -68,6 +71,7 @@ class Loading(TypedDict, total=False):
     crop_margin: float
     flip_prob: float
     color_jitter_prob: float
+    track_motion: bool
     seed: int
     manifest: str | None
     on_error: Literal["raise", "skip"]

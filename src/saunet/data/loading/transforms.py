@@ -107,6 +107,11 @@ class Augment(nn.Module):
                 out[key] = flip_some(depth, mirrored)[:, 0]
         if "T_src_tgt" in batch:
             out["T_src_tgt"] = flip_motion(batch["T_src_tgt"], mirrored)
+        if "T_tracked" in batch:
+            out["T_tracked"] = flip_motion(batch["T_tracked"], mirrored)
+            points = batch["track_points"] - torch.stack([left, top, torch.zeros_like(top)], -1)[:, None, None]
+            mirror = points.new_tensor([self.width - 1, 0, 0]) + points * points.new_tensor([-1, 1, 1])
+            out["track_points"] = torch.where(mirrored[:, None, None, None], mirror, points)
         if "T_stereo_tgt" in batch:  # the partner of a mirrored image is on the other side
             out["T_stereo_tgt"] = flip_motion(batch["T_stereo_tgt"][:, None], mirrored)[:, 0]
         if "distance" in batch:
@@ -131,7 +136,9 @@ class Prepare(nn.Module):
         for target in TARGETS:
             if target in batch:
                 out[target] = batch[target][window].contiguous()
-        for key in ("T_src_tgt", "T_stereo_tgt", "distance", "depth", "depth_size"):
+        if "track_points" in batch:
+            out["track_points"] = batch["track_points"] - batch["K"].new_tensor([left, top, 0])
+        for key in ("T_src_tgt", "T_tracked", "T_stereo_tgt", "distance", "depth", "depth_size"):
             if key in batch:
                 out[key] = batch[key]
         return out  # type: ignore[return-value]

@@ -27,6 +27,7 @@ from saunet.data.loading.stored import DepthMaps
 from saunet.errors import DataError
 from saunet.fingerprint import fingerprint
 from saunet.geometry.camera import scale_intrinsics
+from saunet.geometry.tracks import tracked_motion
 from saunet.io.images import resize
 from saunet.types import FrameBatch
 
@@ -35,6 +36,10 @@ Odometer = Callable[[Drive, int, int], float]
 """Gives the meters traveled between two frames of a drive, NaN where unknown."""
 _SAME_K = 0.5  # pixels by which the intrinsics of two cameras may differ and still be taken for one
 _PATIENCE = 100  # samples in a row that may be broken before it is the data set that is, not a file
+
+
+POINTS = 128
+"""Tracked points of a window that come with a sample, at most."""
 
 
 class Selection(NamedTuple):
@@ -123,6 +128,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         with_depth: bool = False,
         with_target_depth: bool = False,
         with_pose: bool = False,
+        track_motion: bool = False,
         stereo: bool = False,
         odometer: Odometer | None = None,
         maps: Mapping[str, DepthMaps] = MappingProxyType({}),
@@ -132,6 +138,8 @@ class WindowDataset(Dataset[dict[str, Any]]):
         self.size = (height + margin[0], width + margin[1])
         self.with_depth, self.with_target_depth, self.with_pose = with_depth, with_target_depth, with_pose
         self.stereo, self.odometer, self.maps = stereo, odometer, dict(maps)
+        self.track_motion = track_motion
+        self._tracked: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
         self.with_mask = any(drive.has_scene_mask for drive in drives)
 
     def __len__(self) -> int:
@@ -193,6 +201,11 @@ class WindowDataset(Dataset[dict[str, Any]]):
             motion = self._motion(drive, frame)
             motion = np.concatenate([motion, T_stereo_tgt[None]]) if self.stereo else motion
             sample["T_src_tgt"] = torch.from_numpy(motion).float()
+        if self.track_motion:
+            if index not in self._tracked:
+                near = frames.transpose(0, 2, 3, 1)[: 1 + len(self.offsets)]
+                self._tracked[index] = tracked_motions(near, sample["K"].double().numpy())
+            sample["T_tracked"], sample["track_points"] = self._tracked[index]
         if self.odometer is not None:
             ways = [self.odometer(drive, frame, frame + offset) for offset in self.offsets]
             sample["distance"] = torch.tensor([*ways, *[math.nan] * self.stereo], dtype=torch.float32)
@@ -208,6 +221,25 @@ class WindowDataset(Dataset[dict[str, Any]]):
         if T_world_tgt is None or len(known) < len(T_world_src):
             raise DataError(f"'{drive.name}' has no pose at frame {frame} or its neighbors; load it without poses")
         return np.array([np.linalg.inv(pose) @ T_world_tgt for pose in known]).reshape(-1, 4, 4)
+
+
+def tracked_motions(frames: NDArray[np.uint8], K: NDArray[np.float64]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return `tracked_motion` from the first frame (n h w 3) to each other one, and some of its points.
+
+    Returns:
+        T_src_tgt (n-1 4 4), and column, row and depth of `POINTS` points (n-1 points 3); NaN where unknown.
+    """
+    target, *sources = np.ascontiguousarray(frames)
+    motions = np.full((len(sources), 4, 4), math.nan, np.float32)
+    points = np.full((len(sources), POINTS, 3), math.nan, np.float32)
+    for place, source in enumerate(sources):
+        found = tracked_motion(target, source, K)
+        if found is not None:
+            motions[place] = found.T_src_tgt
+            count = min(len(found.points), POINTS)
+            chosen = np.linspace(0, len(found.points) - 1, count).round().astype(int)
+            points[place, :count] = np.c_[found.points, found.depth][chosen]
+    return torch.from_numpy(motions), torch.from_numpy(points)
 
 
 class SkippingWindows(WindowDataset):
