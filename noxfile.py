@@ -48,7 +48,7 @@ def tests(session: nox.Session) -> None:
 @nox.session
 def slow(session: nox.Session) -> None:
     """Run the tests marked slow, those of the extra sweep's launchers and those in a browser among them."""
-    install(session, "-e", ".[dev,sweep,browser]")
+    install(session, "-e", ".[dev,sweep,browser,dask]")
     session.run("pytest", "-m", "slow and not gpu", *session.posargs)
 
 

@@ -56,6 +56,9 @@ def test_each_job_runs_and_leaves_only_its_results(command, tree, tmp_path):
         (["densify"], "root is not set; add root=..."),
         (["cache", "data=synthetic", "folder=c"], "SyntheticDataModule reads no copies made by saunet prepare; use"),
         (["densify", "root=raw", "kinds=liner"], "kinds is 'liner'; did you mean 'linear'?"),
+        (["densify", "root=raw", "executor=dask"], "executor=dask and scheduler="),
+        (["cache", "root=raw", "folder=c", "scheduler=tcp://10.0.0.1:8786"], "go together"),
+        (["densify", "root=raw", "executor=dask", "scheduler=tcp://10.0.0.1:8786", "workers=2"], "workers counts"),
         (["densify", "root=raw", "workers=-1", "folder=maps"], "workers is -1; it must be at least 0"),
     ],
 )

@@ -12,6 +12,7 @@ from saunet.data.loading.stored import DepthMaps
 from saunet.errors import ConfigError, DataError
 from saunet.io.atomic import partial_name
 from saunet.io.images import read_depth
+from saunet.tools.prepare.pool import Workers
 from saunet.tools.prepare.targets import densify, densify_map, interpolate
 from saunet.tools.prepare.tool import kitti_recordings
 
@@ -111,7 +112,7 @@ def test_processes_make_the_same_files(tree, tmp_path):
     torch.set_num_threads(1)  # as in the processes: sums of several threads are rounded in another order
     try:
         for folder, workers in (("one", 0), ("two", 2)):
-            densify(recordings, ["colorization"], str(tmp_path / folder), workers)
+            densify(recordings, ["colorization"], str(tmp_path / folder), Workers(workers))
     finally:
         torch.set_num_threads(threads)
     files = [sorted((tmp_path / folder).rglob("*.png")) for folder in ("one", "two")]

@@ -23,7 +23,7 @@ from saunet.data.loading.stored import FRAMES, SETTINGS, CacheSettings, ImageCac
 from saunet.errors import DataError
 from saunet.io.atomic import remove_partial_files, write_bytes, write_json
 from saunet.io.images import resize
-from saunet.tools.prepare.pool import OnError, Work
+from saunet.tools.prepare.pool import HERE, OnError, Work, Workers
 
 Entry = tuple[int, str, tuple[int, int], list[int] | None]
 """Bytes and SHA-256 of a copy; (height, width) of its original, and the `_state` of the original's file."""
@@ -97,7 +97,7 @@ def build_cache(
     recordings: Sequence[tuple[Drive, Sequence[int]]],
     folder: str | Path,
     settings: CacheSettings,
-    workers: int = 0,
+    workers: Workers = HERE,
     on_error: OnError = "raise",
 ) -> CacheReport:
     """Make, complete or check a cache of some frames of each recording; the recordings are only read."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,7 +24,7 @@ from saunet.io.colormaps import depth_to_png16
 from saunet.io.images import read_depth, resize, write_image
 from saunet.io.plain import read_array
 from saunet.tools.prepare.colorization import colorize
-from saunet.tools.prepare.pool import Done, OnError, Work
+from saunet.tools.prepare.pool import HERE, Done, OnError, Work, Workers
 
 Recording = tuple[KittiDrive, list[int]]
 """A recording and the frames of it that are wanted."""
@@ -76,7 +77,7 @@ def densify(
     recordings: Sequence[Recording],
     kinds: Sequence[DenseKind] = ("linear",),
     folder: str | None = None,
-    workers: int = 0,
+    workers: Workers = HERE,
     on_error: OnError = "raise",
 ) -> Done:
     """Write the dense maps of recordings (``folder`` None: beside each); what is there already is left alone."""
@@ -182,13 +183,39 @@ def _read_numbers(path: Path) -> Float32[ndarray, "_ _"]:
     return np.asarray(array, dtype=np.float32)
 
 
+@dataclass(frozen=True, slots=True)
+class _Teach:
+    """Writes the teacher's depth of one frame; the first of a recording decides the factor of all."""
+
+    drives: tuple[KittiDrive, ...]
+    source: ModelTeacher | FileTeacher
+    maps: DepthMaps
+    factors: dict[int, float] = field(default_factory=dict)
+
+    def __call__(self, item: tuple[int, int]) -> None:
+        drive, frame = self.drives[item[0]], item[1]
+        depth = self.source.depth(drive, frame)
+        known = depth[depth > 0]
+        if known.size == 0:
+            raise DataError(f"the teacher knows no depth in {drive.path(frame)}")
+        if item[0] not in self.factors:
+            # Relative depth may be of any magnitude; a power of two brings it to where 16 bits resolve it.
+            scale = 2.0 ** round(math.log2(_TYPICAL / float(np.median(known))))
+            self.factors[item[0]] = self.maps.claim(drive, self.source.made_from(), scale)
+        write_image(self.maps.path(drive, frame), depth_to_png16(depth * np.float32(self.factors[item[0]])))
+
+
 def teach(
     recordings: Sequence[Recording],
     source: ModelTeacher | FileTeacher,
     folder: str | None = None,
+    workers: Workers = HERE,
     on_error: OnError = "raise",
 ) -> Done:
-    """Write a teacher's depth for recordings (``folder`` None: beside each); what is there already is left alone."""
+    """Write a teacher's depth for recordings (``folder`` None: beside each); what is there already is left alone.
+
+    One worker does all of a recording.
+    """
     maps = DepthMaps("teacher", folder)
     items, before = [], 0
     for position, (drive, frames) in enumerate(recordings):
@@ -198,19 +225,7 @@ def teach(
         there = maps.frames(drive)
         before += len(there.intersection(frames))
         items += [(position, frame) for frame in frames if frame not in there]
-    factors: dict[int, float] = {}
-
-    def write(item: tuple[int, int]) -> None:
-        drive, frame = recordings[item[0]][0], item[1]
-        depth = source.depth(drive, frame)
-        known = depth[depth > 0]
-        if known.size == 0:
-            raise DataError(f"the teacher knows no depth in {drive.path(frame)}")
-        if item[0] not in factors:
-            # Relative depth may be of any magnitude; a power of two brings it to where 16 bits resolve it.
-            scale = 2.0 ** round(math.log2(_TYPICAL / float(np.median(known))))
-            factors[item[0]] = maps.claim(drive, source.made_from(), scale)
-        write_image(maps.path(drive, frame), depth_to_png16(depth * np.float32(factors[item[0]])))
-
-    work: Work[tuple[int, int], None] = Work(write, 0, on_error)
-    return Done(sum(1 for _ in work.run(items, "teacher")), before, None, tuple(work.failures))
+    teacher = _Teach(tuple(drive for drive, _ in recordings), source, maps)
+    work: Work[tuple[int, int], None] = Work(teacher, workers, on_error)
+    done = sum(1 for _ in work.run(items, "teacher", together=itemgetter(0)))
+    return Done(done, before, None, tuple(work.failures))

@@ -21,16 +21,17 @@ from saunet.threads import available_cores
 from saunet.tools.prepare.bags import ImportReport, import_bags
 from saunet.tools.prepare.cache import CacheReport, build_cache
 from saunet.tools.prepare.pack import PackReport, pack
-from saunet.tools.prepare.pool import Done, OnError
+from saunet.tools.prepare.pool import Done, OnError, Workers
 from saunet.tools.prepare.targets import DenseKind, FileTeacher, ModelTeacher, Recording, Values, densify, teach
 
 Job = Literal["densify", "teacher", "cache", "import", "pack"]
 _KITTI = ("root", "cameras", "drives", "split")
+_WORKERS = ("workers", "executor", "scheduler")
 _SHARED = ("job", *_KITTI, "folder", "on_error")
 KEYS: dict[str, tuple[str, ...]] = {
-    "densify": (*_SHARED, "kinds", "depth", "workers"),
-    "teacher": (*_SHARED, "checkpoint", "foreign", "input", "values", "device"),
-    "cache": (*_SHARED, "data", "height", "width", "format", "quality", "workers"),
+    "densify": (*_SHARED, "kinds", "depth", *_WORKERS),
+    "teacher": (*_SHARED, "checkpoint", "foreign", "input", "values", "device", "executor", "scheduler"),
+    "cache": (*_SHARED, "data", "height", "width", "format", "quality", *_WORKERS),
     "import": ("job", "folder", "on_error", "input", "topics", "camera"),
     "pack": ("job", "folder", "data", "shard_mb", "workers"),
 }
@@ -97,6 +98,10 @@ class PrepareOptions:
     """``pack``: most megabytes a file."""
     workers: int | None = None
     """Processes; 0 works in this one, None takes one per core."""
+    executor: Literal["processes", "dask"] = "processes"
+    """Who works: ``processes`` of this machine, or the workers of a ``dask`` cluster, which see the same folders."""
+    scheduler: str | None = None
+    """``executor=dask``: address of the cluster's scheduler, such as ``tcp://10.0.0.1:8786``."""
     on_error: OnError = "raise"
     """For a broken file: ``raise`` stops and names it, ``skip`` continues without the frame."""
 
@@ -112,6 +117,11 @@ class PrepareOptions:
             if self.data is not None and key in _KITTI:
                 raise ConfigError(f"{key} is for KITTI raw trees; with data=..., set data.{key} or leave it out")
         one_of("on_error", self.on_error, get_args(OnError))
+        one_of("executor", self.executor, ("processes", "dask"))
+        if (self.executor == "dask") != (self.scheduler is not None):
+            raise ConfigError("executor=dask and scheduler=... (such as tcp://10.0.0.1:8786) go together; set both")
+        if self.executor == "dask" and self.workers is not None:
+            raise ConfigError("workers counts processes of this machine; with executor=dask, leave it out")
         if self.job == "import":
             if self.input is None or self.folder is None:
                 raise ConfigError("import needs input=... (a bag, or a folder of bags) and folder=... (for the clips)")
@@ -161,10 +171,11 @@ def prepare(options: PrepareOptions) -> Done | CacheReport | ImportReport | Pack
     """
     if options.job == "import":
         return import_bags(str(options.input), str(options.folder), options.topics, options.camera, options.on_error)
-    workers = available_cores() if options.workers is None else options.workers
+    count = available_cores() if options.workers is None else options.workers
+    workers = Workers(count, options.scheduler)
     if options.job == "pack":
         assert options.data is not None
-        return pack(options.data.build(), str(options.folder), options.shard_mb, workers)
+        return pack(options.data.build(), str(options.folder), options.shard_mb, count)
     if options.data is not None:
         skips = options.on_error == "skip" and "on_error" in options.data.parameters
         changes = {"on_error": "skip"} if skips else {}
@@ -175,7 +186,7 @@ def prepare(options: PrepareOptions) -> Done | CacheReport | ImportReport | Pack
         if options.job == "densify":
             return densify(kitti, options.kinds, options.folder, workers, options.on_error)
         if options.job == "teacher":
-            return teach(kitti, _teacher(options), options.folder, options.on_error)
+            return teach(kitti, _teacher(options), options.folder, Workers(0, options.scheduler), options.on_error)
         recordings = list(kitti)
     settings = CacheSettings(options.height, options.width, options.format, options.quality)
     return build_cache(recordings, Path(str(options.folder)), settings, workers, options.on_error)
