@@ -89,14 +89,16 @@ def _source(tool: str, table: Table) -> type[FileConfigSource]:
 
     class Source(FileConfigSource):
         def load_config(self, config_path: str) -> ConfigResult:
-            found = super().load_config(config_path)
-            loader = get_yaml_loader()(Path(self.path, self._normalize_file_name(config_path)).read_text("utf-8"))
+            text = Path(self.path, self._normalize_file_name(config_path)).read_text("utf-8")
+            header = self._get_header_dict(text)
+            loader = get_yaml_loader()(text)
             root = loader.get_single_node()
+            config = OmegaConf.create()
             if root is not None:
-                package = found.header.get("package") or config_path.rpartition("/")[0].replace("/", ".")
+                package = header.get("package") or config_path.rpartition("/")[0].replace("/", ".")
                 keep_text(root, "" if package == "_global_" else package)
-                found.config = OmegaConf.create(loader.construct_document(root))
-            return found
+                config = OmegaConf.create(loader.construct_document(root))
+            return ConfigResult(self.provider, f"{self.scheme()}://{self.path}", config, header)
 
     return Source
 
