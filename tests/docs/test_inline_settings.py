@@ -91,7 +91,8 @@ def test_every_setting_in_the_text_is_one_of_a_tool_that_the_page_names() -> Non
     wrong = []
     for page, code in SETTINGS:
         command = code.split(" ")[1] if code.startswith("saunet ") else code.partition(" ")[0]
-        named = [command] if command in CONFIGURED else [*(tool for tool in tools(page) if tool in CONFIGURED), "train"]
+        others = (tool for tool in tools(page) if tool in CONFIGURED)
+        named = [command] if command in CONFIGURED else list(dict.fromkeys(["train", *others]))
         for overrides in _alternatives(code):
             alone = ((tool, None) for tool in named)
             with_data = ((tool, data) for tool in named if tool in WITH_DATA for data in REGISTRIES["data"].names())
