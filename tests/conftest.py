@@ -91,7 +91,10 @@ def logging_as_it_was() -> Iterator[None]:
     finally:
         for logger in _loggers():
             # One that an import has just made keeps its level, and speaks through its parents.
-            handlers, level, propagate, disabled = before.get(logger, ([], logger.level, True, False))
+            was = before.get(logger, ([], logger.level, True, False))
+            if was == (logger.handlers, logger.level, logger.propagate, logger.disabled):
+                continue  # as after most tests
+            handlers, level, propagate, disabled = was
             for handler in set(logger.handlers) - set(handlers):
                 logger.removeHandler(handler)
                 handler.close()
