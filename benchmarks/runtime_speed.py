@@ -92,7 +92,9 @@ def main() -> None:
             own, each = np.median(times[:, index]), times[:, index] / base
             change = depth_change(ways["torch"], run, image)
             ratio = f"{own / np.median(base):.3f} ({each.min():.3f} to {each.max():.3f})"
-            print(f"{model:24} {width}x{height} {name:14} {1000 * own:7.1f} ms, ratio {ratio}, Abs Rel {change:.1e}")
+            print(
+                f"{model:24} {width}x{height} {name:14} {1000 * own:7.1f} ms, ratio {ratio}, depth changes by {change}"
+            )
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,8 +27,25 @@ from saunet.prediction.predictor import Predictor
 from saunet.prediction.tool import RUNTIMES
 from saunet.weights.files import read_model
 
-LIMITS = {"f32": 1e-4, "bf16": 2e-3}
-"""Largest Abs Rel change of depth against torch, by precision, with which a runtime is used."""
+
+class Change(NamedTuple):
+    """How depth changes relative to torch's."""
+
+    mean: float
+    """Over an image: Abs Rel."""
+    largest: float
+    """At any pixel."""
+
+    def within(self, limit: Change) -> bool:
+        """Return whether neither is larger; NaN is."""
+        return self.mean <= limit.mean and self.largest <= limit.largest
+
+    def __str__(self) -> str:
+        return f"{self.mean:.1g} (Abs Rel), at most {self.largest:.1g} at a pixel"
+
+
+LIMITS = {"f32": Change(1e-4, 1e-2), "bf16": Change(2e-3, 0.1)}
+"""Largest change, by precision, with which a runtime is used."""
 WORTH_FRAMES = 200
 """Frames that are worth a conversion, which takes as long as about so many frames."""
 _PACKAGES = {"openvino": ("openvino",), "onnx": ("onnxruntime", "onnx", "onnxscript")}
@@ -40,10 +58,10 @@ class ConvertedPredictor(Predictor):
     Args:
         predictor: The original.
         run: The converted network: one image to its disparity.
-        limit: Largest Abs Rel change of depth.
+        limit: Largest change of depth.
     """
 
-    def __init__(self, predictor: Predictor, run: Run, limit: float) -> None:
+    def __init__(self, predictor: Predictor, run: Run, limit: Change) -> None:
         about = (predictor.device, predictor.scale, predictor.flip, predictor.keep_aspect)
         super().__init__(predictor.network, predictor.height, predictor.width, *about)
         self._converted, self._limit, self._compared = run, limit, False
@@ -52,10 +70,10 @@ class ConvertedPredictor(Predictor):
         """Run the network: RGB in [0, 1] to disparity at the same size, before any scale."""
         if not self._compared:
             self._compared, change = True, depth_change(exporters.run_eager(self.network), self._converted, images[:1])
-            if not change <= self._limit:
+            if not change.within(self._limit):
                 raise CheckpointError(
-                    f"in this runtime, depth of the first image changes by {change:.2g} (Abs Rel), more than "
-                    f"{self._limit:g}; set runtime=torch"
+                    f"in this runtime, depth of the first image changes by {change}, and allowed is {self._limit}; "
+                    "set runtime=torch"
                 )
         found = self._each(images)
         if self.flip:
@@ -67,10 +85,10 @@ class ConvertedPredictor(Predictor):
         return np.concatenate([self._converted(image[None]) for image in images])
 
 
-def depth_change(eager: Run, converted: Run, image: Float32[np.ndarray, "1 3 h w"]) -> float:
-    """Return the mean relative change of depth (Abs Rel) of an image."""
-    wanted, got = eager(image), converted(image)
-    return float(np.abs(wanted / got - 1).mean())
+def depth_change(eager: Run, converted: Run, image: Float32[np.ndarray, "1 3 h w"]) -> Change:
+    """Return the relative change of an image's depth."""
+    apart = np.abs(eager(image) / converted(image) - 1)
+    return Change(float(apart.mean()), float(apart.max()))
 
 
 def choose_runtime(
@@ -117,17 +135,17 @@ def choose_runtime(
     images = random_images(predictor.height, predictor.width)
     eager = exporters.run_eager(predictor.network)
     change = _largest_change(eager, run, images)
-    if not change <= LIMITS[precision] and precision != "f32":
+    if not change.within(LIMITS[precision]) and precision != "f32":
         precision, run = "f32", run_openvino(path, path.with_suffix(".bin"))
         change = _largest_change(eager, run, images)
-    if not change <= LIMITS[precision]:
-        found_it = f"{name} changes depth by {change:.2g} (Abs Rel), more than {LIMITS[precision]:g}"
+    if not change.within(LIMITS[precision]):
+        found_it = f"{name} changes depth by {change}, and allowed is {LIMITS[precision]}"
         if not auto:
             raise ConfigError(f"{found_it}; set runtime=torch")
         print(f"runtime: torch ({found_it})")
         return predictor
     before, after = milliseconds([eager, run], images[0], repeats=3)
-    about = f"{name} {precision}, {after / before:.2f} of torch's time, depth changes by {change:.1g} (Abs Rel)"
+    about = f"{name} {precision}, {after / before:.2f} of torch's time, depth changes by {change}"
     if auto and after >= before:
         print(f"runtime: torch ({about})")
         return predictor
@@ -135,10 +153,10 @@ def choose_runtime(
     return ConvertedPredictor(predictor, run, LIMITS[precision])
 
 
-def _largest_change(eager: Run, converted: Run, images: Sequence[Float32[np.ndarray, "1 3 h w"]]) -> float:
-    """Return the largest `depth_change` of several images; infinite if one of them is not finite."""
-    changes = [depth_change(eager, converted, image) for image in images]
-    return max(changes) if all(map(math.isfinite, changes)) else math.inf
+def _largest_change(eager: Run, converted: Run, images: Sequence[Float32[np.ndarray, "1 3 h w"]]) -> Change:
+    """Return the largest `depth_change` of several images; NaN if one of them is not finite."""
+    means, largest = np.max([depth_change(eager, converted, image) for image in images], axis=0)
+    return Change(float(means), float(largest))
 
 
 def _why_not(predictor: ImagePredictor) -> str:
