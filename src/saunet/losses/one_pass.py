@@ -4,7 +4,8 @@
 scales are kept for the gradient. Here the few maps at work stay in the processor's cache:
 
 - A pixel (u, v) of disparity D is seen at (M (u, v, 1) + D m) / w, where w is the third row, M = A R K^-1, m = A t, and
-  A is K followed by the scaling to [-1, 1]. Depth is never formed, and only D, M and m get gradients.
+  A is K followed by the scaling to [-1, 1]. Depth is never formed, and only D, M and m get gradients; from these on to
+  poses and intrinsics it is autograd's matter.
 - Box sums stand for box means: C1 and C2 of SSIM are multiplied by 81.
 - A mask is a number, 1.0 or 0.0: on a CPU, choosing by truth values costs ten times a multiplication.
 """
@@ -45,8 +46,8 @@ class Choices:
 
 
 def takes(batch: TrainBatch) -> bool:
-    """Return whether a batch can be compared in one pass: on a CPU, where nothing but disparities and poses learns."""
-    given = batch["loss_target"], batch["loss_sources"], batch["K"]
+    """Return whether a batch can be compared in one pass: on a CPU, where no image learns."""
+    given = batch["loss_target"], batch["loss_sources"]
     large = min(given[0].shape[-2:]) >= 4
     plain = "target_mask" not in batch  # pixels left out are the separate operations' matter
     return plain and large and given[0].device.type == "cpu" and not any(each.requires_grad for each in given)
@@ -64,21 +65,33 @@ def photometric(
 ) -> tuple[Float[Tensor, " scales"], Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
     """Return each scale's photometric loss; and of the first scale the error, and 1.0 where it counts.
 
-    Only disparities and poses get gradients, and these none of their own. ``noise`` decides ties of the auto-mask.
+    Disparities, poses and K get gradients, and these none of their own. ``noise`` decides ties of the auto-mask.
     """
     images = target.contiguous(), sources.contiguous()
     result: tuple[Tensor, Tensor, Tensor] = _OnePass.apply(  # type: ignore[no-untyped-call]
-        poses, K, *images, noise, choices, *disparities
+        *_mappings(K.double(), poses.double(), *target.shape[-2:]), *images, noise, choices, *disparities
     )
     return result
+
+
+def _mappings(K: Tensor, poses: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Return M (b s 3 3) and m (b s 3 1) of all images and sources."""
+    zero, one = torch.zeros_like(K[:, 0, 0]), torch.ones_like(K[:, 0, 0])
+    fx, skew, cx, fy, cy = (K[:, row, column] for row, column in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
+    x, y = 2 / max(width - 1, 1), 2 / max(height - 1, 1)
+    entries = (x * fx, x * skew, x * cx - 1, zero, y * fy, y * cy - 1, zero, zero, one)
+    A = torch.stack(entries, -1).view(-1, 1, 3, 3)
+    entries = (1 / fx, -skew / (fx * fy), (skew * cy / fy - cx) / fx, zero, 1 / fy, -cy / fy, zero, zero, one)
+    B = torch.stack(entries, -1).view(-1, 1, 3, 3)
+    return A @ poses[..., :3, :3] @ B, A @ poses[..., :3, 3:]
 
 
 class _OnePass(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        poses: Tensor,
-        K: Tensor,
+        M: Tensor,
+        m: Tensor,
         target: Tensor,
         sources: Tensor,
         noise: Tensor | None,
@@ -88,10 +101,10 @@ class _OnePass(torch.autograd.Function):
         batch, count, _, height, width = sources.shape
         learns = any(ctx.needs_input_grad)
         to_disparities = [torch.empty_like(each) if learns else each for each in disparities]
-        to_poses = poses.new_zeros(len(disparities), *poses.shape)
+        to_M, to_m = (each.new_zeros(len(disparities), *each.shape) for each in (M, m))
         values = target.new_zeros(len(disparities), batch)
         error, counted = target.new_empty(2, batch, 1, height, width)
-        cameras, ssim = _Cameras(K, poses, height, width), _Comparison(target, count, choices.ssim_weight, learns)
+        cameras, ssim = _Cameras(M, m, height, width), _Comparison(target, count, choices.ssim_weight, learns)
         for image in range(batch):
             ssim.look_at(target[image])
             still = None
@@ -121,17 +134,17 @@ class _OnePass(torch.autograd.Function):
                     moved = torch.ops.aten.grid_sampler_2d_backward(
                         ssim.gradient, sources[image], warp.pixels, 0, 1, True, [False, True]
                     )[1]
-                    warp.slope(moved, to_disparities[scale][image, 0], to_poses[scale, image])
-        ctx.save_for_backward(to_poses, *to_disparities)
+                    to_M[scale, image], to_m[scale, image] = warp.slope(moved, to_disparities[scale][image, 0])
+        ctx.save_for_backward(to_M, to_m, *to_disparities)
         ctx.mark_non_differentiable(error, counted)
         return values.mean(1), error, counted
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
-        to_poses, *to_disparities = ctx.saved_tensors
-        poses = (grad[:, None, None, None, None] * to_poses).sum(0)
-        return poses, None, None, None, None, None, *map(torch.mul, to_disparities, grad)
+        to_M, to_m, *to_disparities = ctx.saved_tensors
+        M, m = ((grad[:, None, None, None, None] * each).sum(0) for each in (to_M, to_m))
+        return M, m, None, None, None, None, *map(torch.mul, to_disparities, grad)
 
 
 def _combine(
@@ -159,16 +172,9 @@ def _combine(
 class _Cameras:
     """The cameras of all images: M and m of every source, in double precision."""
 
-    def __init__(self, K: Tensor, poses: Tensor, height: int, width: int) -> None:
-        K, self.like = K.double(), poses
-        zero, one = torch.zeros_like(K[:, 0, 0]), torch.ones_like(K[:, 0, 0])
-        fx, skew, cx, fy, cy = (K[:, row, column] for row, column in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
+    def __init__(self, M: Tensor, m: Tensor, height: int, width: int) -> None:
+        self.M, self.m = M, m
         x, y = 2 / max(width - 1, 1), 2 / max(height - 1, 1)
-        entries = (x * fx, x * skew, x * cx - 1, zero, y * fy, y * cy - 1, zero, zero, one)
-        self.A = torch.stack(entries, -1).view(-1, 1, 3, 3)
-        entries = (1 / fx, -skew / (fx * fy), (skew * cy / fy - cx) / fx, zero, 1 / fy, -cy / fy, zero, zero, one)
-        self.B = torch.stack(entries, -1).view(-1, 1, 3, 3)
-        self.M, self.m = self.A @ poses[..., :3, :3].double() @ self.B, self.A @ poses[..., :3, 3:].double()
         self.u, self.v = (torch.arange(size, dtype=torch.float64) for size in (width, height))
         self.limits = 1 + BORDER * x, 1 + BORDER * y
         self.behind = BEHIND * x - 1, BEHIND * y - 1
@@ -207,8 +213,8 @@ class _Warp:
             inside[:, axis].le_(limit)
         return list(inside[:, 0].mul_(inside[:, 1]).mul_(self.front))
 
-    def slope(self, moved: Tensor, to_disparity: Tensor, to_poses: Tensor) -> None:
-        """Set the gradients of disparity and poses, given that of ``pixels``, s h w 2."""
+    def slope(self, moved: Tensor, to_disparity: Tensor) -> tuple[Tensor, Tensor]:
+        """Set the gradient of disparity and return those of M and m, given that of ``pixels``, s h w 2."""
         count, height, width, _ = moved.shape
         h = moved.new_empty(count, 3, height, width)
         torch.mul(moved.permute(0, 3, 1, 2), self.inverse[:, None], out=h[:, :2])
@@ -218,12 +224,10 @@ class _Warp:
         for source, row in enumerate(self.cameras.m[self.image].squeeze(-1).tolist()):
             for axis in range(3):
                 to_disparity.add_(h[source, axis], alpha=row[axis])
-        A, B = self.cameras.A[self.image], self.cameras.B[self.image]
         rows, columns = h.sum(-1).double(), h.sum(-2).double()
         to_M = torch.stack((columns @ self.cameras.u, rows @ self.cameras.v, rows.sum(-1)), -1)
         to_m = torch.mv(h.view(count * 3, -1), self.disparity.flatten()).view(count, 3, 1)
-        to_poses[:, :3, :3] = A.mT @ to_M @ B.mT
-        to_poses[:, :3, 3:] = A.mT @ to_m.double()
+        return to_M, to_m.double()
 
 
 class _Comparison:
