@@ -19,6 +19,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from saunet.runs.folder import recording
 from saunet.training.callbacks import LastCheckpoint
+from saunet.training.intrinsics import focal_lengths
 from saunet.training.optim import Recipe
 from saunet.training.stopping import GracefulStop, ProcessWatch
 
@@ -46,6 +47,9 @@ def main(folder: Path, processes: int, epochs: int, rank: int | None = None, num
         assert photometric.reduction == "masked"
         photometric.noise = 0.0
         model.depth.encoder[1] = torch.nn.Identity()  # type: ignore[union-attr, index, operator]
+        data = tiny.tiny_walls()
+        data.setup("fit")
+        model.intrinsics = focal_lengths("refined", data)
         curve = Curve(folder, rank, number)
         watch = [
             GracefulStop(str(folder / "c")),
@@ -60,10 +64,13 @@ def main(folder: Path, processes: int, epochs: int, rank: int | None = None, num
             strategy="ddp" if processes > 1 else "auto",
             callbacks=[curve, *watch],
         )
-        trainer.fit(model, tiny.tiny_walls())
+        trainer.fit(model, data)
         if trainer.is_global_zero:
             metrics = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("val")}
-            (folder / "curve.json").write_text(json.dumps({"losses": curve.losses, "metrics": metrics}))
+            focals = [after / before for before, after in model.found_intrinsics().focals.values()]
+            (folder / "curve.json").write_text(
+                json.dumps({"losses": curve.losses, "metrics": metrics, "focals": focals})
+            )
 
 
 if __name__ == "__main__":

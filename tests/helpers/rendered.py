@@ -7,7 +7,23 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from saunet.synthetic import SyntheticDrive
+from saunet.synthetic.world import turn
+
+
+class Winding(SyntheticDrive):
+    """A rendered street driven in bends of 30 degrees to both sides."""
+
+    def pose(self, index: int) -> NDArray[np.float64]:
+        heading = np.radians(30) * np.sin(2 * np.pi * np.arange(index + 1) / 40)
+        T = super().pose(0).copy()
+        T[:3, :3] = turn(heading[-1]) @ T[:3, :3]
+        T[0, 3] += 0.45 * np.sin(heading).sum()
+        T[2, 3] += 0.45 * np.cos(heading).sum()
+        return T
 
 
 @contextlib.contextmanager

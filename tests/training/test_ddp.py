@@ -123,6 +123,8 @@ def test_two_processes_have_the_loss_curve_of_one(tmp_path: Path) -> None:
     assert one["losses"][-1] < 0.95 * one["losses"][0]
     assert two["losses"] == pytest.approx(one["losses"], rel=1e-4)  # sums are taken in another order
     assert two["metrics"] == pytest.approx(one["metrics"], rel=1e-4)  # of weights that differ by as little
+    assert two["focals"] == pytest.approx(one["focals"], rel=1e-4)
+    assert all(abs(factor - 1) > 0.005 for factor in one["focals"])
 
 
 @pytest.mark.parametrize("victim", [0, 1])

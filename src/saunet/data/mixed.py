@@ -90,6 +90,7 @@ class MixedDataModule(DepthDataModule):
 
     def prepare_data(self) -> None:
         for source in self.sources.values():
+            source.guess_camera = self.guess_camera
             source.prepare_data()
 
     def select(self, split: str) -> Sequence[Selection]:
@@ -97,6 +98,7 @@ class MixedDataModule(DepthDataModule):
         selections = []
         for name in self._names["train" if split in ("train", "val") else "test"]:
             source = self.sources[name]
+            source.guess_camera = self.guess_camera
             for each in source.select(split):
                 selection = Selection(*each)
                 if source.manifest is not None and split in ("train", "val"):

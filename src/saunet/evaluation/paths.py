@@ -326,6 +326,7 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
     record = read_model(source).record
     odometer = Odometer.from_model(source, device=str(device), batch_size=options.batch_size)
     data = options.data.build(height=record.height, width=record.width, offsets=list(record.offsets))
+    data.guess_camera = True  # paths need no intrinsics
     data.setup("test")
     drawn = options.figure and find_spec("matplotlib") is not None
     paths, errors, notes = [], [], []

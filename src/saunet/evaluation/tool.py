@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -16,7 +16,7 @@ from torch import nn
 from saunet.data.drive import Drive
 from saunet.data.loading.module import surroundings
 from saunet.data.loading.stored import cache_truths
-from saunet.data.loading.windows import measured_distance
+from saunet.data.loading.windows import measured_distance, recording_of
 from saunet.errors import ConfigError, DataError, checked, one_of, usable_device
 from saunet.evaluation.predictors import (
     ExportingPredictor,
@@ -30,6 +30,7 @@ from saunet.evaluation.result import EvaluationResult, read_rows, write_results
 from saunet.evaluation.scoring import Buckets, Shapes, score, score_views
 from saunet.evaluation.statistics import drive_of, with_statistics
 from saunet.evaluation.team import Team, joined
+from saunet.geometry.camera import zoom_intrinsics
 from saunet.io.atomic import check_folder
 from saunet.io.speeds import read_speeds
 from saunet.metrics.baselines import ConstantDepth, MeanDepthMap
@@ -39,7 +40,7 @@ from saunet.models.depth import DepthNet
 from saunet.prediction.foreign import NOTHING, ForeignOptions, ForeignPredictor, is_foreign
 from saunet.prediction.prediction import load
 from saunet.registry import Spec
-from saunet.runs.record import ModelRecord
+from saunet.runs.record import Intrinsics, ModelRecord
 from saunet.scale.estimate import MetricDepth, MetricMotion, estimate_scale, keep_scale
 from saunet.scale.options import ScaleOptions
 from saunet.types import EvalBatch
@@ -56,6 +57,7 @@ class EvaluationData(Protocol):
 
     ground_truth: str
     neighbors: Sequence[str]
+    guess_camera: bool
 
     @property
     def datasets(self) -> Mapping[str, Any]:
@@ -190,7 +192,7 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
     device = team.device(usable_device(options.device))
     folder = None if options.output_dir is None else check_folder(options.output_dir)
     settings: dict[str, object] = {"data": options.data.name}
-    model, pose = None, None
+    model, pose, found = None, None, None
     if options.checkpoint is not None and runs_alone(options):
         loaded = load(options.checkpoint, device=str(device), flip=options.flip, foreign=options.foreign)
         size = {"height": loaded.height, "width": loaded.width}
@@ -201,8 +203,10 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         settings |= {"checkpoint": options.checkpoint, **({"foreign": about} if options.foreign.given else {})}
     elif options.checkpoint is not None:
         checkpoint = read_model(options.checkpoint)
-        networks = checkpoint.networks()
+        networks, found = checkpoint.networks(), checkpoint.record.intrinsics
         passes = _passes(options, _resized(options.data, checkpoint.record), motion=networks[1] is not None)
+        for data, _ in passes:
+            data.guess_camera = found is not None
         _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth is of the same images
         depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device, first=team.rank == 0)
         model = NetworkPredictor(depth, options.flip)
@@ -212,7 +216,7 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         existing(Path(str(options.predictions)))
         settings |= {"predictions": options.predictions, "match": options.match}
     settings |= {"split": options.split, "post_processing": "monodepth blend of two flips" if options.flip else None}
-    result, exported = _score_passes(options, passes, model, pose, device, team)
+    result, exported = _score_passes(options, passes, model, pose, device, team, found)
     sources = tuple(options.data.get("sources") or ())
     result = replace(result, settings={**settings, **result.settings}, sources=sources, folder=folder, notes=exported)
     first = team.rank == 0
@@ -320,6 +324,7 @@ def _score_passes(
     pose: nn.Module | None,
     device: torch.device,
     team: Team,
+    found: Intrinsics | None,
 ) -> tuple[EvaluationResult, tuple[str, ...]]:
     """Go through the images once for each ground truth; return the result, and what was exported."""
     split, name, exporter = options.split, "model" if model else "predictions", None
@@ -341,6 +346,7 @@ def _score_passes(
             assert pose is not None
             pair = {name: (predictor, lambda batch: pose(batch["target"], batch["sources"]))}
             group_of = _conditions(data, split)
+            batches = _refined(batches, found)
             results += [score_views(pair, batches, rule, group_of=group_of, total=total, team=team) for rule in rules]
         else:
             predictors = {name: predictor, **(trivial(data, options.truth_cache) if options.baselines else {})}
@@ -405,6 +411,7 @@ def _scaled(
             most=options.scale.frames,
         )
         height = data.camera_height if options.scale.camera_height is None else options.scale.camera_height
+        batches = _refined(batches, record.intrinsics)
         estimate = estimate_scale(method, batches, lambda image: depth(image).depth[0], pose, height)
         report = {key: value for key, value in estimate.as_json().items() if key != "per_frame"}  # scale.json has it
         folder = None if options.output_dir is None else Path(options.output_dir)
@@ -415,6 +422,17 @@ def _scaled(
         return depth, pose, {"method": method, "factor": None}
     report = {"method": method, **(report or {"source": scale.source, "factor": scale.factor})}
     return MetricDepth(depth, scale), None if pose is None else MetricMotion(pose, scale), report
+
+
+def _refined(batches: Iterable[EvalBatch], found: Intrinsics | None) -> Iterator[EvalBatch]:
+    """Yield batches with the focal lengths that the training found, if it did."""
+    for batch in batches:
+        if found is not None:
+            width, own = batch["target"].shape[-1], batch["K"][:, 0, 0].tolist()
+            focals = [found.focal(recording_of(name), fx / width) for name, fx in zip(batch["name"], own, strict=True)]
+            factors = torch.tensor([width * focal / fx for focal, fx in zip(focals, own, strict=True)])
+            batch = {**batch, "K": zoom_intrinsics(batch["K"], factors)}
+        yield batch
 
 
 def _odometer(options: EvaluateOptions, data: EvaluationData) -> Callable[[Drive, int, int], float]:

@@ -27,7 +27,7 @@ from saunet.io.plain import read_json
 from saunet.io.progress import bar
 from saunet.models.depth import DepthNet
 from saunet.prediction.sources import find_sources
-from saunet.runs.record import ModelRecord
+from saunet.runs.record import Intrinsics, ModelRecord
 from saunet.tables import show
 from saunet.weights.files import read_model, restored, write_safetensors
 from saunet.weights.locate import CARD, CONFIG, POSE, WEIGHTS, check_push, push
@@ -254,8 +254,12 @@ def remove(earlier: Sequence[Path]) -> None:
 
 
 def public_record(record: ModelRecord) -> ModelRecord:
-    """Return a model's record without the trainer's folders."""
-    record = replace(record, data={key: value for key, value in record.data.items() if key not in _PLACES})
+    """Return a model's record without the trainer's folders and recordings."""
+    data = {key: value for key, value in record.data.items() if key not in _PLACES}
+    found = record.intrinsics
+    if found is not None:  # the names of recordings are the trainer's too
+        found = Intrinsics(found.mode, {"mean": found.mean})
+    record = replace(record, data=data, intrinsics=found)
     try:
         json.dumps(record.to_plain(), allow_nan=False)
     except ValueError as reason:

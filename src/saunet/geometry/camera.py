@@ -5,6 +5,8 @@ All functions take K as ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in pixels; 
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,6 +14,8 @@ from torch import Tensor
 from saunet.geometry import full_precision
 
 Number = float | int | Float[Tensor, "*b"]
+GUESS = 0.5 / math.tan(math.radians(60) / 2)
+"""Focal length of a camera that nobody knows, in picture widths: 60 degrees of view."""
 
 
 @full_precision
@@ -79,6 +83,14 @@ def flip_intrinsics(K: Float[Tensor, "*b 3 3"], width: Number) -> Float[Tensor, 
     across, down, last = K.unbind(-2)
     mirrored = torch.cat((across[..., :1], -across[..., 1:]), dim=-1)
     return torch.stack((mirrored + (_per_item(width, K) - 1) * last, down, last), dim=-2)
+
+
+@full_precision
+def zoom_intrinsics(K: Float[Tensor, "*b 3 3"], factor: Number) -> Float[Tensor, "*b 3 3"]:
+    """Intrinsics of a lens with ``factor`` times the focal lengths; one number, or one per item of the batch."""
+    times = torch.as_tensor(factor).to(K)[..., None, None]
+    top = torch.cat((times * K[..., :2, :2], K[..., :2, 2:]), dim=-1)
+    return torch.cat((top, K[..., 2:, :]), dim=-2)
 
 
 def _per_item(value: Number, K: Tensor) -> Tensor | float:

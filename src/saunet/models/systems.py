@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Literal
 
 from torch import Tensor, nn
 
-from saunet.errors import checked
+from saunet.errors import checked, one_of
 from saunet.models.depth import DepthNet
 from saunet.registry import Spec, models
 from saunet.types import DepthPyramid
@@ -67,6 +68,8 @@ class ModelOptions:
         pose: Pose network; None for training on stereo pairs alone.
         min_depth: Smallest depth that the network can say, meters up to scale.
         max_depth: Largest depth.
+        intrinsics: Focal lengths in training: ``fixed`` as given; ``refined``: one per recording is learned with the
+            networks, starting from the given one; ``learned``: the same from a guess, 60 degrees of view.
 
     Examples:
         >>> parts = {"encoder": "resnet18", "decoder": "unet", "pose": "posecnn"}
@@ -79,6 +82,10 @@ class ModelOptions:
     pose: Spec | None = None
     min_depth: float = 0.1
     max_depth: float = 100.0
+    intrinsics: Literal["fixed", "refined", "learned"] = "fixed"
+
+    def __post_init__(self) -> None:
+        one_of("model.intrinsics", self.intrinsics, ("fixed", "refined", "learned"))
 
     @classmethod
     def named(cls, name: str) -> ModelOptions:
@@ -93,7 +100,9 @@ class ModelOptions:
 
     def build(self) -> DepthAndPose:
         """Build the networks with random weights, or with those that the parts name."""
-        return DepthAndPose(**{each.name: getattr(self, each.name) for each in fields(self)})
+        return DepthAndPose(
+            **{each.name: getattr(self, each.name) for each in fields(self) if each.name != "intrinsics"}
+        )
 
     def same_architecture(self, other: ModelOptions) -> bool:
         """Return whether both cost the same: all parameters agree but the weights to start from."""
@@ -104,7 +113,7 @@ def _architecture(options: ModelOptions) -> dict[str, object]:
     return {each.name: _settings(getattr(options, each.name)) for each in fields(options)}
 
 
-def _settings(part: Spec | float | None) -> object:
+def _settings(part: Spec | str | float | None) -> object:
     if not isinstance(part, Spec):
         return part
     defaults = {name: each.default for name, each in part.parameters.items() if each.default is not each.empty}

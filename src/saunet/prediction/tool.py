@@ -54,7 +54,8 @@ class PredictOptions:
             videos.
         colormap: magma, inferno, viridis, turbo or gray.
         camera: True intrinsics, which ``ply`` and ``html`` need: a camera.yaml; fx, fy, cx, cy in pixels of the first
-            image; the nine numbers of K; or one number, the horizontal field of view in degrees.
+            image; the nine numbers of K; one number, the horizontal field of view in degrees; or ``checkpoint`` for the
+            mean focal length that the model's training found (``model.intrinsics``).
         undistort: A camera.yaml: undistort and crop the images first, as training on that camera's clips does.
         max_depth: Leave out points that are farther, in the unit of depth.
         max_frames: Predict the first so many images or frames only.
@@ -356,6 +357,17 @@ def _camera(
     given = options.camera if options.undistort is None else options.undistort
     if given is None or isinstance(given, Camera):
         return given, None
+    if given == "checkpoint":
+        from saunet.weights.files import read_model
+
+        found, size = read_model(options.checkpoint).record.intrinsics, recording.first_size
+        if found is None:
+            raise ConfigError(
+                f"camera=checkpoint asks for the focal length that a training found, and '{options.checkpoint}' has "
+                "none; give the camera, or train with model.intrinsics=learned"
+            )
+        view = math.degrees(2 * math.atan(0.5 / found.mean[1]))
+        return None if size is None else Camera.from_numbers([view], *size), None
     numbers = _numbers(str(given)) if isinstance(given, str | Path) else given
     if numbers is not None:
         size = recording.first_size

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -53,6 +54,37 @@ class Scale:
 
 
 @dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """The focal lengths that a training found (``model.intrinsics``)."""
+
+    mode: str
+    """``refined`` or ``learned``."""
+    focals: Mapping[str, tuple[float, float]]
+    """Recording -> focal length before and after, in picture widths."""
+
+    def __post_init__(self) -> None:
+        if not self.focals or not all(0 < each < math.inf for pair in self.focals.values() for each in pair):
+            raise CheckpointError(f"the model record's focal lengths are {_short(self.focals)}; they must be above 0")
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return it as plain containers."""
+        return {"mode": self.mode, "focals": {name: list(pair) for name, pair in self.focals.items()}}
+
+    @property
+    def mean(self) -> tuple[float, float]:
+        """The geometric means of the focal lengths before and after."""
+        before, after = zip(*self.focals.values(), strict=True)
+        return statistics.geometric_mean(before), statistics.geometric_mean(after)
+
+    def focal(self, recording: str, own: float) -> float:
+        """Return a recording's focal length; of one that was not trained on, with its ``own``, by the mean of all."""
+        if recording in self.focals:
+            return self.focals[recording][1]
+        before, after = self.mean
+        return own * after / before if self.mode == "refined" else after
+
+
+@dataclass(frozen=True, slots=True)
 class ModelRecord:
     """Everything but the weights that prediction needs, as plain data; networks as config nodes with ``_target_``."""
 
@@ -73,6 +105,8 @@ class ModelRecord:
     version: str = __version__
     plugins: tuple[str, ...] = ()
     """Modules outside saunet that register its components."""
+    intrinsics: Intrinsics | None = None
+    """None if the training took the data's."""
 
     def __post_init__(self) -> None:
         if not 0 < self.min_depth < self.max_depth < math.inf:
@@ -101,6 +135,7 @@ class ModelRecord:
             "scale": asdict(self.scale) if self.scale else None,
             "data": _plain(self.data),
             **({"plugins": list(self.plugins)} if self.plugins else {}),
+            **({"intrinsics": self.intrinsics.to_plain()} if self.intrinsics else {}),
         }
 
     @classmethod
@@ -118,6 +153,7 @@ class ModelRecord:
                 f"this is saunet {__version__}, which reads up to {FORMAT}; upgrade saunet"
             )
         model, scale = _get(plain, "model", Mapping), _get(plain, "scale", Mapping | None)
+        found = _get({"intrinsics": None, **plain}, "intrinsics", Mapping | None)
         return cls(
             encoder=_node(model, "encoder"),
             decoder=_node(model, "decoder"),
@@ -131,6 +167,7 @@ class ModelRecord:
             data=_get(plain, "data", Mapping),
             version=_get(plain, "version", str),
             plugins=tuple(map(str, _get({"plugins": [], **plain}, "plugins", list))),
+            intrinsics=None if found is None else Intrinsics(_get(found, "mode", str), _focals(found)),
         )
 
     def check_same_training(self, plain: Mapping[str, Any]) -> None:
@@ -224,6 +261,17 @@ def _get(plain: Mapping[str, Any], key: str, kind: Any) -> Any:
     if not isinstance(value, kind) or isinstance(value, bool):
         raise CheckpointError(f"the model record's {key} is {_short(value)}; the file is damaged or was edited")
     return value
+
+
+def _focals(found: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    focals: Mapping[str, Any] = _get(found, "focals", Mapping)
+    for name in focals:
+        pair = _get(focals, name, list | tuple)
+        if len(pair) != 2 or not all(isinstance(each, float) for each in pair):
+            raise CheckpointError(
+                f"the model record's focal lengths of '{name[:60]}' are {_short(pair)}; two numbers are needed"
+            )
+    return {name: (pair[0], pair[1]) for name, pair in focals.items()}
 
 
 def _node(model: Mapping[str, Any], slot: str) -> Mapping[str, Any]:

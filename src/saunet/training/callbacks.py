@@ -233,7 +233,7 @@ class Progress(TQDMProgressBar):
             name: sum(parameter.numel() for parameter in module.parameters()) / 1e6
             for name, module in pl_module.named_children()
         }
-        parts = ", ".join(f"{name} {count:.1f} M" for name, count in counts.items() if count)
+        parts = ", ".join(f"{name} {count:.1f} M" for name, count in counts.items() if count and name != "intrinsics")
         rank_zero_info(f"networks: {parts}; together {sum(counts.values()):.1f} M parameters")
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -23,6 +23,8 @@ from saunet.geometry.pose import scaled_motion
 from saunet.losses.base import Objective
 from saunet.metrics.depth import DepthMetrics
 from saunet.runs.folder import RunRecord
+from saunet.runs.record import Intrinsics
+from saunet.training.intrinsics import FocalLengths
 from saunet.training.monitors import health
 from saunet.training.optim import MovingAverage, Recipe
 from saunet.training.resume import continuation, owe_validation, validation_due
@@ -73,6 +75,8 @@ class SelfSupervisedDepth(LightningModule):
         self.run_record: RunRecord | None = None
         """The run's ``run.json``, where there is one."""
         self.average = MovingAverage(self.recipe.ema) if self.recipe.ema > 0 else None
+        self.intrinsics: FocalLengths | None = None
+        """Learns the focal lengths, where the data's are not fixed."""
         self._prepared = False
         self._owed = False  # a validation that a killed run did not finish
 
@@ -114,6 +118,8 @@ class SelfSupervisedDepth(LightningModule):
                 f"the batch has {', '.join(batch)} and no target: it comes from the loader as bytes; "
                 "prepare it first: batch = data.on_after_batch_transfer(batch, 0)"
             )
+        if self.intrinsics is not None:
+            batch = {**batch, "K": self.intrinsics(batch["K"], batch["name"], batch["target"].shape[-1])}
         pyramid: DepthPyramid = self.depth(batch["target"])  # Z_t
         poses = self.motion(batch)  # D_{t->t'}
         if "T_tracked" in batch:
@@ -254,7 +260,17 @@ class SelfSupervisedDepth(LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the record from which the networks are rebuilt, and what a resumed training must share."""
         checkpoint["saunet"] = self.record
+        if self.intrinsics is not None:
+            found = self.found_intrinsics(checkpoint["state_dict"])
+            checkpoint["saunet"] = {**self.record, "intrinsics": found.to_plain()}
         checkpoint["saunet_training"] = self.training_state(getattr(self._trainer, "datamodule", None))
+
+    def found_intrinsics(self, state: Mapping[str, Tensor] | None = None) -> Intrinsics:
+        """Return the focal lengths that were learned, by a state of this module, or as they are now or on average."""
+        assert self.intrinsics is not None
+        if state is None:
+            state = self.average.values if self.average is not None else self.state_dict()
+        return self.intrinsics.found(state["intrinsics.change"])
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Check that the training continues, and say what becomes of a changed recipe, network or objective."""

@@ -63,6 +63,12 @@ def check_resume(model: SelfSupervisedDepth, checkpoint: Checkpoint, data: Any) 
             f"of a run, or start a new training from its weights with init_from={checkpoint.path}"
         )
     checkpoint.record.check_same_training(model.record)
+    before, now = (getattr(each.intrinsics, "mode", "fixed") for each in (checkpoint.record, model))
+    if before != now:
+        raise CheckpointError(
+            f"the checkpoint was trained with model.intrinsics={before} and this run has {now}; give the same, or "
+            f"start a new training from its weights with init_from={checkpoint.path}"
+        )
     load_weights(model.depth, checkpoint.weights("depth"), "depth network")
     if model.pose is not None:
         load_weights(model.pose, checkpoint.weights("pose"), "pose network")

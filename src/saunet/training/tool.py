@@ -13,6 +13,7 @@ from typing import Any
 from lightning import Callback, Trainer, seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities import rank_zero_info
 
 from saunet import plugins
 from saunet.data.loading.module import DepthDataModule
@@ -27,6 +28,7 @@ from saunet.runs.checkpoint import build_networks, read_checkpoint
 from saunet.runs.folder import Describe, locked, recording
 from saunet.runs.record import ModelRecord, Scale
 from saunet.training.callbacks import AtomicCheckpointIO, BestCheckpoint
+from saunet.training.intrinsics import focal_lengths
 from saunet.training.module import SelfSupervisedDepth
 from saunet.training.optim import Recipe
 from saunet.training.resume import check_resume, check_unused, keep_rows, resume_path, validation_due, warm_start
@@ -227,11 +229,13 @@ def train(
     checkpoint = read_checkpoint(resume) if resume else None  # before the data are set up, which takes its time
     seed_everything(options.seed, workers=True, verbose=False)
     data = options.data.build()
+    data.guess_camera = options.model.intrinsics == "learned"
     model = assemble(options, data, pretrained=resume is None and options.init_from is None)
     loggers = _loggers(options)
     trainer = _trainer(options, loggers)
     data.setup("fit")
     data.train_dataloader()  # knows whether there are enough samples
+    model.intrinsics = focal_lengths(options.model.intrinsics, data)
     steps = check_resume(model, checkpoint, data) if checkpoint else 0
     done = {"global_step": steps, "saunet_training": checkpoint.rest.get("saunet_training", {})} if checkpoint else {}
     due = validation_due(done)
@@ -265,6 +269,10 @@ def train(
                     lost = "the connection to another process of this run broke, most likely because it died"
                     raise SaunetError(f"{lost}; {way_on(folder / 'checkpoints')}") from error
                 raise
+            if model.intrinsics is not None:
+                found = model.found_intrinsics()
+                record.write(intrinsics=found.to_plain())
+                rank_zero_info(model.intrinsics.told(found))
     if trainer.is_global_zero:
         if trainer.global_step >= DRAWN_FROM:
             _draw(folder)

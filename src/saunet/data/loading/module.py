@@ -77,6 +77,8 @@ class DepthDataModule(LightningDataModule):
     """Whether ``saunet prepare cache`` can make copies for it."""
     root: str | None = None
     """Where its files are; None if it reads none."""
+    guess_camera: bool = False
+    """Whether a camera that is unknown, and that its frames do not tell, is guessed: intrinsics are learned."""
     recognizable: bool = True
     """Whether its files are arranged as those of no other data set, so that it can be found among others."""
 

@@ -6,6 +6,7 @@ A window is usable when the frames at all offsets exist. What is left out is cou
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from bisect import bisect_left
 from collections import Counter
@@ -362,3 +363,8 @@ def sample_name(drive: str, frame: int) -> str:
     """Return drive and frame as one name; the camera side, if the drive's name ends with one, stays last."""
     folder, _, side = drive.rpartition(" ")
     return f"{folder} {frame:010d} {side}" if folder and side in ("l", "r") else f"{drive} {frame:010d}"
+
+
+def recording_of(name: str) -> str:
+    """Return the drive in a `sample_name`."""
+    return re.sub(r" \d{10,}( [lr])?$", r"\1", name)
