@@ -22,7 +22,8 @@ from saunet.runs.sweep import summary
 from saunet.training.stopping import GracefulStop
 
 Tool = Callable[..., Any]
-SMALL = ("model/encoder=lite_mono_tiny", "model/pose=posecnn")
+NARROW = ("model/encoder=lite_mono_tiny", "model.encoder.dims=[8,16,16]", "model.encoder.depths=[2,2,2]")
+SMALL = (*NARROW, "model/pose=posecnn")
 QUICK = ("experiment=smoke", "logger=none", "callbacks.pictures=null", *SMALL)
 
 
@@ -163,7 +164,7 @@ def test_an_interrupted_sweep_names_the_jobs_that_never_started(
 
 def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
     last = smoke_run / "checkpoints" / "last.ckpt"
-    again = ("experiment=smoke", "logger=none", "callbacks.pictures=null", "trainer.limit_train_batches=1", SMALL[1])
+    again = ("experiment=smoke", "logger=none", "callbacks.pictures=null", "trainer.limit_train_batches=1", SMALL[-1])
     outcome = tool("train", *again, f"init_from={last}", "optim.lr=1e-5", "output_dir=warm")
     assert outcome.code == 0, outcome.err
     assert "starting from" in outcome.out
