@@ -18,6 +18,7 @@ from saunet.registry import objectives
 from saunet.runs.folder import RunRecord
 from saunet.training.monitors import HealthMonitor, LoaderMonitor, Loading, health, holes, sentence
 from saunet.training.optim import Recipe
+from saunet.training.pace import Pace, first_change
 from saunet.types import DepthPyramid, LossTerms
 
 
@@ -203,6 +204,30 @@ def test_copies_are_advised_where_the_data_can_be_read_from_them(
     assert ("use a faster disk or more cores" in said) == (not cacheable or cached)
 
 
+@pytest.mark.parametrize(
+    ("waiting", "augment", "given", "change"),
+    [
+        (0.5, 0.0, {"workers": 1}, "data.workers=2 (now 1)"),
+        (0.9, 0.0, {"workers": 2}, "data.workers=4 (now 2)"),
+        (0.5, 0.0, {"workers": 4}, "saunet prepare cache"),
+        (0.5, 0.0, {"workers": 4, "cacheable": False}, "no setting helps"),
+        (0.0, 0.5, {}, "color_jitter_prob=0"),
+        (0.0, 0.1, {"device": "cuda"}, "trainer.precision=bf16-mixed"),
+        (0.0, 0.1, {"device": "cuda", "precision": "bf16-mixed"}, "speed.compile=true"),
+        (0.0, 0.1, {"device": "cuda", "precision": "bf16-mixed", "compiled": True}, "the networks set the pace"),
+        (0.0, 0.1, {}, "the networks set the pace"),
+    ],
+)
+def test_the_setting_that_gains_most(
+    waiting: float, augment: float, given: dict[str, Any], change: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("saunet.training.pace.available_cores", lambda: 4)
+    usual: dict[str, Any] = {"workers": 0, "cacheable": True, "device": "cpu", "precision": "32-true"}
+    pace = Pace(step=1.0, waiting=waiting, augment=augment, decode=0.4, rest=0.1)
+    assert f"{waiting:.0%} waiting" in str(pace)
+    assert change in first_change(pace, share=0.1, **{**usual, "compiled": False, **given})
+
+
 @pytest.mark.parametrize(("slow", "epochs", "every"), [(True, 1, 2), (False, 1, 2), (True, 2, 4), (True, 3, 5)])
 def test_a_slow_loader_is_named_with_its_figures_and_a_fast_one_is_not(
     slow: bool,
@@ -215,6 +240,8 @@ def test_a_slow_loader_is_named_with_its_figures_and_a_fast_one_is_not(
     clock = [0.0]  # a clock of our own: a busy machine must not decide this test
     monkeypatch.setattr("saunet.data.loading.sampling.time.perf_counter", lambda: clock[0])
     monkeypatch.setattr("saunet.training.monitors.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("saunet.training.monitors._ENOUGH", 1)
+    monkeypatch.setattr("saunet.training.pace.available_cores", lambda: 3)
     image = tiny.Wall.image
 
     def read(self: Any, index: int) -> Any:
@@ -240,6 +267,9 @@ def test_a_slow_loader_is_named_with_its_figures_and_a_fast_one_is_not(
     with caplog.at_level("INFO"):
         trainer.fit(model, tiny.tiny_walls())
     said = [record.getMessage() for record in caplog.records if "bottleneck" in record.getMessage()]
+    (pace,) = [record.getMessage() for record in caplog.records if "to make it faster" in record.getMessage()]
+    assert f"{75 if slow else 0}% waiting" in pace
+    assert ("data.workers=3 (now 0)" if slow else "the networks set the pace") in pace
     # four samples of three images: 0.12 s to load, 0.04 s to use
     assert trainer.callback_metrics["loader/share"] == pytest.approx(0.75 if slow else 0.0, abs=0.01)
     assert trainer.callback_metrics["loader/images_per_second"] == pytest.approx(75 if slow else 300, rel=0.01)

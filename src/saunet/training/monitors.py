@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import time
@@ -19,10 +20,12 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor, distributed
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from saunet.errors import CheckpointError, SaunetError, in_range, one_of, positive
+from saunet.data.loading.module import DepthDataModule
+from saunet.errors import CheckpointError, DataError, SaunetError, in_range, one_of, positive
 from saunet.geometry import full_precision
 from saunet.runs.checkpoint import atomic_save
 from saunet.threads import SETTINGS, Usage, available_cores, free
+from saunet.training.pace import first_change, measure
 from saunet.types import DepthPyramid, LossTerms
 
 FAR = 0.8
@@ -33,6 +36,8 @@ NAMED = 3
 """Bad batches named at most in one message."""
 AHEAD = 8
 """Batches that the device may lag behind before their flags are waited for."""
+_ENOUGH = 20
+"""Steps from which a training says what set its pace."""
 _LOOK = 0.5
 """Seconds over which the use of the cores is measured before the first step."""
 
@@ -204,6 +209,7 @@ class Loading:
 class LoaderMonitor(Callback):
     """Log the loader's images a second and its share of the time, and say once when it is the bottleneck.
 
+    At the end it says where the time of a step went and what to change first.
     The first step of an epoch, before which worker processes start and validation runs, is left out. Time that the
     loader needs beside a busy device costs nothing and is not counted: only what the training step waits for is.
 
@@ -219,6 +225,8 @@ class LoaderMonitor(Callback):
         """When the step before ended, and what had been waited by then; None before the first step of an epoch."""
         self._measured = Loading(0, 0.0, 0.0)
         self._steps = 0
+        self._all = Loading(0, 0.0, 0.0)
+        self._all_steps = 0
         self._said = False
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -236,8 +244,11 @@ class LoaderMonitor(Callback):
             return
         before, sources = self._measured, batch["sources"]
         images = before.images + int(sources.shape[0] * (1 + sources.shape[1]))
-        loading = Loading(images, before.seconds + self._since[0] - since[0], before.waited + waited - since[1])
+        seconds, late = self._since[0] - since[0], waited - since[1]
+        loading = Loading(images, before.seconds + seconds, before.waited + late)
         self._measured, self._steps = loading, self._steps + 1
+        self._all = Loading(len(sources), self._all.seconds + seconds, self._all.waited + late)
+        self._all_steps += 1
         if self._steps < self.every_n_steps:
             return
         self._measured, self._steps = Loading(0, 0.0, 0.0), 0
@@ -246,6 +257,25 @@ class LoaderMonitor(Callback):
         if loading.share > self.share and not self._said:
             self._said = True
             rank_zero_info(sentence(loading, trainer))
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say what set the pace, unless there were too few steps to know."""
+        data = getattr(trainer, "datamodule", None)
+        if self._all_steps < _ENOUGH or not trainer.is_global_zero or not isinstance(data, DepthDataModule):
+            return
+        step, waiting = (total / self._all_steps for total in (self._all.seconds, self._all.waited))
+        with contextlib.suppress(DataError):  # a file that is gone by now is no reason to fail a finished training
+            pace = measure(step, waiting, data, self._all.images, pl_module.device)
+            change = first_change(
+                pace,
+                share=self.share,
+                workers=getattr(trainer.train_dataloader, "num_workers", 0),
+                cacheable=data.cacheable and data.copies is None,
+                device=pl_module.device.type,
+                precision=str(trainer.precision),
+                compiled=getattr(getattr(pl_module, "speed", None), "compile", False),
+            )
+            rank_zero_info(f"{pace}; to make it faster: {change}")
 
 
 class Threads(Callback):
