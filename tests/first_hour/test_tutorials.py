@@ -44,7 +44,7 @@ ELSEWHERE = {
     "saunet train -m 'experiment=glob(table3/*)' data.root=/data/kitti": "networks.md trains them on rendered frames",
     "saunet calibrate video=drive.mp4 output=camera.yaml": "test_driving.py has a drive with turns",
     "saunet predict checkpoint=last.ckpt input=image_02/data output=depth/ scale.method=camera_height": "measured once",
-    "saunet train experiment=demo data.stereo=true": "measured once",
+    "saunet train experiment=scratch data.stereo=true": "measured once",
 }
 """Beginnings of commands that are not run here -> where they are, or why they are not."""
 
