@@ -47,6 +47,20 @@ def test_intrinsics_follow_the_size_of_the_frames(tmp_path):
         camera.intrinsics(360, 640)
 
 
+def test_an_unknown_camera_is_guessed_where_that_is_allowed(tmp_path):
+    path = write(tmp_path, "camera: unknown\nfps: 30\ncamera_height: 1.4\ncrop: [0, 0.1, 0, 0]\n")
+    camera = read_camera(path, may_be_unknown=True)
+    assert not camera.is_known
+    assert (camera.fps, camera.camera_height, camera.crop) == (30, 1.4, (0, 0.1, 0, 0))
+    focal = 320 / np.tan(np.radians(30))
+    np.testing.assert_allclose(camera.intrinsics(480, 640), [[focal, 0, 319.5], [0, focal, 239.5], [0, 0, 1]])
+    with pytest.raises(DataError, match=r"camera: unknown, which only data=video .*saunet calibrate video="):
+        read_camera(path)
+    for text in ("camera: unknown\nK: [500, 510, 321, 242]\n", "camera: mine\n"):
+        with pytest.raises(DataError, match=r"only 'unknown' is allowed, in place of K"):
+            read_camera(write(tmp_path, text), may_be_unknown=True)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

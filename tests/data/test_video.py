@@ -13,6 +13,7 @@ from clip_tree import CAMERA, frames, make_clip, make_video
 from jaxtyping import TypeCheckError
 
 from saunet.data.video.clips import every, find_clips, frame_paths, read_clip
+from saunet.data.video.focal import FocalEstimate
 from saunet.data.video.motion import CUT, cuts, relative_change
 from saunet.errors import ConfigError, DataError
 from saunet.registry import datamodules
@@ -285,6 +286,38 @@ def test_a_bad_first_frame_is_skipped_and_no_other(tmp_path, first, static):
     assert data.skipped() == ([] if measured else ["a 0000000001"])
     assert len(names(data, "val")) >= 2
     assert all(usage.left_out["unreadable"] == 0 for usage in data.usage["val"])
+
+
+def test_an_unknown_camera_is_estimated_once_from_all_its_clips(tmp_path, monkeypatch, caplog):
+    """The estimate itself is tested with calibrate; here 0.7 widths of the cropped frames become pixels of K."""
+    asked = []
+
+    def estimate(windows, center):
+        asked.append((len(list(windows)), center))
+        return FocalEstimate(0.7, 0.004, 5)
+
+    monkeypatch.setattr("saunet.data.video.module.estimate_focal", estimate)
+    for name in ("a", "b"):
+        make_clip(tmp_path / "clips", name, frames(14), camera="camera: unknown\nfps: 10\ncrop: [0, 0.1, 0.1, 0]\n")
+    for _ in range(2):
+        data = module(tmp_path / "clips", frames_cache=str(tmp_path / "cache"))
+        with caplog.at_level("INFO"):
+            data.setup("fit")
+        K = data.datasets["train"].drives[0].intrinsics(0)
+        np.testing.assert_allclose(K, [[0.7 * 288, 0, 159.5 - 32], [0, 0.7 * 288, 99.5], [0, 0, 1]])
+    assert asked == [(2, (128 / 288, 100 / 288))]  # a window a clip; the second time it is known
+    assert "known to 0.40% from 5 windows" in caplog.text
+
+
+def test_an_unknown_camera_that_nothing_tells_is_refused_or_guessed(tmp_path):
+    make_clip(tmp_path, "a", frames(14), camera=None)
+    data = module(tmp_path, camera="unknown")
+    with pytest.raises(DataError, match=r"cannot be known .*film a minute with turns.*model\.intrinsics=learned"):
+        data.setup("fit")
+    data = module(tmp_path, camera="unknown")
+    data.guess_camera = True
+    data.setup("fit")
+    assert data.datasets["train"].drives[0].intrinsics(0)[0, 0] == pytest.approx(160 / np.tan(np.radians(30)))
 
 
 def test_what_is_missing_is_one_sentence(tmp_path):

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rendered import Winding
 from videos import write_video
 
 import saunet
 from saunet.data.video.camera import read_camera
+from saunet.data.video.focal import WINDOW, WindowFocal, combined, solve_window
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import write_image
-from saunet.synthetic import SyntheticDrive
 from saunet.synthetic.world import turn
-from saunet.tools.calibrate.driving import WINDOW, WindowFocal, combined, solve_window
 from saunet.tools.calibrate.tool import CalibrateOptions, calibrate
 from saunet.tools.doctor.findings import diagnose
 from saunet.tools.doctor.survey import survey
@@ -80,18 +80,6 @@ def test_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "camera.yaml").exists()
 
 
-class Winding(SyntheticDrive):
-    """A rendered street driven in bends of 30 degrees to both sides."""
-
-    def pose(self, index: int) -> NDArray[np.float64]:
-        heading = np.radians(30) * np.sin(2 * np.pi * np.arange(index + 1) / 40)
-        T = super().pose(0).copy()
-        T[:3, :3] = turn(heading[-1]) @ T[:3, :3]
-        T[0, 3] += 0.45 * np.sin(heading).sum()
-        T[2, 3] += 0.45 * np.cos(heading).sum()
-        return T
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "focal"), [(3, 0.58), (5, 0.9)])
 def test_rendered_turns(seed: int, focal: float, tmp_path: Path) -> None:
@@ -104,6 +92,12 @@ def test_rendered_turns(seed: int, focal: float, tmp_path: Path) -> None:
     found = read_camera(output).K[0, 0] / 480
     print(said, f"true {focal * 480:.1f}")
     assert found == pytest.approx(focal, rel=0.03)
+    (tmp_path / "clips" / "camera.yaml").write_text("camera: unknown\nfps: 10\n")
+    data = saunet.build(
+        "data", "video", root=str(tmp_path / "clips"), fps=None, workers=0, frames_cache=str(tmp_path / "cache")
+    )
+    data.setup("fit")
+    assert data.datasets["train"].drives[0].intrinsics(0)[0, 0] / 480 == pytest.approx(focal, rel=0.03)
     for factor, named in ((1.0, False), (1.2, True), (1 / 1.2, True)):
         f = focal * 480 * factor
         text = f"image_size: [480, 180]\nK: [{f}, {f}, 239.5, {0.46 * 179}]\nfps: 10\n"

@@ -12,6 +12,8 @@ condition: cloudy                      # a label; clips can be filtered and comp
 crop: [0, 0.12, 0, 0]                  # share to cut off at the top, bottom, left, right: sky, bonnet
 ```
 
+``camera: unknown`` in place of K and image_size: data=video then estimates the focal length from turns in the clips.
+
 With ``normalized: true`` K is in shares of the width and height, (0.5, 0.5) the middle of the image, and no size is
 needed.
 """
@@ -35,7 +37,7 @@ from saunet.data.checks import check_intrinsics
 from saunet.data.video.calibrations import find_camera, split_name
 from saunet.data.video.lens_models import COEFFICIENTS, WIDEST, Maps, straight_intrinsics, straightening_maps
 from saunet.errors import DataError, SaunetError, suggest
-from saunet.geometry.camera import crop_intrinsics, scale_intrinsics
+from saunet.geometry.camera import GUESS, crop_intrinsics, scale_intrinsics
 from saunet.io.atomic import write_bytes
 
 FILE_NAME = "camera.yaml"
@@ -64,6 +66,8 @@ class CameraFile:
     """Shares of the image to cut off at the top, bottom, left and right."""
     reprojection_error: float | None = None  # root mean square in pixels, where the file comes from a calibration
     fov: float | None = None  # horizontal degrees of the straight picture; None for as many as it can have
+    is_known: bool = True
+    """False where the file says ``camera: unknown``: K is a guess then."""
 
     @property
     def is_straight(self) -> bool:
@@ -72,6 +76,9 @@ class CameraFile:
 
     def intrinsics(self, height: int, width: int, what: str = "the frames") -> NDArray[np.float64]:
         """Return K, 3 x 3, in pixels of frames of a size, which must have the shape of the calibrated ones."""
+        if not self.is_known:
+            focal = GUESS * width
+            return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
         given = torch.from_numpy(self.K)
         if self.image_size is None:  # one pixel, whose center is 0
             scaled = scale_intrinsics(crop_intrinsics(given, 0.5, 0.5), width, height)
@@ -88,7 +95,12 @@ class CameraFile:
         return K
 
 
-def read_camera(path: str | Path) -> CameraFile:
+def unknown_camera(path: Path) -> CameraFile:
+    """Return a camera of which nothing is known."""
+    return CameraFile(path, np.array([[GUESS, 0, 0.5], [0, GUESS, 0.5], [0, 0, 1]]), None, is_known=False)
+
+
+def read_camera(path: str | Path, *, may_be_unknown: bool = False) -> CameraFile:
     """Read a ``camera.yaml``, or ``FILE[:camera name]`` of another tool's calibration (docs/cameras.md)."""
     path, name = split_name(path)
     try:
@@ -100,7 +112,11 @@ def read_camera(path: str | Path) -> CameraFile:
         raise DataError(f"cannot read {path}: {reason.strerror or reason}; check its rights") from reason
     if not isinstance(plain, dict):
         raise DataError(f"{path} holds {type(plain).__name__}; expected keys such as 'K: [fx, fy, cx, cy]'")
-    keys = [*(each.name for each in fields(CameraFile) if each.name != "path"), "normalized"]
+    keys = [
+        *(each.name for each in fields(CameraFile) if each.name not in ("path", "is_known")),
+        "normalized",
+        "camera",
+    ]
     if plain and not set(plain) & set(keys):
         raise DataError(
             f"{path} is no calibration that can be read: camera.yaml, ROS, OpenCV, Kalibr, COLMAP, Nerfstudio, KITTI, "
@@ -110,6 +126,16 @@ def read_camera(path: str | Path) -> CameraFile:
         if key not in keys:
             hint = suggest(str(key), keys)
             raise DataError(f"{path}: unknown key '{key}'{hint or ';'} allowed: {', '.join(keys)}")
+    if "camera" in plain:
+        if plain["camera"] != "unknown" or {"K", "image_size", "model", "distortion", "normalized"} & set(plain):
+            raise DataError(
+                f"{path}: camera is {plain['camera']!r}; only 'unknown' is allowed, in place of K and the lens"
+            )
+        if not may_be_unknown:
+            raise DataError(
+                f"{path} says camera: unknown, which only data=video can estimate; give K, or make the file with "
+                "saunet calibrate video=drive.mp4"
+            )
     return _camera(path, plain)
 
 
@@ -124,10 +150,11 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
     normalized = plain.get("normalized", False)
     if not isinstance(normalized, bool):
         raise DataError(f"{path}: normalized is {normalized!r}; it must be true or false")
-    if "K" not in plain:
+    known = plain.get("camera") is None
+    if known and "K" not in plain:
         raise DataError(f"{path} lacks K; expected 'K: [fx, fy, cx, cy]' or three rows of three numbers")
     size = None
-    if not normalized:
+    if known and not normalized:
         if "image_size" not in plain:
             raise DataError(f"{path} lacks image_size; expected 'image_size: [width, height]' of the images of K")
         width, height = _numbers(path, "image_size", plain["image_size"], (2,))
@@ -143,7 +170,7 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
     check_crop(crop, f"{path}: crop")
     camera = CameraFile(
         path=path,
-        K=_matrix(path, plain["K"]),
+        K=_matrix(path, plain["K"]) if known else unknown_camera(path).K,
         image_size=size,
         distortion=tuple(_numbers(path, "distortion", plain.get("distortion") or [], COEFFICIENTS[model])),
         model=model,
@@ -153,12 +180,13 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
         crop=(crop[0], crop[1], crop[2], crop[3]),
         reprojection_error=above_zero("reprojection_error"),
         fov=above_zero("fov"),
+        is_known=known,
     )
     if camera.fov is not None and camera.fov > WIDEST:
         raise DataError(f"{path}: fov is {camera.fov:g} degrees; a straight picture has at most {WIDEST:g}")
     if size is not None:
         check_intrinsics(camera.K, *size, f"{path}: K", FIX)
-    elif not (0.1 < camera.K[0, 0] < 20 and 0 < camera.K[0, 2] < 1 and 0 < camera.K[1, 2] < 1):
+    elif known and not (0.1 < camera.K[0, 0] < 20 and 0 < camera.K[0, 2] < 1 and 0 < camera.K[1, 2] < 1):
         raise DataError(
             f"{path}: normalized K has fx {camera.K[0, 0]:g} and center {camera.K[0, 2]:g}, {camera.K[1, 2]:g}; "
             "expected shares of the image, such as 0.58, 1.92, 0.5, 0.5"

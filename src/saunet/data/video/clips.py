@@ -19,7 +19,7 @@ from typing import overload
 
 import numpy as np
 
-from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera
+from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera, unknown_camera
 from saunet.errors import DataError
 from saunet.io.atomic import partial_name, remove_partial_files, write_json
 from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order, resize
@@ -28,6 +28,8 @@ from saunet.io.video import VIDEO_SUFFIXES, VideoReader, nearest_steps
 
 _NO_CLIPS = frozenset({"@eaDir", "__MACOSX"})
 """Folders in which other systems keep thumbnails and attributes; names with a dot in front are skipped as well."""
+UNKNOWN = "unknown"
+"""What a user calls a camera of which nothing is known, in place of its file."""
 QUALITY = 95  # JPEG quality of cached frames
 
 
@@ -77,7 +79,10 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
     if not paths:
         raise DataError(f"{root} holds neither folders of images nor videos; put each clip below it")
     base = root.parent if root.is_file() else root
-    given = read_camera(camera) if camera else None
+    given = None
+    if camera:
+        unknown = str(camera) == UNKNOWN and not Path(UNKNOWN).exists()
+        given = unknown_camera(Path(UNKNOWN)) if unknown else read_camera(camera, may_be_unknown=True)
     known: dict[Path, CameraFile] = {}
     names = [path.absolute().name if path == base else path.relative_to(base).as_posix() for path in paths]
     return [Clip(name, path, given or _camera_of(path, base, known)) for name, path in zip(names, paths, strict=True)]
@@ -274,10 +279,10 @@ def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraF
     for folder in folders[: folders.index(highest) + 1]:
         file = folder / FILE_NAME
         if file not in known and file.is_file():
-            known[file] = read_camera(file)
+            known[file] = read_camera(file, may_be_unknown=True)
         if file in known:
             return known[file]
     raise DataError(
-        f"no {FILE_NAME} for {path}: put one beside it or at {highest / FILE_NAME}, or set data.camera; "
-        "saunet calibrate makes one (see docs/your_camera.md)"
+        f"no {FILE_NAME} for {path}: put one beside it or at {highest / FILE_NAME}, or set data.camera; saunet "
+        "calibrate makes one, and data.camera=unknown estimates the focal length from turns (see docs/your_camera.md)"
     )

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import itertools
 import math
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from lightning.pytorch.utilities import rank_zero_info
 from numpy.typing import NDArray
 from rich.progress import Progress
 from typing_extensions import Unpack
@@ -21,7 +25,7 @@ from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
 from saunet.data.loading.selecting import divide
 from saunet.data.loading.windows import Selection, measured_distance, reach
-from saunet.data.video.camera import Lens, check_crop
+from saunet.data.video.camera import CameraFile, Lens, check_crop
 from saunet.data.video.clips import (
     Clip,
     FramesCacheError,
@@ -31,15 +35,20 @@ from saunet.data.video.clips import (
     read_clip,
     short_hash,
 )
-from saunet.data.video.motion import Motion, cuts, even_steps, measure
-from saunet.errors import ConfigError, DataError, in_range, one_of, positive
+from saunet.data.video.focal import WINDOW, FocalEstimate, drive_windows, estimate_focal, refusal
+from saunet.data.video.motion import Motion, cuts, even_steps, measure, motion_key
+from saunet.errors import ConfigError, DataError, UnreadableError, in_range, one_of, positive
+from saunet.io.atomic import write_json
 from saunet.io.images import read_image
+from saunet.io.plain import read_json
 from saunet.io.progress import bar
 from saunet.io.speeds import SpeedTable, read_speeds
 from saunet.registry import datamodules
 
 SPEEDS = "speeds.csv"
 """A clip's speeds: in its folder, or beside a video as ``NAME.speeds.csv``."""
+_WINDOWS = 100
+"""Windows in which turns are looked for where the camera is unknown."""
 LONGEST_STEP = 5.0
 """Seconds between two frames beyond which they are no neighbors: too much has moved meanwhile."""
 
@@ -143,6 +152,19 @@ class ClipDrive(Drive):
     def frame_size(self) -> tuple[int, int]:
         return self._lens.height, self._lens.width
 
+    @property
+    def recorded_size(self) -> tuple[int, int]:
+        """(height, width) of the frames before they are cropped."""
+        return self._lens.recorded
+
+    def seen_by(self, camera: CameraFile) -> ClipDrive:
+        """Return the same drive with another camera."""
+        twin = copy.copy(self)
+        twin.clip = replace(self.clip, camera=camera)
+        for name in ("_lens", "origin"):
+            twin.__dict__.pop(name, None)
+        return twin
+
     @functools.cached_property
     def origin(self) -> str:
         camera, lens = self.clip.camera, self._lens
@@ -207,7 +229,8 @@ class VideoDataModule(DepthDataModule):
 
     Args:
         root: Folder of clips at any depth, a folder of frames, or a video.
-        camera: Description of the camera of all clips; by default the nearest ``camera.yaml`` of each.
+        camera: Description of the camera of all clips; by default the nearest ``camera.yaml`` of each. ``unknown``: the
+            focal length is estimated from turns in the clips.
         conditions: Only clips whose camera file has one of these conditions, such as ``[cloudy, sunny]``; all if empty.
         val_clips: Clips to hold out, by name below the root or by pattern, such as ``night_*``.
         test_clips: Clips to test and predict; by default the held-out frames.
@@ -287,7 +310,8 @@ class VideoDataModule(DepthDataModule):
                     one_of("conditions", condition, found)
                 clips = [clip for clip in clips if clip.camera.condition in self.conditions]
             with bar(self._place()[0] == 0) as shown:
-                self._drives = [drive for drive in (self._usable_drive(clip, shown) for clip in clips) if drive]
+                drives = [drive for drive in (self._usable_drive(clip, shown) for clip in clips) if drive]
+            self._drives = self._with_focal_lengths(drives)
         return self._drives
 
     @property
@@ -317,6 +341,46 @@ class VideoDataModule(DepthDataModule):
                 wanted = [frame for frame in wanted if frame not in static]
             selections.append(Selection(drive, wanted, left_out))
         return selections
+
+    def _with_focal_lengths(self, drives: list[ClipDrive]) -> list[ClipDrive]:
+        """Estimate the focal length of each unknown camera from the turns in all its clips."""
+        groups: dict[tuple[Path, tuple[int, int]], list[ClipDrive]] = {}
+        for drive in drives:
+            if not drive.clip.camera.is_known and drive.indices:
+                groups.setdefault((drive.clip.camera.path, drive.recorded_size), []).append(drive)
+        known: dict[str, CameraFile] = {}
+        for (_, (height, width)), several in groups.items():
+            found, what = self._focal(several), f"the clips of {self.root} without a known camera"
+            if found is None or not found.is_known:
+                why = refusal(found, what)
+                if not self.guess_camera:
+                    raise DataError(f"{why}; or train with model.intrinsics=learned, which starts from a guess")
+                rank_zero_info(f"{why}; model.intrinsics=learned starts from 60 degrees of view")
+                continue
+            focal = found.focal * several[0].frame_size[1]
+            view = math.degrees(2 * math.atan(width / 2 / focal))
+            rank_zero_info(
+                f"focal length of {what}: {focal:.1f} px of {width} ({view:.0f} degrees), known to "
+                f"{found.uncertainty:.2%} from {found.windows} windows of {WINDOW} frames; the center and a straight "
+                "lens are assumed"
+            )
+            K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+            for drive in several:
+                known[drive.name] = replace(drive.clip.camera, K=K, image_size=(height, width), is_known=True)
+        return [drive.seen_by(known[drive.name]) if drive.name in known else drive for drive in drives]
+
+    def _focal(self, drives: Sequence[ClipDrive]) -> FocalEstimate | None:
+        """Return what turns say about the focal length of one camera, in widths of its drives' frames; kept on disk."""
+        keys = [motion_key(drive.recording.paths, self.crop or drive.clip.camera.crop) for drive in drives]
+        file = self.frames_cache / f"focal-{short_hash(repr((keys, self.fps, self.parallax, self.static)))}.json"
+        with suppress(OSError, UnreadableError, TypeError):
+            kept = read_json(file)
+            return None if kept is None else FocalEstimate(**kept)
+        K, (_, width) = drives[0].intrinsics(drives[0].indices[0]), drives[0].frame_size
+        center = (K[0, 2] + 0.5) / width, (K[1, 2] + 0.5) / width
+        found = estimate_focal(drive_windows(drives, _WINDOWS), center=center)
+        write_json(file, None if found is None else asdict(found), FramesCacheError, indent=None)
+        return found
 
     def _usable_drive(self, clip: Clip, shown: Progress) -> ClipDrive | None:
         """Return a clip as a drive; None where it cannot be read and that is to be skipped."""

@@ -168,7 +168,7 @@ def measure(
     Not ``exact``, numbers far from `SAME_PICTURE`, `MIN_FLOW` and `CUT` may come from smaller pictures: what they
     decide is the same, and they are no measure of distance.
     """
-    key = _motion_key(paths, crop) if cache else ""
+    key = motion_key(paths, crop) if cache else ""
     names = [cache / f"motion-{key}{kind}.npy" for kind in ("", "-quick")] if cache else []
     for file in names[: 1 if exact else 2]:
         known = _read_motion(file, len(paths))
@@ -212,7 +212,7 @@ def even_steps(flow: NDArray[np.float64], parallax: float) -> NDArray[np.bool_]:
     return chosen
 
 
-def _motion_key(paths: FramePaths, crop: Sequence[float | int]) -> str:
+def motion_key(paths: FramePaths, crop: Sequence[float | int]) -> str:
     text = [str([round(float(share), 6) for share in crop])]
     for path in paths.texts():
         try:

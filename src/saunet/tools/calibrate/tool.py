@@ -20,7 +20,7 @@ from saunet.io.atomic import check_folder
 from saunet.io.images import read_image, write_image
 from saunet.io.progress import bar
 from saunet.io.video import VideoReader
-from saunet.tools.calibrate.driving import KNOWN, WINDOW, estimate_focal, small_gray
+from saunet.data.video.focal import KNOWN, WINDOW, estimate_focal, small_gray
 from saunet.tools.calibrate.solve import Board, Calibration, check_picture, solve
 
 

@@ -121,9 +121,13 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
         low, high = min(views), max(views)
         yield Finding("note", f"horizontal field of view {low}{f' to {high}' if high > low else ''} degrees")
     known = [camera for camera in survey.cameras if camera.estimate is not None and camera.estimate.is_known]
+    looked, cameras = survey.focals
     if known:
         text = f"the focal lengths of {len(known)} of {len(survey.cameras)} drives were compared with turns in them"
         yield Finding("note", text)
+    if cameras > looked:
+        text = f"turns were looked for in the drives of {looked} of {cameras} different K"
+        yield Finding("note", text, "for another one: saunet calibrate video=DRIVE")
     heights = {camera.height for camera in survey.cameras}
     if heights and None not in heights:
         listed = ", ".join(map(str, sorted({round(height or 0, 2) for height in heights})))

@@ -19,9 +19,9 @@ from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.sampling import evenly
 from saunet.data.loading.selecting import optical_flow
 from saunet.data.loading.windows import WindowDataset
+from saunet.data.video.focal import WINDOW, FocalEstimate, drive_windows, estimate_focal
 from saunet.data.video.motion import relative_change, shrink
 from saunet.errors import DataError, SaunetError
-from saunet.tools.calibrate.driving import WINDOW, FocalEstimate, estimate_focal, small_gray
 
 SPLITS = ("train", "val", "test")
 ABSENT = "in absent recordings"
@@ -33,6 +33,8 @@ _TRUTHS = 16
 _PICTURES = 8
 _FOCALS = 3
 """Cameras whose focal length is estimated."""
+FOCAL_SECONDS = 20.0
+"""Time for that, all of them together; three windows of each are looked at all the same."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,8 @@ class Survey:
     """Of them, those that were asked for."""
     frames: list[FrameFacts] = field(default_factory=list)
     cameras: list[CameraFacts] = field(default_factory=list)
+    focals: tuple[int, int] = 0, 0
+    """How many cameras (of one K each) were looked at for their focal length, and how many there are."""
     camera_problems: list[str] = field(default_factory=list)
     truths: list[TruthFacts] = field(default_factory=list)
     truth_wanted: int = 0
@@ -302,25 +306,16 @@ def _estimate_focal(found: Survey, drives: Mapping[str, Drive], frames: int) -> 
     groups: dict[bytes, list[int]] = {}
     for place, camera in enumerate(found.cameras):
         groups.setdefault(camera.K.tobytes(), []).append(place)
-    for places in list(groups.values())[:_FOCALS]:
+    chosen, began = list(groups.values())[:_FOCALS], time.monotonic()
+    for number, places in enumerate(chosen):
         camera, several = found.cameras[places[0]], [drives[found.cameras[place].drive] for place in places]
-        starts = [
-            (drive, start)
-            for drive in several
-            for start in range(0, len(drive.indices) - WINDOW + 1, WINDOW // 2)
-            if drive.indices[start + WINDOW - 1] - drive.indices[start] == WINDOW - 1
-        ]
         center = (camera.K[0, 2] + 0.5) / camera.size[1], (camera.K[1, 2] + 0.5) / camera.size[1]
-        chosen = [starts[place] for place in evenly(len(starts), min(20, frames // 12))]
-
-        def windows(chosen: Sequence[tuple[Drive, int]] = chosen) -> Iterator[list[NDArray[np.uint8]]]:
-            for drive, start in chosen:
-                with suppress(DataError):  # broken frames are reported elsewhere
-                    yield [small_gray(drive.image(each)) for each in drive.indices[start : start + WINDOW]]
-
-        estimate = estimate_focal(windows(), most=6, center=center)
+        left = (FOCAL_SECONDS - (time.monotonic() - began)) / (len(chosen) - number)
+        windows = drive_windows(several, min(20, frames // WINDOW))
+        estimate = estimate_focal(windows, most=6, center=center, seconds=left)
         for place in places:
             found.cameras[place] = replace(found.cameras[place], estimate=estimate)
+    found.focals = len(chosen), len(groups)
 
 
 def _read_truths(found: Survey, dataset: WindowDataset) -> None:

@@ -10,17 +10,26 @@ import functools
 import heapq
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from saunet.data.drive import Drive
+from saunet.data.loading.sampling import evenly
+from saunet.errors import DataError
+
 F64 = NDArray[np.float64]
 WINDOW = 12
 """Frames that are solved together, about a second of them."""
+STEP = 0.1
+"""Seconds between its frames."""
 WIDTH = 620
 """Pictures are made this narrow."""
 KNOWN = 0.015
@@ -123,6 +132,35 @@ def combined(found: Sequence[WindowFocal]) -> FocalEstimate | None:
     return FocalEstimate(float(np.exp(mean)), float(np.sqrt(max(1.0, doubt) / weights.sum())), int(keep.sum()))
 
 
+def refusal(found: FocalEstimate | None, source: str) -> str:
+    """Say why a focal length cannot be known, and what to film."""
+    known = "nothing says it" if found is None else f"it is known to {found.uncertainty:.1%} only"
+    film = "film a minute with turns at 15 to 30 km/h: corners, a roundabout, a winding road"
+    return f"the focal length cannot be known from {source}: {known}, {KNOWN:.1%} is required; {film}"
+
+
+def drive_windows(drives: Sequence[Drive], most: int) -> Iterator[list[NDArray[np.uint8]]]:
+    """Yield windows of gray frames about `STEP` apart, evenly spread over recordings."""
+    starts = []
+    for drive in drives:
+        every = max(1, round(STEP * (drive.fps or 0) / _median_step(drive)))
+        span = every * (WINDOW - 1)
+        for start in range(0, len(drive.indices) - span, max(1, span // 2)):
+            chosen = drive.indices[start : start + span + 1 : every]
+            if chosen[-1] - chosen[0] == span:  # nothing is missing
+                starts.append((drive, chosen))
+    for place in evenly(len(starts), most):
+        drive, chosen = starts[place]
+        with suppress(DataError):  # broken frames are reported elsewhere
+            yield [small_gray(drive.image(each)) for each in chosen]
+
+
+def _median_step(drive: Drive) -> float:
+    """Return how many recorded frames there are to a step of the indices."""
+    numbers = [drive.recorded(index) for index in drive.indices[:100]]
+    return max(1.0, float(np.median(np.diff(numbers)))) if len(numbers) > 1 else 1.0
+
+
 def small_gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return an RGB picture, h x w x 3, in gray, at most `WIDTH` wide."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -138,20 +176,29 @@ def turning(pixels: F64, known: NDArray[np.bool_]) -> float:
 
 
 def estimate_focal(
-    windows: Iterable[Sequence[NDArray[np.uint8]]], most: int = 16, center: tuple[float, float] | None = None
+    windows: Iterable[Sequence[NDArray[np.uint8]]],
+    most: int = 16,
+    center: tuple[float, float] | None = None,
+    seconds: float = math.inf,
 ) -> FocalEstimate | None:
     """Estimate the focal length from windows of gray frames; the ``most`` that turn most are solved.
 
-    ``center`` is the principal point in picture widths. None if no window has enough points to follow.
+    ``center`` is the principal point in picture widths. After ``seconds`` no window is begun but the three that are
+    needed. None if no window has enough points to follow.
     """
+    began = time.monotonic()
     best: list[tuple[float, int, Any]] = []
     for number, frames in enumerate(windows):
         pixels, known = track(frames)
         heapq.heappush(best, (turning(pixels, known), number, (pixels, known, frames[0].shape[:2])))
         if len(best) > most:
             heapq.heappop(best)
-    solved = []
-    for _, _, (pixels, known, size) in best:
+        if number >= 2 and time.monotonic() - began > seconds / 2:
+            break
+    solved: list[WindowFocal | None] = []
+    for _, _, (pixels, known, size) in sorted(best, reverse=True, key=itemgetter(0)):
+        if len(solved) >= 3 and time.monotonic() - began > seconds:
+            break
         at = None if center is None else (center[0] * size[1], center[1] * size[1])
         solved.append(solve_window(pixels, known, size, at))
     return combined([each for each in solved if each])
