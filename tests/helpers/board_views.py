@@ -21,11 +21,23 @@ def poses(count, seed=0, tilt=0.6, spread=1.0):
         yield cv2.Rodrigues(turn)[0], place * [spread, spread, 1]
 
 
-def views(board, count=14, distortion=None, seed=0, per_square=40, tilt=0.6, undistort=cv2.undistortPoints, spread=1.0):
+def views(
+    board,
+    count=14,
+    distortion=None,
+    seed=0,
+    per_square=40,
+    tilt=0.6,
+    undistort=cv2.undistortPoints,
+    spread=1.0,
+    T_this_first=None,
+):
     """Return pictures of the board, RGB, anti-aliased, with its center at each pose's place.
 
-    ``undistort`` is the lens: `cv2.fisheye.undistortPoints` for a fisheye.
+    ``undistort`` is the lens: `cv2.fisheye.undistortPoints` for a fisheye. ``T_this_first`` places the camera in a rig,
+    of which the first sees the board at its poses.
     """
+    T = np.eye(4) if T_this_first is None else T_this_first
     texture = board.picture(per_square)
     meters = board.square / per_square
     height, width = texture.shape
@@ -34,7 +46,7 @@ def views(board, count=14, distortion=None, seed=0, per_square=40, tilt=0.6, und
     finer = 3
     S = np.array([[finer, 0, (finer - 1) / 2], [0, finer, (finer - 1) / 2], [0, 0, 1.0]])
     pictures = []
-    for R, t in poses(count, seed, tilt, spread):
+    for R, t in ((T[:3, :3] @ R, T[:3, :3] @ t + T[:3, 3]) for R, t in poses(count, seed, tilt, spread)):
         H = S @ K @ np.c_[R[:, :2], t] @ A
         large = cv2.warpPerspective(
             texture,

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import os
+
 import cv2
 import numpy as np
 import pytest
+import yaml
 from board_views import SIZE, K, views
 from processes import python
 
@@ -35,6 +38,10 @@ def test_the_camera_of_a_synthetic_chessboard_is_recovered(tmp_path):
     assert np.abs(result.camera.distortion[0]) < 0.02
     picture = check_picture(result)
     assert picture.shape == (SIZE[0], 2 * SIZE[1], 3)
+    root = np.sqrt(np.mean([(miss**2).sum(1).mean() for miss in result.misses]))
+    assert root == pytest.approx(result.error, rel=0.01)
+    photos = solve(tmp_path / "pictures" / "0*.png", Board())
+    np.testing.assert_array_equal(photos.camera.K, result.camera.K)
     write_camera(tmp_path / "camera.yaml", result.camera, "a note")
     again = read_camera(tmp_path / "camera.yaml")
     np.testing.assert_allclose(again.K, result.camera.K, rtol=1e-6)
@@ -54,6 +61,52 @@ def test_charuco_in_a_video_and_distortion(tmp_path):
     np.testing.assert_allclose(result.camera.K[[0, 1], [0, 1]], K[[0, 1], [0, 1]], rtol=0.01)
     assert result.camera.distortion[0] == pytest.approx(-0.25, abs=0.05)
     assert result.camera.fps is None  # that of this video; other recordings of the camera have their own
+
+
+def test_an_aprilgrid_is_printed_as_kalibr_does_and_recovered(tmp_path):
+    board = Board("aprilgrid", columns=6, rows=5, square=0.03)
+    drawn = board.picture(40)
+    step, first = 52, (20 + 12, 20 + 12 + 4 * 52)  # x, y of tag 0, at the bottom left
+    for number, code in ((0, 0xD5D628584), (1, 0xD97F18B49), (6, 0x056A5D085)):  # Kalibr's t36h11
+        x, y = first[0] + number % 6 * step, first[1] - number // 6 * step
+        modules = drawn[y + 2 : y + 40 : 4, x + 2 : x + 40 : 4] > 127
+        bits = [code >> (35 - bit) & 1 for bit in range(36)]  # from the top left; white is 1
+        np.testing.assert_array_equal(modules, np.pad(np.array(bits, bool).reshape(6, 6), 2))
+        np.testing.assert_array_equal(drawn[[y - 2, y - 2, y + 41, y + 41], [x - 2, x + 41, x - 2, x + 41]], 0)
+    result = solve(save(tmp_path / "pictures", views(board, 14, [-0.2, 0.05, 0, 0, 0], spread=2.0)), board)
+    assert len(result.views) == 14
+    assert result.error < 0.2
+    np.testing.assert_allclose(result.camera.K[[0, 1], [0, 1]], K[[0, 1], [0, 1]], rtol=0.005)
+    np.testing.assert_allclose(result.camera.K[:2, 2], K[:2, 2], atol=2)
+    assert result.camera.distortion[0] == pytest.approx(-0.2, abs=0.03)
+
+
+def test_the_cameras_of_a_rig_are_placed(tmp_path):
+    """The second camera is 12 cm to the right, a little turned; the third is not there for enough pictures."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(np.array([0.01, 0.05, -0.02]))[0], (-0.12, 0.004, 0.01)
+    board = Board("aprilgrid", columns=6, rows=6, square=0.03)
+    save(tmp_path / "left", views(board, 14, spread=2.0))
+    save(tmp_path / "right", views(board, 14, spread=2.0, T_this_first=T))
+    about = {"board": "aprilgrid", "columns": 6, "rows": 6, "square": 0.03, "output": str(tmp_path / "camera.yaml")}
+    right = str(tmp_path / "right")
+    said = str(saunet.calibrate(saunet.CalibrateOptions(input=str(tmp_path / "left"), rig=[right], **about)))
+    print(said)
+    assert "camera 1" in said
+    assert "seen from camera 0: 0.12" in said
+    chain = yaml.safe_load((tmp_path / "camera_rig.yaml").read_text())
+    found = np.array(chain["cam1"]["T_cn_cnm1"])
+    np.testing.assert_allclose(found[:3, 3], T[:3, 3], atol=1e-3)
+    np.testing.assert_allclose(found[:3, :3], T[:3, :3], atol=2e-3)
+    for number, file in enumerate(("camera.yaml", "camera_1.yaml")):
+        named = read_camera(f"{tmp_path / 'camera_rig.yaml'}:cam{number}")
+        np.testing.assert_allclose(named.K, read_camera(tmp_path / file).K, rtol=1e-6)
+    for name in os.listdir(right)[:3]:
+        os.unlink(os.path.join(right, name))
+    with pytest.raises(DataError, match=r"has 14 pictures and .*right 11; the cameras of a rig need as many"):
+        saunet.calibrate(saunet.CalibrateOptions(input=str(tmp_path / "left"), rig=[right], overwrite=True, **about))
+    with pytest.raises(ConfigError, match=r"camera_1.yaml exists|camera_rig.yaml exists|camera.yaml exists"):
+        saunet.CalibrateOptions(input="left", rig=[right], **about)
 
 
 def test_a_fisheye_is_calibrated_on_the_command_line(tmp_path):
@@ -92,6 +145,8 @@ def test_what_cannot_be_trusted_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"mixes pictures of 640x480 and 640x400"):
         solve(mixed, Board())
     (tmp_path / "none").mkdir()
+    with pytest.raises(DataError, match=r"no images in .*\*\.jpg; give a folder or a pattern"):
+        solve(tmp_path / "few" / "*.jpg", Board())
     with pytest.raises(DataError, match=r"no images in .*none"):
         solve(tmp_path / "none", Board())
 
@@ -119,6 +174,8 @@ def _bent(picture):
         ({"kind": "charuco", "columns": 30, "rows": 20}, "has 100 markers and the board needs 300; .* DICT_4X4_1000"),
         ({"kind": "charuco", "columns": 50, "rows": 50}, "has 100 markers and the board needs 1250; use fewer squares"),
         ({"kind": "charuco", "marker": 1.5}, "marker is 1.5"),
+        ({"kind": "aprilgrid", "columns": 30, "rows": 20}, "has 30x20 tags; allowed are 2x2 to 587"),
+        ({"kind": "aprilgrid", "spacing": 0.0}, "spacing is 0"),
         ({"square": 0.0}, "square is 0.0"),
     ],
 )

@@ -379,6 +379,20 @@ def export_camera(path: str | Path, camera: CameraFile, kind: str) -> None:
     Raises:
         ConfigError: if the format is unknown or has no such lens model.
     """
+    write_bytes(path, _exported(camera, kind).encode())
+
+
+def export_rig(path: str | Path, cameras: Sequence[CameraFile], poses: Sequence[Any]) -> None:
+    """Write the cameras of a rig as a Kalibr camchain; ``poses`` are T_cn_cnm1 of all but the first, 4 x 4, meters."""
+    chain: Plain = {}
+    for number, camera in enumerate(cameras):
+        chain[f"cam{number}"] = {**yaml.safe_load(_exported(camera, "kalibr"))["cam0"], "rostopic": f"/cam{number}"}
+        if number:
+            chain[f"cam{number}"]["T_cn_cnm1"] = [[float(each) for each in row] for row in poses[number - 1]]
+    write_bytes(path, _dump(chain).encode())
+
+
+def _exported(camera: CameraFile, kind: str) -> str:
     one_of("export", kind, EXPORTS)
     if camera.image_size is None or camera.K[0, 1]:
         raise ConfigError("export needs K in pixels and without skew; this camera's is normalized or skewed")
@@ -393,7 +407,7 @@ def export_camera(path: str | Path, camera: CameraFile, kind: str) -> None:
             f"{kind} has no {model} lens with the distortion {bent}; choose another export "
             "(for kalibr calibrate with export=kalibr, which leaves k3 out)"
         )
-    write_bytes(path, text.encode())
+    return text
 
 
 def _to_ros(width: int, height: int, K: list[float], bent: list[float], model: str) -> str | None:

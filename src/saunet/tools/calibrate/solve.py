@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,15 @@ from saunet.data.video.camera import CameraFile, Lens
 from saunet.data.video.clips import frame_paths
 from saunet.data.video.lens_models import fold, rays_of
 from saunet.errors import ConfigError, DataError, in_range, one_of, positive, suggest
-from saunet.io.images import read_image, resize
+from saunet.io.images import natural_order, read_image, resize
 from saunet.io.video import VideoReader
 
-KINDS = ("chessboard", "charuco")
+KINDS = ("chessboard", "charuco", "aprilgrid")
+_TAGS = cv2.aruco.DICT_APRILTAG_36h11
+_BORDER = 2
+"""Black modules around the 6x6 of a tag, as Kalibr prints them."""
+_REFINED = 0.1
+"""Half of the window in which a tag's corner is refined, over its side: smaller than its border and the space."""
 _SEARCH_WIDTH = 1280
 """Pictures are made this narrow to look for the board; corners are then refined in the picture itself."""
 _FEWEST_CORNERS = 8
@@ -30,6 +36,8 @@ UNCERTAIN = 0.02
 """Relative standard deviation of the focal length from which a calibration is refused."""
 UNCERTAIN_CORNER = 0.005
 """Standard deviation of a corner, over the width, from which a calibration is refused."""
+MAGNIFIED = 50
+"""Length of a drawn residual over its own."""
 _CELLS = (6, 8)
 """Rows and columns of the grid on which coverage is counted."""
 
@@ -42,6 +50,8 @@ class BoardView:
     """n x 3, meters on the board, z = 0."""
     pixels: NDArray[np.float32]
     """n x 2; integer coordinates are pixel centers."""
+    number: int = 0
+    """Of the picture among those that were looked at."""
 
 
 class Board:
@@ -55,9 +65,15 @@ class Board:
         square: float = 0.025,
         marker: float = 0.75,
         dictionary: str = "DICT_4X4_100",
+        spacing: float = 0.3,
     ) -> None:
-        self.kind = one_of("board", kind, KINDS)
-        if columns < 4 or rows < 4:
+        self.kind, self.spacing = one_of("board", kind, KINDS), spacing
+        if kind == "aprilgrid":
+            in_range("spacing", spacing, 0.05, 1.0)
+            tags = len(cv2.aruco.getPredefinedDictionary(_TAGS).bytesList)
+            if min(columns, rows) < 2 or columns * rows > tags:
+                raise ConfigError(f"the board has {columns}x{rows} tags; allowed are 2x2 to {tags} in all")
+        elif columns < 4 or rows < 4:
             raise ConfigError(f"the board has {columns}x{rows} squares; it needs at least 4 in both directions")
         self.columns, self.rows = columns, rows
         self.square = float(positive("square", square))
@@ -85,10 +101,14 @@ class Board:
         """Pictures in which only the layout of OpenCV before 4.6 was found."""
 
     def __str__(self) -> str:
+        if self.kind == "aprilgrid":
+            return f"aprilgrid of {self.columns}x{self.rows} tags"
         return f"{self.kind} of {self.columns}x{self.rows} squares ({self.columns - 1}x{self.rows - 1} inner corners)"
 
     def picture(self, pixels_a_square: int = 120) -> UInt8[np.ndarray, "h w"]:
         """Return the board to print, with a white margin of one square."""
+        if self.kind == "aprilgrid":
+            return self._aprilgrid(pixels_a_square)
         size = (self.columns * pixels_a_square, self.rows * pixels_a_square)
         if self._charuco is not None:
             inner = np.asarray(self._charuco.generateImage(size))
@@ -100,7 +120,55 @@ class Board:
     def find(self, image: UInt8[np.ndarray, "h w 3"]) -> BoardView | None:
         """Return the board in an RGB picture; None where it is not, or not enough of it."""
         gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        if self.kind == "aprilgrid":
+            return self._find_aprilgrid(gray)
         return self._find_charuco(gray) if self._charuco is not None else self._find_chessboard(gray)
+
+    def _aprilgrid(self, side: int) -> UInt8[np.ndarray, "h w"]:
+        """Return what Kalibr prints: tag 0 at the bottom left, and squares that make all corners saddles."""
+        words, gap = cv2.aruco.getPredefinedDictionary(_TAGS), round(self.spacing * side)
+        left, top = (
+            [round(n * (1 + self.spacing) * side) for n in range(count + 1)] for count in (self.columns, self.rows)
+        )
+        drawn = np.full((top[-1] + gap, left[-1] + gap), 255, np.uint8)
+        for row in range(self.rows + 1):
+            for column in range(self.columns + 1):
+                drawn[top[row] : top[row] + gap, left[column] : left[column] + gap] = 0
+                if row < self.rows and column < self.columns:
+                    number, modules = (self.rows - 1 - row) * self.columns + column, 6 + 2 * _BORDER
+                    tag = np.rot90(cv2.aruco.generateImageMarker(words, number, modules, borderBits=_BORDER), 2)
+                    large = cv2.resize(np.ascontiguousarray(tag), (side, side), interpolation=cv2.INTER_NEAREST_EXACT)
+                    at = (
+                        slice(top[row] + gap, top[row] + gap + side),
+                        slice(left[column] + gap, left[column] + gap + side),
+                    )
+                    drawn[at] = large
+        return np.pad(drawn, side // 2, constant_values=255)
+
+    def _find_aprilgrid(self, gray: NDArray[np.uint8]) -> BoardView | None:
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.markerBorderBits = _BORDER
+        detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(_TAGS), parameters)
+        corners, numbers, _ = detector.detectMarkers(gray)
+        stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
+        points, pixels = list[tuple[float, float, float]](), list[NDArray[np.float32]]()
+        for found, number in zip(corners, [] if numbers is None else np.ravel(numbers).tolist(), strict=True):
+            if number >= self.columns * self.rows:
+                continue
+            tag = np.asarray(found, np.float32).reshape(4, 1, 2)
+            window = max(2, round(_REFINED * float(np.linalg.norm(tag - np.roll(tag, 1, 0), axis=2).min())))
+            refined = np.asarray(cv2.cornerSubPix(gray, tag.copy(), (window, window), (-1, -1), stop))
+            row, column = divmod(number, self.columns)
+            # OpenCV's tags are Kalibr's upside down: the first corner, its top left, is at the bottom right; y is up.
+            for (x, y), at, was in zip(((1, 0), (0, 0), (0, 1), (1, 1)), refined[:, 0], tag[:, 0], strict=True):
+                inside = (at > window).all() and (at < np.array(gray.shape[::-1]) - 1 - window).all()
+                if inside and 0 < np.linalg.norm(at - was) <= 1.5 * window:  # OpenCV leaves what it cannot refine
+                    places = column * (1 + self.spacing) + x, row * (1 + self.spacing) + y
+                    points.append((places[0] * self.square, places[1] * self.square, 0.0))
+                    pixels.append(at)
+        if len(pixels) < 2 * _FEWEST_CORNERS:
+            return None
+        return BoardView(np.array(points, np.float32), np.array(pixels, np.float32))
 
     def _find_chessboard(self, gray: NDArray[np.uint8]) -> BoardView | None:
         scale = min(1.0, _SEARCH_WIDTH / gray.shape[1])
@@ -143,11 +211,15 @@ class Calibration:
     coverage: float
     """Fraction of the image in which the board was seen."""
     views: tuple[BoardView, ...]
+    misses: tuple[NDArray[np.float64], ...]
+    """Residuals of each view, n x 2: where the camera shows a corner, from where it was found, in pixels."""
     looked_at: int
     dropped: int
     """Views left out since they fit the others badly."""
     example: UInt8[np.ndarray, "h w 3"]
     """One of the pictures."""
+    found: tuple[BoardView, ...] = ()
+    """The board in all pictures in which it was found."""
 
 
 def solve(
@@ -172,7 +244,7 @@ def solve(
         size = (image.shape[0], image.shape[1])
         view = board.find(image)
         if view is not None:
-            found.append(view)
+            found.append(replace(view, number=looked_at - 1))
             example = image
         advance(looked_at, total)
     if len(found) < FEWEST_VIEWS or example is None:
@@ -197,27 +269,121 @@ def solve(
     if problem:
         raise DataError(f"the calibration from {source} is not to be trusted: {problem}")
     dropped = len(chosen) - len(used)
-    coverage = _coverage(used, size)
-    return Calibration(camera, fit.error, uncertainty, corner, coverage, tuple(used), looked_at, dropped, example)
+    coverage, misses = float(_covered(used, size).mean()), tuple(_misses(fit, used))
+    return Calibration(
+        camera,
+        fit.error,
+        uncertainty,
+        corner,
+        coverage,
+        tuple(used),
+        misses,
+        looked_at,
+        dropped,
+        example,
+        tuple(found),
+    )
 
 
 def check_picture(result: Calibration) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return a picture to judge a calibration by: all corners found, and beside it the same picture undistorted."""
-    left = result.example.copy()
-    radius = max(2, left.shape[1] // 320)
-    for view in result.views:
-        for x, y in view.pixels:
-            cv2.circle(left, (round(float(x)), round(float(y))), radius, (255, 60, 0), -1, cv2.LINE_AA)
-    right = Lens(result.camera, *result.example.shape[:2])(result.example)
+    """Return a picture to judge a calibration by, and beside it the same picture undistorted.
+
+    On the left, each corner found has a line that is `MAGNIFIED` times its residual, and what the board never covered
+    is dark.
+    """
+    left, (height, width) = result.example.copy(), result.example.shape[:2]
+    seen = cv2.resize(_covered(result.views, (height, width)).astype(np.uint8), (width, height), interpolation=0)
+    left = np.where(seen[..., None] > 0, left // 2 + 110, left // 3)
+    thick = max(1, width // 640)
+    for view, misses in zip(result.views, result.misses, strict=True):
+        for at, miss in zip(view.pixels, misses, strict=True):
+            ends = [(round(float(x)), round(float(y))) for x, y in (at, at + MAGNIFIED * miss)]
+            cv2.circle(left, ends[0], 2 * thick, (0, 90, 255), -1, cv2.LINE_AA)
+            cv2.line(left, *ends, (255, 40, 0), thick, cv2.LINE_AA)
+    right = Lens(result.camera, height, width)(result.example)
     return np.concatenate([left, right], axis=1)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a camera of a rig is, seen from the one before it."""
+
+    T: NDArray[np.float64]
+    """T_this_before, 4 x 4: a point of the camera before times it is one of this camera; meters."""
+    error: float
+    """Root mean square reprojection error of both cameras, pixels."""
+    deviation: float
+    """Standard deviation of its position, meters, by leaving out pictures."""
+    pairs: int
+    """Pictures in which both saw the board."""
+
+    def __str__(self) -> str:
+        turn = float(np.degrees(np.linalg.norm(cv2.Rodrigues(self.T[:3, :3])[0])))
+        distance = float(np.linalg.norm(self.T[:3, 3]))
+        return (
+            f"{distance:.4f} m away (known to {1000 * self.deviation:.1f} mm), turned by {turn:.2f} degrees; "
+            f"error {self.error:.3f} px in {self.pairs} pairs"
+        )
+
+
+def place(before: Calibration, after: Calibration) -> Placement:
+    """Find where a camera is, seen from another one, by the pictures in which both see the board.
+
+    Lenses are those calibrated; their views are straightened first, so that any two can be paired.
+    """
+    if before.looked_at != after.looked_at:
+        raise DataError(
+            f"{before.camera.path} has {before.looked_at} pictures and {after.camera.path} {after.looked_at}; the "
+            "cameras of a rig need as many, taken at the same moments"
+        )
+    others, pairs = {view.number: view for view in after.found}, []
+    for view in before.found:
+        other = others.get(view.number)
+        if other is None:
+            continue
+        known = {tuple(point): place for place, point in enumerate(np.round(other.points, 6).tolist())}
+        both = [(n, known[p]) for n, p in enumerate(map(tuple, np.round(view.points, 6).tolist())) if p in known]
+        if len(both) >= _FEWEST_CORNERS:
+            ours, theirs = (np.array(each) for each in zip(*both, strict=True))
+            pairs.append((view.points[ours], _straight(before, view, ours), _straight(after, other, theirs)))
+    if len(pairs) < FEWEST_VIEWS:
+        raise DataError(
+            f"{len(pairs)} pictures show the board to both {before.camera.path} and {after.camera.path}; at least "
+            f"{FEWEST_VIEWS} are required: film it where their views overlap"
+        )
+    focals = [float(each.camera.K[0, 0]) for each in (before, after)]
+    error, T = _stereo(pairs, focals)
+    groups = min(8, len(pairs))
+    shifts = np.array(
+        [_stereo([p for n, p in enumerate(pairs) if n % groups != g], focals)[1][:3, 3] for g in range(groups)]
+    )
+    deviation = float(np.sqrt((groups - 1) / groups * ((shifts - shifts.mean(0)) ** 2).sum()))  # jackknife
+    return Placement(T, error, deviation, len(pairs))
+
+
+def _straight(result: Calibration, view: BoardView, chosen: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return corners as an ideal camera with the focal length fx and its center at 0 shows them."""
+    camera, pixels = result.camera, view.pixels[chosen].reshape(-1, 1, 2).astype(np.float64)
+    undistort: Any = cv2.fisheye.undistortPoints if camera.model == "fisheye" else cv2.undistortPoints
+    return np.asarray(undistort(pixels, camera.K, np.array(camera.distortion)) * camera.K[0, 0], np.float32)
+
+
+def _stereo(pairs: Sequence[Any], focals: Sequence[float]) -> tuple[float, NDArray[np.float64]]:
+    points, ours, theirs = zip(*pairs, strict=True)
+    first, second = (np.diag([focal, focal, 1.0]) for focal in focals)
+    lenses = first, np.zeros(5), second, np.zeros(5)
+    found = cv2.stereoCalibrate(points, ours, theirs, *lenses, (1, 1), flags=cv2.CALIB_FIX_INTRINSIC)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = found[5], np.ravel(found[6])
+    return float(found[0]), T
 
 
 def _pictures(source: Path, most: int) -> Iterator[tuple[NDArray[np.uint8], int | None]]:
     """Yield (image, number of pictures), evenly spread where there are more than ``most``."""
-    if source.is_dir():
-        paths = frame_paths(source)
+    if source.is_dir() or (not source.exists() and set("*?[") & set(str(source))):
+        paths = frame_paths(source) if source.is_dir() else sorted(map(Path, glob(str(source))), key=natural_order)
         if not paths:
-            raise DataError(f"no images in {source}; give a folder of pictures of the board, or a video")
+            raise DataError(f"no images in {source}; give a folder or a pattern of pictures of the board, or a video")
         for place in evenly(len(paths), most):
             yield read_image(paths[place]), min(most, len(paths))
         return
@@ -271,12 +437,15 @@ def _solve(views: Sequence[BoardView], size: tuple[int, int], model: str, k3: bo
     used = list(views)
     while True:
         fit = _fisheye(used, size) if model == "fisheye" else _pinhole(used, size, k3)
-        misses = [fit.project(view.points, pose)[0] - view.pixels for view, pose in zip(used, fit.poses, strict=True)]
-        errors = np.array([np.sqrt((miss**2).sum(1).mean()) for miss in misses])
+        errors = np.array([np.sqrt((miss**2).sum(1).mean()) for miss in _misses(fit, used)])
         good = errors <= max(0.5, 3 * float(np.median(errors)))
         if good.all() or int(good.sum()) < FEWEST_VIEWS:
             return fit, used
         used = [view for view, fits in zip(used, good, strict=True) if fits]
+
+
+def _misses(fit: _Fit, views: Sequence[BoardView]) -> list[NDArray[np.float64]]:
+    return [fit.project(view.points, pose)[0] - view.pixels for view, pose in zip(views, fit.poses, strict=True)]
 
 
 def _pinhole(views: Sequence[BoardView], size: tuple[int, int], k3: bool) -> _Fit:
@@ -370,9 +539,10 @@ def _outside(fit: _Fit, views: Sequence[BoardView], corner: float, size: tuple[i
     return None
 
 
-def _coverage(views: Sequence[BoardView], size: tuple[int, int]) -> float:
+def _covered(views: Sequence[BoardView], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return in which cells of the picture the board was seen."""
     seen = np.zeros(_CELLS, dtype=bool)
     for view in views:
         cells = (view.pixels[:, ::-1] / np.array(size) * np.array(_CELLS)).astype(int)
         seen[tuple(np.clip(cells, 0, np.array(_CELLS) - 1).T)] = True
-    return float(seen.mean())
+    return seen

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -11,17 +12,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.data.video.calibrations import EXPORTS, SUFFIXES, export_camera, split_name
+from saunet.data.video.calibrations import EXPORTS, SUFFIXES, export_camera, export_rig, split_name
 from saunet.data.video.camera import CameraFile, Lens, read_camera, write_camera
 from saunet.data.video.clips import frame_paths
+from saunet.data.video.focal import STEP, WINDOW, estimate_focal, refusal, small_gray
 from saunet.data.video.lens_models import WIDEST
 from saunet.errors import ConfigError, DataError, checked, in_range, one_of, positive
 from saunet.io.atomic import check_folder
 from saunet.io.images import read_image, write_image
 from saunet.io.progress import bar
 from saunet.io.video import VideoReader
-from saunet.data.video.focal import KNOWN, WINDOW, estimate_focal, small_gray
-from saunet.tools.calibrate.solve import Board, Calibration, check_picture, solve
+from saunet.tools.calibrate.solve import MAGNIFIED, Board, Calibration, check_picture, place, solve
 
 
 @checked
@@ -38,21 +39,26 @@ class CalibrateOptions:
     """
 
     input: str | None = None
-    """A video, or a folder of pictures, of the board held in many places and tilts; or a calibration ``FILE[:camera]``
-    of another tool, to convert."""
+    """A video, a folder or a pattern (``photos/*.jpg``) of pictures of the board held in many places and tilts; or a
+    calibration ``FILE[:camera]`` of another tool, to convert."""
     video: str | None = None
     """In place of ``input``: a driving video with turns, or a folder of its frames. Gives the focal length, if it can
     be known; the center is taken to be the middle, and the lens to be straight."""
     output: str = "camera.yaml"
     """The camera file to write; a picture to check it by is written beside it."""
-    board: Literal["chessboard", "charuco"] = "chessboard"
-    """A ``charuco`` board has markers and may be partly hidden."""
+    rig: Sequence[str] = ()
+    """Videos or pictures of the same board by further cameras of a rig, taken at the same moments as ``input``. Where
+    each camera is, seen from the one before it, goes into a Kalibr camchain beside ``output``."""
+    board: Literal["chessboard", "charuco", "aprilgrid"] = "chessboard"
+    """A ``charuco`` board or a Kalibr ``aprilgrid`` has markers and may be partly hidden."""
     columns: int = 10
-    """Squares from left to right."""
+    """Squares (of an aprilgrid: tags) from left to right."""
     rows: int = 7
-    """Squares from top to bottom."""
+    """The same from top to bottom."""
     square: float = 0.025
-    """Side of a square in meters."""
+    """Side of a square, or of a tag with its black border, in meters."""
+    spacing: float = 0.3
+    """Space between the tags of an aprilgrid over their side."""
     marker: float = 0.75
     """Side of a ChArUco marker as a fraction of the square."""
     dictionary: str = "DICT_4X4_100"
@@ -89,7 +95,9 @@ class CalibrateOptions:
             one_of("export", self.export, EXPORTS)
         if self.fov is not None:
             in_range("fov", self.fov, 1.0, WIDEST)
-        for path in filter(None, (Path(self.output), self.exported())):
+        if self.rig and self.input is None:
+            raise ConfigError("rig names further cameras that filmed the board of input; set input too")
+        for path in filter(None, (Path(self.output), self.exported(), *self.rig_files())):
             if path.exists() and not self.overwrite:
                 raise ConfigError(f"{path} exists; choose another output, or set overwrite=true")
         one_of("lens", self.lens, ("pinhole", "fisheye"))
@@ -103,9 +111,15 @@ class CalibrateOptions:
         output = Path(self.output)
         return output.with_name(output.stem + EXPORTS[self.export]) if self.export else None
 
+    def rig_files(self) -> list[Path]:
+        """Return the camchain and the camera files of a rig's further cameras; none without a rig."""
+        output = Path(self.output)
+        names = ["rig", *map(str, range(1, len(self.rig) + 1))] if self.rig else []
+        return [output.with_name(f"{output.stem}_{name}{output.suffix}") for name in names]
+
     def target(self) -> Board:
         """Return the board."""
-        return Board(self.board, self.columns, self.rows, self.square, self.marker, self.dictionary)
+        return Board(self.board, self.columns, self.rows, self.square, self.marker, self.dictionary, self.spacing)
 
 
 @dataclass(frozen=True)
@@ -147,7 +161,7 @@ def calibrate(
         how = "print it, glue it to something flat, and measure a square"
         return CalibrateResult(Path(options.print_board), f"{board}: {options.print_board}; {how}")
     check_folder(Path(options.output).parent)
-    result = None
+    result, more = None, list[Calibration]()
     if options.video is not None:
         camera, note = _from_driving(options.video)
     elif split_name(str(options.input))[0].suffix.lower() in SUFFIXES:
@@ -157,8 +171,9 @@ def calibrate(
         with bar() as shown:
             task = shown.add_task("looking for the board", total=None)
             advance = advance or (lambda done, total: shown.update(task, completed=done, total=total))
-            k3 = options.export != "kalibr"  # which has no such number
-            result = solve(str(options.input), board, options.lens, options.views, options.max_error, advance, k3)
+            k3 = options.export != "kalibr" and not options.rig  # Kalibr has no such number
+            settings = board, options.lens, options.views, options.max_error, advance, k3
+            result, *more = (solve(source, *settings) for source in (str(options.input), *options.rig))
         camera = result.camera
         note = f"from {len(result.views)} views of a {board} in {Path(str(options.input)).name}"
     own: dict[str, Any] = {"camera_height": options.camera_height, "condition": options.condition, "fov": options.fov}
@@ -166,6 +181,7 @@ def calibrate(
     if camera.image_size:
         Lens(camera, *camera.image_size)  # a lens that cannot be straightened is refused before anything is written
     output, exported, K = Path(options.output), options.exported(), camera.K
+    told = _write_rig(options, [result, *more]) if result and more else []
     if exported and options.export:
         export_camera(exported, camera, options.export)
     write_camera(output, camera, f"saunet calibrate: {note}")
@@ -185,8 +201,23 @@ def calibrate(
         lines.append("the board has the layout of OpenCV before 4.6 (legacy pattern)")
     if result.coverage < 0.6:
         lines.append(f"the board was seen in {result.coverage:.0%} of the image only: hold it into the corners too")
-    lines.append(f"{files}; look at {picture}: straight lines must be straight on its right side")
+    lines += told
+    drawn = f"on the left, residuals {MAGNIFIED} times and dark where the board was not seen"
+    lines.append(f"{files}; look at {picture}: straight lines must be straight on its right side; {drawn}")
     return CalibrateResult(output, "\n".join(lines), result)
+
+
+def _write_rig(options: CalibrateOptions, results: Sequence[Calibration]) -> list[str]:
+    """Write the further cameras of a rig and the camchain; say where each camera is."""
+    chain, *files = options.rig_files()
+    places = [place(before, after) for before, after in itertools.pairwise(results)]
+    export_rig(chain, [each.camera for each in results], [each.T for each in places])
+    lines = []
+    for number, (file, found, placed) in enumerate(zip(files, results[1:], places, strict=True), start=1):
+        write_camera(file, found.camera, f"saunet calibrate: camera {number} of a rig, see {chain.name}")
+        lines.append(f"camera {number} ({file}), seen from camera {number - 1}: {placed}")
+        lines.append(f"  its own reprojection error {found.error:.3f} px, corners known to {found.corner:.2f} px")
+    return [*lines, f"rig: {chain} (Kalibr camchain)"]
 
 
 def _from_driving(source: str) -> tuple[CameraFile, str]:
@@ -198,7 +229,7 @@ def _from_driving(source: str) -> tuple[CameraFile, str]:
             yield from map(read_image, frame_paths(path))
         else:
             with VideoReader(path) as reader:
-                yield from (frame.image for frame in reader.frames(10.0))
+                yield from (frame.image for frame in reader.frames(1 / STEP))
 
     def windows() -> Iterator[list[NDArray[np.uint8]]]:
         frames = deque[NDArray[np.uint8]](maxlen=WINDOW)
@@ -209,10 +240,8 @@ def _from_driving(source: str) -> tuple[CameraFile, str]:
                 yield list(frames)
 
     found = estimate_focal(windows())
-    film = "film a minute with turns at 15 to 30 km/h: corners, a roundabout, a winding road"
     if found is None or not found.is_known:
-        known = "nothing says it" if found is None else f"it is known to {found.uncertainty:.1%} only"
-        raise DataError(f"the focal length cannot be known from {source}: {known}, {KNOWN:.1%} is required; {film}")
+        raise DataError(refusal(found, source))
     height, width = size[0]
     focal = found.focal * width
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
