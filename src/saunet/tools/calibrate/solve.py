@@ -299,7 +299,7 @@ def check_picture(result: Calibration) -> UInt8[np.ndarray, "_ _ 3"]:
         for at, miss in zip(view.pixels, misses, strict=True):
             ends = [(round(float(x)), round(float(y))) for x, y in (at, at + MAGNIFIED * miss)]
             cv2.circle(left, ends[0], 2 * thick, (0, 90, 255), -1, cv2.LINE_AA)
-            cv2.line(left, *ends, (255, 40, 0), thick, cv2.LINE_AA)
+            cv2.line(left, ends[0], ends[1], (255, 40, 0), thick, cv2.LINE_AA)
     right = Lens(result.camera, height, width)(result.example)
     return np.concatenate([left, right], axis=1)
 
@@ -321,7 +321,7 @@ class Placement:
         turn = float(np.degrees(np.linalg.norm(cv2.Rodrigues(self.T[:3, :3])[0])))
         distance = float(np.linalg.norm(self.T[:3, 3]))
         return (
-            f"{distance:.4f} m away (known to {1000 * self.deviation:.1f} mm), turned by {turn:.2f} degrees; "
+            f"{distance:.4f} m away (known to {1000 * self.deviation:.2g} mm), turned by {turn:.2f} degrees; "
             f"error {self.error:.3f} px in {self.pairs} pairs"
         )
 
