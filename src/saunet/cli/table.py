@@ -57,7 +57,7 @@ calibrate input: make camera.yaml from a video or pictures of a board
     calibrate print_board=board.png
     calibrate board.mp4 columns=10 rows=7 square=0.025
     calibrate video=drive.mp4
-prepare job: do once before training: dense depth, a teacher's depth, smaller images, clips from bags, packed data
+prepare job: do once before training: dense depth, a teacher's depth, small images, clips of bags and GoPros, a pack
     prepare densify root=/data/kitti/raw
     prepare import input=drive.bag folder=clips
 components: list every registered component with its keys

@@ -64,6 +64,7 @@ class VideoReader(Session):
         declared: Number of frames as the file states it, or estimated from its duration; None if unknown.
         height: Of the frames, after rotation.
         width: Of the frames, after rotation.
+        origin: Time stamp of the first frame in the file, in seconds; 0 if it has none.
         missing: After reading to the end: frames that a truncated file lacks.
         damaged: After reading to the end: frames that could be decoded in part or not at all.
         plain: After reading to the end: frames of one single color.
@@ -86,7 +87,7 @@ class VideoReader(Session):
                 )
             self.height, self.width = to_rgb(first, self.name).shape[:2]
             self._timed = container.format.name not in _RAW and first.time is not None
-            self._origin = float(first.time) if self._timed else 0.0  # time stamp of the first frame
+            self.origin = float(first.time) if self._timed else 0.0
             mean, usual = self._rates(container, stream)
             self.fps, self._pace = mean or rate, usual or rate
             self.declared = self._count(container, stream)
@@ -161,7 +162,7 @@ class VideoReader(Session):
         """Yield all frames with number and time; a clock that jumps back continues where it was."""
         self.missing = self.damaged = self.plain = self.count = 0
         self._broken = False
-        step, shift, last = 1 / (self.fps or 25), -self._origin, -math.inf
+        step, shift, last = 1 / (self.fps or 25), -self.origin, -math.inf
         with self._opened() as (container, stream):
             for number, frame in enumerate(self._decoded(container, stream)):
                 self.count = number + 1

@@ -12,10 +12,11 @@ from videos import number_of, numbered
 
 import saunet
 from saunet.data.video.camera import read_camera
+from saunet.data.video.clips import find_clips
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import encode_jpeg, read_image
 from saunet.tools.prepare import bags as bags_module
-from saunet.tools.prepare.bags import import_bags
+from saunet.tools.prepare.importing import import_recordings
 from saunet.tools.prepare.tool import PrepareOptions, prepare
 
 rosbags = pytest.importorskip("rosbags.highlevel", reason="rosbags is not installed")
@@ -136,7 +137,11 @@ def test_a_bag_becomes_clips_that_train(bag: Path, tmp_path: Path) -> None:
     assert "camera from /cam0/camera_info, speeds from /odom" in said
     assert "no CameraInfo: add camera.yaml" in said
     clip = tmp_path / "drive" / "cam0_image_raw"
-    assert sorted(path.name for path in tmp_path.glob("drive/*")) == ["cam0_image_raw", "cam1_image_raw_compressed"]
+    with_images = {path.parent.name for path in tmp_path.glob("drive/*/*.jpg")}
+    assert with_images == {"cam0_image_raw", "cam1_image_raw_compressed"}
+    assert [clip.name for clip in find_clips(tmp_path, str(clip / "camera.yaml"))] == sorted(
+        f"drive/{name}" for name in with_images
+    )
     camera = read_camera(clip / "camera.yaml")
     assert camera.K.ravel().tolist() == K
     assert camera.distortion == tuple(D)
@@ -167,14 +172,17 @@ def test_an_interrupted_import_resumes_and_a_finished_one_is_kept(
 
     monkeypatch.setattr(bags_module, "write_bytes", full)
     with pytest.raises(DataError, match="No space left"):
-        import_bags(bag, tmp_path)
+        import_recordings(bag, tmp_path)
     made = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.jpg")}
     assert len(made) == 9
-    again = import_bags(bag, tmp_path)
+    again = import_recordings(bag, tmp_path)
     assert (again.made, again.before) == (15, 9)
     assert {path: path.stat().st_mtime_ns for path in made} == made
-    last = import_bags(bag, tmp_path)
+    with monkeypatch.context() as patched:  # nothing is read a third time, though one topic is depth
+        patched.delattr(bags_module.Bag, "_run")
+        last = import_recordings(bag, tmp_path)
     assert (last.made, last.before) == (0, 24)
+    assert "0 frames, not color images" in str(last)
     other = bag.with_name("other") / bag.name
     other.parent.mkdir(exist_ok=True)
     files = [bag] if bag.is_file() else list(bag.iterdir())
@@ -183,7 +191,7 @@ def test_an_interrupted_import_resumes_and_a_finished_one_is_kept(
         target.parent.mkdir(exist_ok=True)
         target.write_bytes(file.read_bytes())
     with pytest.raises(DataError, match="another version"):
-        import_bags(other, tmp_path)
+        import_recordings(other, tmp_path)
 
 
 def test_sources_of_speed(tmp_path: Path) -> None:
@@ -196,7 +204,7 @@ def test_sources_of_speed(tmp_path: Path) -> None:
                 if name == "moved":
                     bag.odometry(stamp, 0.0, x=speed * number / 10)
                 bag.fix(stamp, 49.0 + 12.0 * number / 10 / 111_208, status=-1 if number in (3, 20) else 0)
-        import_bags(tmp_path / f"{name}.bag", tmp_path / "clips")
+        import_recordings(tmp_path / f"{name}.bag", tmp_path / "clips")
         rows = np.loadtxt(tmp_path / "clips" / name / "image" / "speeds.csv", delimiter=",", skiprows=1)
         assert len(rows) == (40 if name == "moved" else 38)
         assert rows[:, 1] == pytest.approx(speed, rel=1e-3)
@@ -220,7 +228,7 @@ def test_encodings(tmp_path: Path, encoding: str) -> None:
     }[encoding]
     with Bag("mcap", tmp_path / "a") as bag:
         bag.image("/image", 12 * 10**9 + 5, pixels, encoding)
-    import_bags(tmp_path / "a", tmp_path / "clips")
+    import_recordings(tmp_path / "a", tmp_path / "clips")
     image = read_image(tmp_path / "clips" / "a" / "image" / "12.000000005.jpg")  # simulated time
     wanted = [200, 200, 200] if encoding == "mono8" else [200, 30, 40]
     assert np.median(image.reshape(-1, 3), 0) == pytest.approx(wanted, abs=6)
@@ -228,25 +236,30 @@ def test_encodings(tmp_path: Path, encoding: str) -> None:
 
 def test_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DataError, match="no file or folder"):
-        import_bags(tmp_path / "nowhere", tmp_path / "clips")
+        import_recordings(tmp_path / "nowhere", tmp_path / "clips")
     with pytest.raises(DataError, match="no bag below"):
-        import_bags(tmp_path, tmp_path / "clips")
+        import_recordings(tmp_path, tmp_path / "clips")
     with pytest.raises(ConfigError, match="import needs input"):
         PrepareOptions(job="import", input="a.bag")
     whole = drive("ros1", tmp_path / "whole")
     with pytest.raises(ConfigError, match=r"topics is '/cam0/image'.*/cam0/image_raw"):
-        import_bags(whole, tmp_path / "clips", ["/cam0/image"])
+        import_recordings(whole, tmp_path / "clips", ["/cam0/image"])
     (tmp_path / "cut.bag").write_bytes(whole.read_bytes()[:20_000])
     with pytest.raises(DataError, match=r"cut\.bag is a bag that cannot be read.*reindex"):
-        import_bags(tmp_path / "cut.bag", tmp_path / "clips")
+        import_recordings(tmp_path / "cut.bag", tmp_path / "clips")
     with Bag("sqlite3", tmp_path / "odd") as bag:
         bag.image("/image", START, np.zeros((8, 8, 3), np.uint8), "lab8")
         bag.image("/image", START + STEP, np.zeros((8, 8, 3), np.uint8), "rgb8")
     with pytest.raises(DataError, match=r"encoding 'lab8'; allowed: rgb8"):
-        import_bags(tmp_path / "odd", tmp_path / "clips")
-    report = import_bags(tmp_path / "odd", tmp_path / "clips", on_error="skip")
+        import_recordings(tmp_path / "odd", tmp_path / "clips")
+    report = import_recordings(tmp_path / "odd", tmp_path / "clips", on_error="skip")
     assert (report.made, len(report.failures)) == (1, 1)
+    with Bag("sqlite3", tmp_path / "all_odd") as bag:
+        bag.image("/image", START, np.zeros((8, 8, 3), np.uint8), "lab8")
+    for _ in range(2):  # what could not be read is tried again
+        report = import_recordings(tmp_path / "all_odd", tmp_path / "clips", on_error="skip")
+        assert "no frame that can be read" in str(report)
     with Bag("sqlite3", tmp_path / "none") as bag:
         bag.odometry(START, 1.0)
     with pytest.raises(DataError, match=r"no image topic; it has: /odom"):
-        import_bags(tmp_path / "none", tmp_path / "clips")
+        import_recordings(tmp_path / "none", tmp_path / "clips")

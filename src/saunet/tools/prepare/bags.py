@@ -26,10 +26,10 @@ from saunet.io.atomic import remove_partial_files, write_bytes, write_json
 from saunet.io.images import encode_jpeg
 from saunet.io.plain import read_json
 from saunet.io.progress import bar
+from saunet.tools.prepare.gopro import RECORD
 from saunet.tools.prepare.pool import OnError
 
 Rows = list[tuple[float, ...]]
-_RECORD = "import.json"
 _RAW, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
@@ -51,62 +51,11 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
 """Encoding of a raw image -> bytes a pixel, and OpenCV's conversion to RGB."""
 _NOT_COLOR = ("16UC1", "32FC1", "mono16")
 """Encodings of depth and the like: such topics are no clips."""
-
-
-@dataclass(frozen=True, slots=True)
-class ImportReport:
-    """What `import_bags` did."""
-
-    made: int
-    """Pictures written now."""
-    before: int
-    """Pictures that were there."""
-    failures: tuple[str, ...]
-    """One sentence for each picture that cannot be read and was skipped."""
-    clips: tuple[str, ...]
-    """What each clip has, a line each."""
-
-    def __str__(self) -> str:
-        counts = f"{self.made} frames made, {self.before} were there, {len(self.failures)} skipped"
-        return "\n".join([*self.clips, counts])
-
-
-def import_bags(
-    source: str | Path,
-    folder: str | Path,
-    topics: Sequence[str] = (),
-    camera: str | None = None,
-    on_error: OnError = "raise",
-) -> ImportReport:
-    """Turn the bags at a path into clips below a folder, one for each image topic."""
-    bags, clips, failures = find_bags(Path(source).expanduser()), list[_Clip](), list[str]()
-    given = read_camera(camera) if camera else None
-    for bag in bags:
-        clips += _Bag(bag, Path(folder).expanduser(), topics, on_error, failures).import_()
-    for clip in clips:
-        if given and clip.home.is_dir() and not (clip.home / FILE_NAME).exists():
-            write_camera(clip.home / FILE_NAME, given, f"saunet prepare import: from {camera}")
-    made, before = (sum(getattr(clip, each) for clip in clips) for each in ("made", "before"))
-    return ImportReport(made, before, tuple(failures), tuple(map(str, clips)))
-
-
-def find_bags(source: Path) -> list[Path]:
-    """Return the bags at a path: itself, or all below it; a ROS 2 bag is a folder with ``metadata.yaml``."""
-    if not source.exists():
-        raise DataError(f"no file or folder at {source}; check the path")
-    if source.is_file() or (source / "metadata.yaml").is_file():
-        one_of(f"the suffix of {source.name}", source.suffix if source.is_file() else ".bag", (".bag", ".mcap", ".db3"))
-        return [source]
-    folders = [path.parent for path in source.rglob("metadata.yaml")]
-    files = [path for end in ("bag", "mcap", "db3") for path in source.rglob(f"*.{end}") if path.is_file()]
-    bags = sorted({*folders, *(path for path in files if path.parent not in folders)})
-    if not bags:
-        raise DataError(f"no bag below {source}; looked for .bag, .mcap, .db3 and folders with metadata.yaml")
-    return bags
+_NO_CLIP = "not color images"
 
 
 @dataclass
-class _Clip:
+class BagClip:
     """One image topic of a bag."""
 
     topic: str
@@ -114,6 +63,7 @@ class _Clip:
     state: dict[str, Any]
     made: int = 0
     before: int = 0
+    failed: int = 0
     about: list[str] = field(default_factory=list)
     info: str = ""
     """The camera's first CameraInfo, as YAML."""
@@ -123,7 +73,9 @@ class _Clip:
         return f"{self.home}: {', '.join([f'{self.made + self.before} frames', *self.about])}"
 
 
-class _Bag:
+class Bag:
+    """One bag, whose topics become clips."""
+
     def __init__(self, path: Path, folder: Path, topics: Sequence[str], on_error: OnError, failures: list[str]) -> None:
         try:
             from rosbags.highlevel import AnyReader
@@ -134,7 +86,7 @@ class _Bag:
         store = get_typestore(Stores.ROS2_HUMBLE)  # for bags of that time, which do not define their messages
         self._reader: Any = _read(path, lambda: AnyReader([path], default_typestore=store))
 
-    def import_(self) -> list[_Clip]:
+    def clips(self) -> list[BagClip]:
         _read(self.path, self._reader.open)
         try:
             clips = self._claim()
@@ -144,7 +96,7 @@ class _Bag:
         finally:
             self._reader.close()
 
-    def _claim(self) -> list[_Clip]:
+    def _claim(self) -> list[BagClip]:
         """Return the clips to make; folders of another version of the bag are refused."""
         images = sorted({c.topic for c in self._reader.connections if c.msgtype in (_RAW, _COMPRESSED)})
         for topic in self.wanted:
@@ -155,13 +107,14 @@ class _Bag:
         for topic in self.wanted or [each for each in images if not each.endswith("compressedDepth")]:
             home = self.folder / self.path.stem / (topic.strip("/").replace("/", "_") or "images")
             remove_partial_files(home, ".*.partial*")
-            clip = _Clip(topic, home, {**now, "topic": topic, "frames": None})
-            if (home / _RECORD).is_file():
-                known = read_json(home / _RECORD)
+            clip = BagClip(topic, home, {**now, "topic": topic, "frames": None})
+            if (home / RECORD).is_file():
+                known = read_json(home / RECORD)
                 if not isinstance(known, dict) or {**known, "frames": None} != clip.state:
                     raise DataError(f"{home} was imported from another version of {self.path}; delete it first")
                 clip.state = known
                 clip.before = known["frames"] or 0
+                clip.about += [_NO_CLIP] if known["frames"] == 0 else []
             elif home.is_dir() and any(home.iterdir()):
                 raise DataError(f"{home} holds other files; choose another folder")
             clips.append(clip)
@@ -169,7 +122,7 @@ class _Bag:
             raise DataError(f"{self.path} has no image topic; it has: {', '.join(sorted(self._reader.topics))[:300]}")
         return clips
 
-    def _run(self, clips: Sequence[_Clip]) -> None:
+    def _run(self, clips: Sequence[BagClip]) -> None:
         open_ = {clip.topic: clip for clip in clips if clip.state["frames"] is None}
         infos, speeds = dict[str, Any](), dict[tuple[int, str], Rows]()
         kinds = {_RAW, _COMPRESSED, _INFO, *_SPEEDS}
@@ -199,6 +152,8 @@ class _Bag:
                     if self.on_error == "raise":
                         raise
                     self.failures.append(f"{topic} at {received}: {error}")
+                    if topic in open_:
+                        open_[topic].failed += 1
         found = _speed_of(speeds)
         for clip in open_.values():
             self._finish(clip, infos, found)
@@ -209,7 +164,7 @@ class _Bag:
         while (each := _read(self.path, lambda: next(left, end))) is not end:
             yield each
 
-    def _keep(self, clip: _Clip, stamp: int, message: Any) -> None:
+    def _keep(self, clip: BagClip, stamp: int, message: Any) -> None:
         """Write a picture, unless it is there; before the first, note down which bag the folder is of."""
         name = str(stamp) if stamp >= 10**18 else f"{stamp // 10**9}.{stamp % 10**9:09d}"
         if name in clip.names:
@@ -221,15 +176,17 @@ class _Bag:
                 return
         data, suffix = _picture(message, f"{self.path}, {clip.topic}")
         if data:
-            if not (clip.home / _RECORD).is_file():
-                write_json(clip.home / _RECORD, clip.state)
+            if not (clip.home / RECORD).is_file():
+                write_json(clip.home / RECORD, clip.state)
             write_bytes(clip.home / f"{name}{suffix}", data)
             clip.made += 1
             clip.names.add(name)
 
-    def _finish(self, clip: _Clip, infos: dict[str, Any], speeds: tuple[str, Rows] | None) -> None:
+    def _finish(self, clip: BagClip, infos: dict[str, Any], speeds: tuple[str, Rows] | None) -> None:
         if not clip.names:
-            clip.about.append("not color images")
+            clip.about.append("no frame that can be read" if clip.failed else _NO_CLIP)
+            if not clip.failed:
+                write_json(clip.home / RECORD, {**clip.state, "frames": 0})  # so that it is not read again
             return
         space = clip.topic.removesuffix("/compressed").rpartition("/")[0]
         name = next((each for each in infos if each.rpartition("/")[0] == space), None)
@@ -245,7 +202,7 @@ class _Bag:
             csv.writer(text, lineterminator="\n").writerows([("time", "speed"), *speeds[1]])
             write_bytes(clip.home / SPEEDS, text.getvalue().encode())
         clip.about.append(f"speeds from {speeds[0]}" if speeds else "no speeds")
-        write_json(clip.home / _RECORD, {**clip.state, "frames": len(clip.names)})
+        write_json(clip.home / RECORD, {**clip.state, "frames": len(clip.names)})
 
 
 def _read(path: Path, action: Callable[[], Any]) -> Any:

@@ -18,8 +18,8 @@ from saunet.prediction.foreign import NOTHING, ForeignOptions, ForeignPredictor
 from saunet.prediction.prediction import load
 from saunet.registry import Spec
 from saunet.threads import available_cores
-from saunet.tools.prepare.bags import ImportReport, import_bags
 from saunet.tools.prepare.cache import CacheReport, build_cache
+from saunet.tools.prepare.importing import ImportReport, import_recordings
 from saunet.tools.prepare.pack import PackReport, pack
 from saunet.tools.prepare.pool import Done, OnError, Workers
 from saunet.tools.prepare.targets import DenseKind, FileTeacher, ModelTeacher, Recording, Values, densify, teach
@@ -54,7 +54,7 @@ class PrepareOptions:
 
     job: Job
     """``densify`` (dense depth maps from LiDAR), ``teacher`` (another model's depth), ``cache`` (smaller images),
-    ``import`` (bags as clips), or ``pack`` (a data set in a few large files, for ``data=packed``)."""
+    ``import`` (bags and GoPro videos as clips), or ``pack`` (a data set in a few large files, for ``data=packed``)."""
     data: Spec | None = None
     """``cache``, ``pack``: the data module to read; for ``cache``, None reads the KITTI raw tree at ``root``."""
     root: str | None = None
@@ -76,12 +76,12 @@ class PrepareOptions:
     foreign: ForeignOptions = NOTHING
     """``teacher``: what an ONNX or TorchScript model of another system takes and gives."""
     input: str | None = None
-    """``teacher``: a folder of depth that another system predicted. ``import``: a bag of ROS 1 or 2, an MCAP file, or
-    a folder of them."""
+    """``teacher``: a folder of depth that another system predicted. ``import``: a bag of ROS 1 or 2, an MCAP file, a
+    GoPro video, or a folder of them."""
     topics: Sequence[str] = ()
     """``import``: only these image topics; all if empty."""
     camera: str | None = None
-    """``import``: a camera file for images of which the bag has no CameraInfo."""
+    """``import``: a camera file for clips of which the recording has no calibration."""
     values: Values = "depth"
     """``teacher``: what those files hold, ``depth`` or ``disparity``."""
     device: str = "auto"
@@ -124,7 +124,9 @@ class PrepareOptions:
             raise ConfigError("workers counts processes of this machine; with executor=dask, leave it out")
         if self.job == "import":
             if self.input is None or self.folder is None:
-                raise ConfigError("import needs input=... (a bag, or a folder of bags) and folder=... (for the clips)")
+                raise ConfigError(
+                    "import needs input=... (a bag, a GoPro video, or a folder of them) and folder=... (for the clips)"
+                )
             return
         if self.job == "pack" and (self.data is None or self.folder is None):
             raise ConfigError("a pack needs data=... (what to pack) and folder=... (a new one)")
@@ -170,7 +172,9 @@ def prepare(options: PrepareOptions) -> Done | CacheReport | ImportReport | Pack
         saunet.errors.DataError: no data root at /nowhere...
     """
     if options.job == "import":
-        return import_bags(str(options.input), str(options.folder), options.topics, options.camera, options.on_error)
+        return import_recordings(
+            str(options.input), str(options.folder), options.topics, options.camera, options.on_error
+        )
     count = available_cores() if options.workers is None else options.workers
     workers = Workers(count, options.scheduler)
     if options.job == "pack":
