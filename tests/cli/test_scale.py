@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,11 +17,12 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from videos import write_video
 
 import saunet
 from saunet.data.video.camera import CameraFile, write_camera
-from saunet.errors import CheckpointError, ConfigError
-from saunet.evaluation.tool import EvaluateOptions, _scaled
+from saunet.errors import CheckpointError, ConfigError, DataError
+from saunet.evaluation.tool import EvaluateOptions, _odometer, _scaled
 from saunet.geometry.pose import pose_matrix
 from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import ImagePredictor
@@ -293,3 +296,65 @@ def test_no_source_at_all_is_one_sentence(tool: Tool) -> None:
     outcome = tool("train", "experiment=smoke", "data.offsets=[]")
     assert outcome.code == 1
     assert "data.offsets is empty and data.stereo is false" in outcome.err
+
+
+def test_a_table_over_time_is_read_at_the_times_of_the_frames(tmp_path: Path) -> None:
+    """20 frames a second, then 5: by the mean rate of 8, frame 10 would be at 1.25 s and not at 0.5 s."""
+    (tmp_path / "r").mkdir()
+    times = [*np.arange(10) / 20, *(0.5 + np.arange(10) / 5)]
+    write_video(tmp_path / "r" / "a.mp4", 20, times=times)
+    (tmp_path / "r" / "camera.yaml").write_text("image_size: [128, 96]\nK: [110, 110, 63.5, 47.5]\n")
+    common = {"fps": None, "static": "keep", "workers": 0, "frames_cache": str(tmp_path / "cache"), "val_share": 0.0}
+    data = saunet.build("data", "video", root=str(tmp_path / "r"), height=32, width=64, test_clips=["a.mp4"], **common)
+    data.setup("test")
+    (drive,) = data.datasets["test"].drives
+    (tmp_path / "speeds.csv").write_text("time,speed\n0,0\n10,100\n")  # 10 m/s more each second
+    scale = ScaleOptions(method="speed", speeds=str(tmp_path / "speeds.csv"))
+    options = EvaluateOptions(data=Spec({}), checkpoint="x", scale=scale)
+    assert _odometer(options, data)(drive, 8, 12) == pytest.approx(5 * (0.9**2 - 0.4**2), rel=1e-3)
+    assert _odometer(options, data)(drive, 12, 8) == pytest.approx(5 * (0.9**2 - 0.4**2), rel=1e-3)
+    with pytest.raises(ConfigError, match=r"data\.align_speeds=true"):
+        _odometer(replace(options, scale=replace(scale, align=True)), data)
+
+
+class OfTheColumn(torch.nn.Module):
+    """A pose network that says how far the bright column has moved."""
+
+    def forward(self, target: torch.Tensor, sources: torch.Tensor) -> torch.Tensor:
+        columns = [image.mean((-3, -2)).argmax(-1).float() for image in (target[:, None], sources)]
+        ways = torch.zeros(*sources.shape[:2], 3)
+        ways[..., 2] = (columns[1] - columns[0]).abs() / 4
+        return pose_matrix(torch.zeros_like(ways), ways)
+
+
+def test_a_table_of_another_clock_is_aligned_by_the_pose_network(
+    street: SyntheticDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The column moves by whole pixels, four a unit, two units a meter, 5 frames a second; Unix time 70 s ahead."""
+    at = np.arange(0, 60, 0.2)
+    speed = np.interp(at, [0, 6, 9, 15, 18, 27, 29, 40, 43, 52, 60], [2, 2, 10, 10, 5, 5, 0, 0, 8, 8, 3])
+    frames = []
+    for place in np.cumsum(0.2 * 2 * 4 * speed).round().astype(int) % 300:
+        picture = np.zeros((20, 320, 3), np.uint8)
+        picture[:, place : place + 1] = 255
+        frames.append(picture)
+    video = write_video(tmp_path / "a.mp4", frames, fps=5, codec="libx264rgb", pixels="rgb24", options={"crf": "0"})
+    ticks = np.arange(-10, 75, 0.5)
+    lines = [
+        f"{tick + 1_700_000_070:.2f},{value:.3f}"
+        for tick, value in zip(ticks, np.interp(ticks, at, speed), strict=True)
+    ]
+    (tmp_path / "speeds.csv").write_text("\n".join(["time,speed", *lines]))
+    model = SimpleNamespace(networks=lambda: (None, OfTheColumn()), record=SimpleNamespace(offsets=(-1, 1)))
+    monkeypatch.setattr("saunet.weights.files.read_model", lambda checkpoint: model)
+    predictor = TrueDepth(street)
+    predictor.height, predictor.width = 20, 320
+    options = ScaleOptions(method="speed", speeds=str(tmp_path / "speeds.csv"), align=True)
+    scale_predictor(options, predictor, video, None, tmp_path, "x")
+    said = re.search(r"its clock is \+(\S+) s off that of the frames", capsys.readouterr().out)
+    assert float(said[1]) == pytest.approx(1_700_000_070, abs=0.3)
+    assert predictor.scale.factor == pytest.approx(0.5, rel=0.1)
+    with pytest.raises(DataError, match=r"scale\.align=true if their clock"):
+        scale_predictor(replace(options, align=False), predictor, video, None, tmp_path, "x")
+    with pytest.raises(ConfigError, match=r"scale\.align is set and scale\.method is 'none'"):
+        ScaleOptions(method="none", align=True)

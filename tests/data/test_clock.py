@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import pickle
+import re
 
 import cv2
 import numpy as np
 import pytest
-from clip_tree import CAMERA, frames, make_clip
+from clip_tree import CAMERA, frames, make_clip, texture
 from drives import NumberDrive
 from kitti_tree import make_drive, name
 
+import saunet
 from saunet.data.kitti.files import read_timestamps
 from saunet.data.kitti.raw import KittiRaw
 from saunet.data.loading.windows import Selection, find_windows
@@ -117,3 +119,30 @@ def test_a_rate_in_the_camera_file_gives_times(tmp_path):
     drive = ClipDrive(clip, read_clip(clip, None, tmp_path, 1280))
     assert drive.time(3) == pytest.approx(0.3)
     assert drive.gaps == frozenset()
+
+
+def test_speeds_of_another_clock_are_refused_and_aligned_by_the_flow(tmp_path, capsys):
+    """A logger that began 41.3 s before the camera and counts Unix time; 1.5 px at 320 width are one m/s at 5 fps."""
+    at = np.arange(0, 90, 0.2)
+    knots = [0, 8, 11, 17, 19, 33, 36, 48, 49, 60, 66, 75, 78, 90]
+    speed = np.interp(at, knots, [2, 2, 10, 10, 5, 5, 12, 12, 8, 8, 0, 0, 7, 7])
+    world = np.tile(texture(), (1, 3, 1))
+    folder = make_clip(tmp_path, "clip", [], CAMERA.replace("fps: 10", "fps: 5"))
+    for number, place in enumerate(np.cumsum(1.5 * speed).astype(int) % 3000):
+        cv2.imwrite(str(folder / f"{number:04d}.jpg"), world[:200, place : place + 320])
+    ticks = np.arange(-41, 99, 0.5)
+    rows = zip(ticks + 1_700_000_041.3, np.interp(ticks, at, speed), strict=True)
+    (folder / "speeds.csv").write_text("\n".join(["time,speed", *(f"{tick:.2f},{value:.3f}" for tick, value in rows)]))
+    common = {"root": str(tmp_path), "fps": None, "workers": 0, "frames_cache": str(tmp_path / "cache")}
+    data = saunet.build("data", "video", with_speed=True, **common)
+    with pytest.raises(DataError, match=r"speeds of 'clip' are from 1700000000\.30 .*set data\.align_speeds=true"):
+        data.drives()
+    data = saunet.build("data", "video", with_speed=True, align_speeds=True, **common)
+    (drive,) = data.drives()
+    found = re.search(r"speeds\.csv: its clock is \+(\S+) s off", capsys.readouterr().err)
+    assert float(found[1]) == pytest.approx(1_700_000_041.3, abs=0.4)
+    middle = drive.indices[len(drive.indices) // 3]
+    assert drive.speed(middle) == pytest.approx(np.interp(drive.time(middle), at, speed), abs=1)
+    (folder / "speeds.csv").unlink()
+    with pytest.raises(DataError, match=r"no speeds\.csv to align"):
+        saunet.build("data", "video", align_speeds=True, **common).drives()

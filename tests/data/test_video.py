@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from clip_tree import CAMERA, frames, make_clip, make_video
 from jaxtyping import TypeCheckError
+from videos import write_video
 
 from saunet.data.video.clips import every, find_clips, frame_paths, read_clip
 from saunet.data.video.focal import FocalEstimate
@@ -270,6 +271,41 @@ def test_another_size_within_a_clip_and_a_camera_that_does_not_fit(tmp_path):
     wrong.setup("fit")
     with pytest.raises(DataError, match=r"frames of 'a' \(frame_0.png\) are 320x200 .* is for 1920x1080"):
         list(wrong.train_dataloader())
+
+
+def test_a_rotated_video_needs_the_calibration_of_the_upright_picture(tmp_path):
+    """Phones turn by a tag: the sensor's picture is 128 x 96, and what is shown 96 x 128."""
+    for name, size, K in (
+        ("lying", "[128, 96]", "[110, 110, 63.5, 47.5]"),
+        ("up", "[96, 128]", "[110, 110, 47.5, 63.5]"),
+    ):
+        root = tmp_path / name
+        root.mkdir()
+        write_video(root / "phone.mov", 12, rotation=90)
+        (root / "camera.yaml").write_text(f"image_size: {size}\nK: {K}\n")
+    data = module(tmp_path / "up", static="keep", val_share=0.0)
+    (drive,) = data.drives()
+    assert drive.image(0).shape == (128, 96, 3)
+    assert drive.intrinsics(0)[0, 2] == 47.5
+    (wrong,) = module(tmp_path / "lying", static="keep", val_share=0.0).drives()
+    with pytest.raises(DataError, match=r"frames of 'phone\.mov' .* are 96x128 .* is for 128x96"):
+        wrong.image(0)
+
+
+def test_a_bare_stream_has_the_rate_of_the_camera_file(tmp_path):
+    """comma.ai's logs are HEVC without container; this one does not state its rate."""
+    silent = {"x265-params": "log-level=error:vui-timing-info=0"}
+    (tmp_path / "r").mkdir()
+    write_video(tmp_path / "r" / "video.hevc", 12, codec="libx265", form="hevc", options=silent)
+    camera = "image_size: [128, 96]\nK: [110, 110, 63.5, 47.5]\n"
+    (tmp_path / "r" / "camera.yaml").write_text(camera)
+    with pytest.warns(UserWarning, match=r"frame rate of .*video\.hevc is unknown.*all are taken.*fps in camera\.yaml"):
+        (drive,) = module(tmp_path / "r", static="keep", fps=10.0).drives()
+    assert (len(drive.indices), drive.fps, drive.timestamps) == (12, None, None)
+    (tmp_path / "r" / "camera.yaml").write_text(camera + "fps: 20\n")
+    (drive,) = module(tmp_path / "r", static="keep", fps=10.0).drives()
+    assert drive.timestamps == pytest.approx(np.arange(6) / 10)
+    assert [drive.recorded(index) for index in drive.indices] == [0, 2, 4, 6, 8, 10]
 
 
 @pytest.mark.parametrize("first", ["empty", "small"])

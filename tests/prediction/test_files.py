@@ -153,6 +153,24 @@ def test_frames_come_in_the_order_of_their_numbers(picture: NDArray[np.uint8], t
     assert [source.stem for source in found] == [f"frame_{number}" for number in range(1, 13)]
 
 
+def test_stamps_of_seconds_come_in_order_of_time(picture: NDArray[np.uint8], tmp_path: Path) -> None:
+    stamps = ["1403636579.5", "1403636579.55", "1403636579.6", "1403636579.65", "1403636579.7"]  # .5 < .55, .6 < .65
+    for stamp in stamps:
+        write_image(tmp_path / "in" / f"{stamp}.png", picture)
+    assert [source.stem for source in find_sources(tmp_path / "in", tmp_path / "out")] == stamps
+
+
+def test_links_are_followed_and_files_of_other_programs_skipped(picture: NDArray[np.uint8], tmp_path: Path) -> None:
+    folder = tmp_path / "in"
+    for name in ("store/0.png", "in/drive/1.png", "in/drive/@eaDir/1.png/SYNOPHOTO_THUMB_M.jpg",
+                 "in/drive/.ipynb_checkpoints/1-checkpoint.png", "in/__MACOSX/1.png"):  # fmt: skip
+        write_image(tmp_path / name, picture)
+    (folder / "drive" / "._1.png").write_bytes(b"\0\5\x16\7\0\2\0\0Mac OS X        ")
+    (folder / "linked").symlink_to(tmp_path / "store")
+    (folder / "drive" / "again").symlink_to(folder)  # a circle
+    assert [source.stem for source in find_sources(folder, tmp_path / "out")] == ["drive/1", "linked/0"]
+
+
 def test_single_image_glob_and_several(predictor: Predictor, folder: Path, tmp_path: Path) -> None:
     assert len(run(predictor, folder / "a.png", tmp_path / "1").written) == 2
     assert len(run(predictor, str(folder / "**" / "*.png"), tmp_path / "2").written) == 4

@@ -17,6 +17,7 @@ from saunet.io.images import read_image, write_image
 from saunet.io.video import VideoReader
 from saunet.prediction.prediction import ImagePredictor
 from saunet.prediction.predictor import Predictor
+from saunet.prediction.sources import Recording
 from saunet.prediction.tool import PredictResult
 
 OUTPUTS = ("color", "npy", "mp4", "html")
@@ -174,3 +175,19 @@ def test_first_images_only(run: Callable[..., PredictResult], tmp_path: Path) ->
     assert run(max_frames=3).frames == 3
     assert read_image(tmp_path / "out" / "frame_3_disparity.png").shape == (40, 90, 3)
     assert not (tmp_path / "out" / "frame_10_disparity.png").exists()
+
+
+def test_stamps_in_names_are_the_times_of_results(
+    predictor: Predictor, picture: NDArray[np.uint8], tmp_path: Path
+) -> None:
+    stamps = [1_700_000_000.0, 1_700_000_000.1, 1_700_000_000.25, 1_700_000_001.5]
+    for number, stamp in enumerate(stamps):
+        write_image(tmp_path / "drive" / f"{stamp}.png", np.roll(picture, 20 * number, axis=1))
+    recording = Recording(tmp_path / "drive")
+    assert (recording.timed, [frame.time for frame in recording]) == (True, stamps)
+    assert recording.fps == pytest.approx(1 / 0.15)
+    predict_into(predictor, tmp_path / "drive", tmp_path / "out", ("mp4",))
+    (video,) = (tmp_path / "out").rglob("*.mp4")
+    assert [frame.time for frame in VideoReader(video).frames()] == pytest.approx([0, 0.1, 0.25, 1.5], abs=1e-3)
+    write_image(tmp_path / "drive" / "first.png", picture)
+    assert not Recording(tmp_path / "drive").timed

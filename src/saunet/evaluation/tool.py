@@ -437,12 +437,20 @@ def _refined(batches: Iterable[EvalBatch], found: Intrinsics | None) -> Iterator
 
 def _odometer(options: EvaluateOptions, data: EvaluationData) -> Callable[[Drive, int, int], float]:
     """Return the odometer of the recordings, or of a table of speeds, which counts frames as they were recorded."""
+    if options.scale.align:
+        raise ConfigError(
+            "scale.align=true is for saunet predict; for clips with a speeds.csv, set data.align_speeds=true"
+        )
     if not options.scale.speeds:
         return measured_distance
     table = read_speeds(options.scale.speeds)
     table.check_drives([drive.name for drive in data.datasets[options.split].drives])
 
     def distance(drive: Drive, first: int, second: int) -> float:
+        start, *ends = (drive.time(index) for index in (drive.indices[0], first, second))
+        if table.unit == "time" and options.scale.fps is None and start is not None:
+            low, high = sorted(each - table.start(start, drive.name) for each in ends if each is not None)
+            return table.mean(low, high, drive.name) * (high - low)
         fps = options.scale.fps or drive.fps or 10.0
         return table.distance(drive.name, drive.recorded(first), drive.recorded(second), fps)
 

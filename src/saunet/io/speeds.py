@@ -19,6 +19,10 @@ _FORMAT = (
 )
 
 
+_MONTHS = 1e7
+"""Seconds between two clocks that count from different days."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SpeedTable:
     """Speed over time of one drive, called '', or of several."""
@@ -51,6 +55,15 @@ class SpeedTable:
         at = np.array([low, *ticks[(ticks > low) & (ticks < high)], high])
         speeds = np.interp(at, ticks, speeds)
         return float(np.sum(np.diff(at) * (speeds[1:] + speeds[:-1]) / 2)) / (high - low)
+
+    def start(self, first: float, drive: str = "") -> float:
+        """Return the table's zero on a clock on which the first frame was at ``first``.
+
+        It is that clock's own, but the first frame if the two clocks are months apart: frames with Unix time, and a
+        table that counts from their start.
+        """
+        known = self.drives.get(drive) or self.drives.get("")
+        return 0.0 if known is None or abs(first - float(known[0][0])) < _MONTHS else first
 
     def check_drives(self, names: Sequence[str]) -> None:
         """Check that at least one drive has speeds."""

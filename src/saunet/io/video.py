@@ -20,8 +20,10 @@ from saunet.errors import ConfigError, DataError, UnreadableError, one_of, posit
 from saunet.io.atomic import Session, replacing
 
 _CONTAINERS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ts", ".mts", ".m2ts", ".3gp")
-_OTHERS = (".3g2", ".flv", ".vob", ".lrv", ".ogv", ".h264", ".264", ".h265", ".265", ".hevc", ".mjpg", ".mjpeg")
-VIDEO_SUFFIXES = frozenset((*_CONTAINERS, *_OTHERS))
+_OTHERS = (".3g2", ".flv", ".vob", ".lrv", ".ogv")
+BARE_SUFFIXES = frozenset((".h264", ".264", ".h265", ".265", ".hevc", ".mjpg", ".mjpeg"))
+"""File name endings of bare streams, which may not state their rate."""
+VIDEO_SUFFIXES = BARE_SUFFIXES.union(_CONTAINERS, _OTHERS)
 """File name endings that are taken for videos."""
 
 CODECS: dict[str, tuple[str, dict[str, str]]] = {

@@ -93,7 +93,7 @@ class RerunSink(Sink):
     def _set_time(self, index: int) -> None:
         self._recording.set_time("frame", sequence=index)
         if (seconds := self._times[index]) is not None:
-            self._recording.set_time("time", duration=seconds)
+            self._recording.set_time("time", duration=seconds - (self._times[0] or 0.0))
 
     def _log_path(self, T_world_cam: Float64[np.ndarray, "n 4 4"]) -> None:
         rr = self._rr

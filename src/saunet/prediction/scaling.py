@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from saunet.errors import ConfigError
 from saunet.io.live import live_source
@@ -15,7 +18,11 @@ from saunet.prediction.sources import Input, Recording
 from saunet.scale.options import ScaleOptions
 
 if TYPE_CHECKING:
+    from saunet.io.speeds import SpeedTable
     from saunet.types import TrainBatch
+
+_ALIGNED = 3000
+"""Frames, evenly spread, whose motion a table of speeds is compared with."""
 
 
 def apply_scale(
@@ -48,7 +55,7 @@ def apply_scale(
             pose = model.networks()[1]
             if pose is not None:
                 pose, offsets = pose.eval(), model.record.offsets
-        with _batches(options, predictor, source, camera, offsets) as batches:
+        with _batches(options, predictor, source, camera, pose, offsets) as batches:
             height = camera_height if options.camera_height is None else options.camera_height
             estimate = estimate_scale(options.method, batches, depth, pose, height)
         predictor.scale = keep_scale(estimate, store_in, folder)
@@ -57,12 +64,17 @@ def apply_scale(
 
 @contextlib.contextmanager
 def _batches(
-    options: ScaleOptions, predictor: ImagePredictor, source: Input, camera: Camera | None, offsets: Sequence[int]
+    options: ScaleOptions,
+    predictor: ImagePredictor,
+    source: Input,
+    camera: Camera | None,
+    pose: Any,
+    offsets: Sequence[int],
 ) -> Iterator[Iterator[TrainBatch]]:
     from saunet.io.speeds import read_speeds
     from saunet.scale.recorded import clip_batches
 
-    method, more = options.method, dict[str, Any]()
+    method, more, size = options.method, dict[str, Any](), (predictor.height, predictor.width)
     if live_source(source) is not None:
         raise ConfigError(
             f"scale.method={method} measures over a whole recording and a live camera cannot be looked at beforehand; "
@@ -73,10 +85,14 @@ def _batches(
         more["intrinsics"] = lambda height, width: K.resized(height, width).K
     with contextlib.ExitStack() as stack:
         recording, times = stack.enter_context(contextlib.closing(Recording(source))), list[float | None]()
+        table: SpeedTable | None = None
 
         def pictures() -> Iterator[Any]:
-            for frame in recording:
-                times.append(frame.time)
+            zero = 0.0
+            for number, frame in enumerate(recording):
+                if number == 0 and table is not None and frame.time is not None:
+                    zero = table.start(frame.time)
+                times.append(None if frame.time is None else frame.time - zero)
                 yield frame.read()
 
         if method == "speed":
@@ -84,16 +100,51 @@ def _batches(
                 _needed(method, "scale.speeds", options.speeds, "a CSV file with the columns frame,speed")
             )
             table.check_drives([])
+            if options.align and pose is not None:
+                table = _aligned(table, Recording(source), options.fps, pose, offsets, size)
             clock = times if recording.timed and options.fps is None else None
             fps = options.fps or recording.fps
-            more["distance"] = lambda first, second: table.distance("", first, second, fps, clock)
+            more["distance"] = functools.partial(table.distance, "", fps=fps, times=clock)
         if method == "stereo":
             partner = _needed(method, "scale.partner", options.partner, "the other camera's images")
             baseline = _needed(method, "scale.baseline", options.baseline, "meters to the right camera")
             other = stack.enter_context(contextlib.closing(Recording(partner)))
             more |= {"partner": (frame.read() for frame in other), "baseline": baseline}
-        size = (predictor.height, predictor.width)
         yield clip_batches(pictures(), *size, offsets=offsets, most=options.frames, count=recording.declared, **more)
+
+
+def _aligned(
+    table: SpeedTable, recording: Recording, fps: float | None, pose: Any, offsets: Sequence[int], size: tuple[int, int]
+) -> SpeedTable:
+    """Return a table on the clock of the frames, found by the motion that the pose network predicts; say the offset."""
+    import torch
+
+    from saunet.io.alignment import align_speeds
+    from saunet.scale.recorded import clip_batches
+
+    clock, targets, motion = list[float](), list[float](), list[float]()
+
+    def pictures() -> Iterator[Any]:
+        for number, frame in enumerate(recording):
+            known = frame.time if recording.timed and fps is None else number / (fps or recording.fps)
+            clock.append(np.nan if known is None else known)
+            yield frame.read()
+
+    def elapsed(first: int, second: int) -> float:
+        if first + offsets[0] == second:
+            targets.append(clock[first])
+        return abs(clock[second] - clock[first])
+
+    with contextlib.closing(recording), torch.inference_mode():
+        found = clip_batches(
+            pictures(), *size, offsets=offsets, distance=elapsed, count=recording.declared, most=_ALIGNED
+        )
+        for batch in found:
+            lengths = pose(batch["target"], batch["sources"])[0, :, :3, 3].norm(dim=-1)
+            motion.append(float((lengths / batch["distance"][0]).mean()))
+    moved, alignment = align_speeds(table, "", np.array(targets), np.array(motion))
+    print(f"{table.path}: {alignment}")
+    return moved
 
 
 def _needed(method: str, key: str, value: Any, what: str) -> Any:

@@ -209,7 +209,7 @@ class VideoSink(Sink):
 
     def __init__(self, path: Path, fps: float, layout: str, colormap: str, codec: str, timed: bool) -> None:
         self._layout, self._colormap, self._timed = one_of("layout", layout, LAYOUTS), colormap, timed
-        self._writer, self.paths = VideoWriter(path, fps, codec), (path,)
+        self._writer, self.paths, self._start = VideoWriter(path, fps, codec), (path,), 0.0
 
     def session(self) -> Iterator[None]:
         with self._writer:
@@ -218,7 +218,11 @@ class VideoSink(Sink):
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
         name = f"disparity ({'1/meter' if result.metric else 'relative'})"
         painted = colorize(result.disparity, limits, self._colormap)
-        self._writer.write(compose(result.image, painted, self._layout, name), frame.time if self._timed else None)
+        time = frame.time if self._timed else None
+        if self._writer.count == 0:
+            self._start = time or 0.0
+        picture = compose(result.image, painted, self._layout, name)
+        self._writer.write(picture, None if time is None else time - self._start)
 
 
 class ViewerSink(Sink):

@@ -7,15 +7,15 @@ import itertools
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from saunet.errors import ConfigError, DataError
-from saunet.io.images import IMAGE_SUFFIXES, image_size, natural_order
+from saunet.io.images import IMAGE_SUFFIXES, image_size, name_times, natural_order
 from saunet.io.live import CameraReader, live_source, live_title
 from saunet.io.video import VIDEO_SUFFIXES, VideoReader
 from saunet.prediction.prediction import ImageLike, as_image
@@ -38,7 +38,7 @@ class Frame:
     stem: str
     """What its results are called, relative to the output folder."""
     time: float | None = None
-    """Seconds since the first; None if unknown."""
+    """Seconds since the first of a video, or by the stamps that names of images are; None if unknown."""
     arrived: float | None = None
     """When it came from a live camera, on the monotonic clock."""
 
@@ -78,8 +78,13 @@ class Recording:
         elif isinstance(source, str | Path) or (
             isinstance(source, Sequence) and all(isinstance(item, str | Path) for item in source)
         ):
-            self._frames = self.images = find_sources(source, output_dir)
-            self.declared = len(self.images)
+            self._frames = self.images = found = find_sources(source, output_dir)
+            self.declared = len(found)
+            stamps = name_times([PurePath(frame.stem).name for frame in found])
+            if stamps and len({PurePath(frame.stem).parent for frame in found}) == 1 and (np.diff(stamps) > 0).all():
+                self.timed, times = True, zip(found, stamps, strict=True)
+                self._frames = self.images = [replace(frame, time=stamp) for frame, stamp in times]
+                self.fps = float(fps or 1 / np.median(np.diff(stamps))) if len(stamps) > 1 else self.fps
         else:
             assert not isinstance(source, int)
             self.declared = len(source) if isinstance(source, Sequence) else None

@@ -59,7 +59,8 @@ class PredictOptions:
         undistort: A camera.yaml: undistort and crop the images first, as training on that camera's clips does.
         max_depth: Leave out points that are farther, in the unit of depth.
         max_frames: Predict the first so many images or frames only.
-        fps: Frames per second of results; by default a video keeps its times, and images have 10.
+        fps: Frames per second of results; by default a video keeps its times, images those in their names, and others
+            have 10.
         layout: Of the video: ``stacked`` (disparity below), ``beside``, or ``auto``.
         range_smoothing: Weight of the past in the running color range of a recording, from 0 to below 1.
         codec: Of the video: ``h264``, ``mp4v`` (quickest) or ``vp09``.

@@ -40,7 +40,8 @@ _LARGEST_DISPARITY = 0.15  # of the image's width
 _WHY_NOT = {
     "camera_height": "in none of the {count} frames the lower part of the depth map is a level plane; the road is not "
     "in view, the intrinsics are wrong, or the model is not trained",
-    "speed": "in none of the {count} frames the speed is known and the car moves; give speeds of those frames",
+    "speed": "in none of the {count} frames the speed is known and the car moves; give speeds of those frames, or set "
+    "scale.align=true if their clock starts at another time",
     "stereo": "in none of the {count} frames enough pixels of the stereo pair match; check that both cameras' images "
     "are rectified and belong together",
 }

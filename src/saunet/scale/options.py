@@ -14,7 +14,13 @@ METHODS = ("camera_height", "speed", "stereo")
 SCALE_METHODS = ("auto", "none", "stored", *METHODS)
 """``auto``: the factor stored in the checkpoint, where there is one; `METHODS` measure it."""
 
-_USED_BY = {"camera_height": "camera_height", "speeds": "speed", "partner": "stereo", "baseline": "stereo"}
+_USED_BY = {
+    "camera_height": "camera_height",
+    "speeds": "speed",
+    "align": "speed",
+    "partner": "stereo",
+    "baseline": "stereo",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +32,7 @@ class ScaleOptions:
             ``camera_height``, ``speed``, ``stereo``.
         camera_height: Meters from the road to the camera; by default what the data or ``camera.yaml`` say.
         speeds: A CSV file with the columns ``time`` or ``frame``, ``speed`` and, of several drives, ``drive``.
+        align: Find the clock of the speeds by the predicted motion, if it is not that of the frames.
         fps: Frames per second of the speeds.
         partner: Images of the other camera of a stereo pair.
         baseline: Meters to the other camera.
@@ -39,6 +46,7 @@ class ScaleOptions:
     method: str = "auto"
     camera_height: float | None = None
     speeds: str | None = None
+    align: bool = False
     fps: float | None = None
     partner: str | None = None
     baseline: float | None = None
@@ -56,7 +64,7 @@ class ScaleOptions:
                 f"set scale.method to one of {', '.join(METHODS)}"
             )
         for key, method in _USED_BY.items():
-            if getattr(self, key) is not None and self.method != method:
+            if getattr(self, key) not in (None, False) and self.method != method:
                 raise ConfigError(
                     f"scale.{key} is set and scale.method is '{self.method}', which does not use it; "
                     f"set scale.method={method}, or leave scale.{key} out"

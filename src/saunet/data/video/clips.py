@@ -24,7 +24,7 @@ from saunet.errors import DataError
 from saunet.io.atomic import partial_name, remove_partial_files, write_json
 from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order, resize
 from saunet.io.plain import read_json
-from saunet.io.video import VIDEO_SUFFIXES, VideoReader, nearest_steps
+from saunet.io.video import BARE_SUFFIXES, VIDEO_SUFFIXES, VideoReader, nearest_steps
 
 _NO_CLIPS = frozenset({"@eaDir", "__MACOSX"})
 """Folders in which other systems keep thumbnails and attributes; names with a dot in front are skipped as well."""
@@ -58,6 +58,12 @@ class Recording:
     plain: int = 0  # frames of a video that have one single color, as where nothing could be decoded
     times: tuple[float, ...] | None = None
     """Seconds of each from any fixed origin, by the video or by stamps in the names; None if unknown."""
+
+    def time(self, place: int) -> float | None:
+        """Return the time of one, by the rate if it has no other; None if unknown."""
+        if self.times is not None:
+            return self.times[place]
+        return self.numbers[place] / self.fps if self.fps else None
 
 
 def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]:
@@ -142,7 +148,8 @@ def read_clip(
     """Return a clip's frames; those of a video are decoded into the cache the first time."""
     if clip.path.is_dir():
         return _read_folder(clip, fps)
-    folder = cache / f"{clip.path.stem[:60]}-{_key(clip.path, fps, max_width)}"
+    rate = clip.camera.fps if _suffix(clip.path.name) in BARE_SUFFIXES else None  # others state their own
+    folder = cache / f"{clip.path.stem[:60]}-{_key(clip.path, fps, max_width)}{f'-{rate:g}' if rate else ''}"
     if not (folder / "clip.json").is_file():
         _decode(clip.path, clip.camera.fps, fps, folder, max_width, advance)
     try:

@@ -6,6 +6,7 @@ import copy
 import functools
 import itertools
 import math
+import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
@@ -25,7 +26,7 @@ from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
 from saunet.data.loading.selecting import divide
 from saunet.data.loading.windows import Selection, measured_distance, reach
-from saunet.data.video.camera import CameraFile, Lens, check_crop
+from saunet.data.video.camera import FILE_NAME, CameraFile, Lens, check_crop
 from saunet.data.video.clips import (
     Clip,
     FramesCacheError,
@@ -38,6 +39,7 @@ from saunet.data.video.clips import (
 from saunet.data.video.focal import WINDOW, FocalEstimate, drive_windows, estimate_focal, refusal
 from saunet.data.video.motion import Motion, cuts, even_steps, measure, motion_key
 from saunet.errors import ConfigError, DataError, UnreadableError, in_range, one_of, positive
+from saunet.io.alignment import align_speeds
 from saunet.io.atomic import write_json
 from saunet.io.images import read_image
 from saunet.io.plain import read_json
@@ -75,6 +77,7 @@ class ClipDrive(Drive):
         self._places, self.left_out = _choose(recording, motion, parallax)
         self._indices = sorted(self._places)
         self._still = frozenset(np.flatnonzero(motion.static()).tolist()) if motion else frozenset()
+        self._doubled = tuple(np.flatnonzero(motion.doubled()).tolist()) if motion else ()
 
     @property
     def name(self) -> str:
@@ -102,9 +105,11 @@ class ClipDrive(Drive):
         return self.recording.fps
 
     def time(self, index: int) -> float | None:
-        if self.recording.times is not None:
-            return self.recording.times[self._places[index]]
-        return None if self.fps is None else self.recorded(index) / self.fps
+        return self.recording.time(self._places[index])
+
+    @property
+    def duplicates(self) -> Sequence[float]:
+        return [time for time in map(self.recording.time, self._doubled) if time is not None]
 
     @functools.cached_property
     def gaps(self) -> frozenset[int]:
@@ -125,6 +130,30 @@ class ClipDrive(Drive):
         path = self.clip.path
         file = path / SPEEDS if path.is_dir() else path.with_suffix(f".{SPEEDS}")
         return read_speeds(file) if file.is_file() else None
+
+    def align_speeds(self, flow: NDArray[np.float64]) -> str:
+        """Put the clip's speeds on the clock of its frames, given each one's flow, and return what was found."""
+        if self._speeds is None:
+            raise DataError(f"'{self.name}' has no {SPEEDS} to align; leave data.align_speeds out")
+        times = np.array([self.recording.time(place) for place in range(len(flow))], dtype=np.float64)
+        if np.isnan(times).any():
+            raise DataError(f"the frames of '{self.name}' have no times; give fps in its {FILE_NAME}")
+        steps = np.maximum(np.diff(times), 1e-6)
+        moved, found = align_speeds(self._speeds, "", times[1:] - steps / 2, flow[1:] / steps)
+        vars(self)["_speeds"] = moved
+        return f"{moved.path}: {found}"
+
+    def check_speeds(self) -> None:
+        """Check that the clip's speeds have something in common with the time of its frames."""
+        known = self._speeds.drives.get("") if self._speeds and self._speeds.unit == "time" else None
+        if not self._indices or known is None:
+            return
+        (low, *_, high), first, last = known[0].tolist(), self.time(self._indices[0]), self.time(self._indices[-1])
+        if first is not None and last is not None and (first > high or last < low):
+            raise DataError(
+                f"the speeds of '{self.name}' are from {low:.2f} to {high:.2f} s, and its frames from {first:.2f} to "
+                f"{last:.2f} s; set data.align_speeds=true to find the offset of their clock"
+            )
 
     def _tick(self, index: int) -> float:
         """Return where a frame is in the table of speeds; NaN if unknown."""
@@ -212,7 +241,7 @@ def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tup
     losses = np.cumsum(broken | cut).tolist()  # from one usable frame to the next it grows where time or scene is lost
     for place in usable.tolist():
         if before is not None:
-            seconds = (recording.numbers[place] - recording.numbers[before]) / (recording.fps or math.inf)
+            seconds = (recording.time(place) or 0.0) - (recording.time(before) or 0.0)
             apart = losses[place] > losses[before] or (place - before > 1 and seconds > LONGEST_STEP)
             number += 2 if apart else 1
         places[number] = before = place
@@ -244,6 +273,7 @@ class VideoDataModule(DepthDataModule):
             those of the camera file.
         camera_height: Meters from the road to the camera, for clips whose camera file does not say.
         with_speed: Batches carry the way traveled by a clip's ``speeds.csv``, for the velocity term.
+        align_speeds: Find the clock of each ``speeds.csv`` by the optical flow, if it is not that of the frames.
         frames_cache: Folder for decoded videos and measurements; by default in the user's cache folder.
         max_width: Frames of videos are kept at most this wide.
         **loading: Loader settings, as in `LoadOptions`.
@@ -274,6 +304,7 @@ class VideoDataModule(DepthDataModule):
         crop: Sequence[float] | None = None,
         camera_height: float | None = None,
         with_speed: bool = False,
+        align_speeds: bool = False,
         frames_cache: str | None = None,
         max_width: int = 1280,
         cache: str | None = None,
@@ -293,7 +324,7 @@ class VideoDataModule(DepthDataModule):
         self._height = None if camera_height is None else float(positive("camera_height", camera_height))
         self.frames_cache = default_cache() if frames_cache is None else Path(frames_cache).expanduser()
         self.max_width = int(positive("max_width", max_width))
-        self.odometer = measured_distance if with_speed else None
+        self.odometer, self.align_speeds = measured_distance if with_speed else None, align_speeds
         self._drives: list[ClipDrive] | None = None
         self._broken: list[str] = []
 
@@ -409,8 +440,14 @@ class VideoDataModule(DepthDataModule):
                 "at the video",
                 stacklevel=2,
             )
+        if self.fps is not None and recording.fps is None:
+            warnings.warn(
+                f"the frame rate of {clip.path} is unknown, so data.fps has no effect and all are taken; give fps "
+                f"in {FILE_NAME}",
+                stacklevel=2,
+            )
         motion = None
-        if self.static == "drop" or self.parallax > 0:
+        if self.static == "drop" or self.parallax > 0 or self.align_speeds:
             task = shown.add_task(f"measuring motion of {clip.path.name}", total=len(recording.paths))
             motion = measure(
                 recording.paths,
@@ -422,4 +459,12 @@ class VideoDataModule(DepthDataModule):
             )
             shown.update(task, visible=False)
         settings = f"fps={self.fps} parallax={self.parallax} static={self.static}"
-        return ClipDrive(clip, recording, self.crop, motion, self.parallax, settings, self._height)
+        dropping = motion if self.static == "drop" or self.parallax > 0 else None
+        drive = ClipDrive(clip, recording, self.crop, dropping, self.parallax, settings, self._height)
+        if self.align_speeds and motion is not None:
+            found = drive.align_speeds(motion.flow)
+            if self._place()[0] == 0:
+                print(found, file=sys.stderr)
+        elif self.odometer is not None:
+            drive.check_speeds()
+        return drive
