@@ -96,6 +96,11 @@ class Drive(ABC):
         steps = np.diff(times) / np.diff(self.indices)
         return frozenset(self.indices[place] for place in np.flatnonzero(steps > GAP * np.nanmedian(steps)).tolist())
 
+    @property
+    def duplicates(self) -> Sequence[float]:
+        """Times of recorded frames that repeat the picture before them and got no index; empty if there are none."""
+        return ()
+
     def speed(self, index: int) -> float | None:
         """Return the speed of the vehicle in m/s; None if unknown."""
         return None

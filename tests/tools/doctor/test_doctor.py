@@ -22,7 +22,7 @@ from saunet.io.video import VideoReader
 from saunet.registry import datamodules
 from saunet.tools.doctor.findings import diagnose, manifest_of
 from saunet.tools.doctor.sheet import draw_sheet
-from saunet.tools.doctor.survey import survey
+from saunet.tools.doctor.survey import Survey, Timeline, survey
 from saunet.tools.prepare.cache import build_cache
 from saunet.tools.prepare.tool import kitti_recordings
 
@@ -296,3 +296,41 @@ def test_inspect_writes_nothing_and_takes_a_folder_a_name_or_a_spec(tmp_path, mo
         saunet.inspect("synthetic_tyny")
     assert not list(tmp_path.glob("*.json"))
     assert not list(tmp_path.glob("*.png"))
+
+
+def test_gaps_duplicates_and_rates_are_told_and_drawn_as_a_timeline(tmp_path):
+    """20 frames a second, then 10; two pictures come twice; two seconds and half a second are lost."""
+    root = tmp_path / "r"
+    times = [*np.arange(20) / 20, *(1 + np.arange(10) / 10), *(4 + np.arange(10) / 10), *(5.5 + np.arange(5) / 10)]
+    folder = make_clip(root, "uneven", [])
+    for time, picture in zip(times, frames(45, [5] * 8 + [0] + [5] * 16 + [0] + [5] * 19), strict=True):
+        cv2.imwrite(str(folder / f"{1700000000 + time:.3f}.png"), picture)
+    make_clip(root, "even")
+    (root / "camera.yaml").write_text(CAMERA.replace("fps: 10\n", ""))
+    make_clip(root, "unknown")
+    (root / "even" / "camera.yaml").write_text(CAMERA)
+    found, findings, text = look(campus(root, fps=None))
+    lines = {line.drive: line for line in found.timelines}
+    uneven = lines["uneven"]
+    assert uneven.gaps == (pytest.approx((1.9, 4.0), abs=1e-3), pytest.approx((4.9, 5.5), abs=1e-3))
+    assert uneven.duplicates == pytest.approx([times[8], times[25]], abs=1e-3)
+    assert uneven.rates == pytest.approx((10, 10, 20), rel=0.01)
+    assert lines["even"].times == pytest.approx(np.arange(10) / 10)
+    assert (lines["even"].gaps, lines["even"].duplicates, lines["unknown"].times.size) == ((), (), 0)
+    assert "2 gaps in time in 1 of 3 recordings, the longest 2.10 s long, after 1.90 s of 'uneven'" in text
+    assert "rate varies in 1 of 3 recordings, such as 'uneven' (10 to 20 frames a second)" in text
+    assert "no times in 1 of 3 recordings, such as 'unknown'; give fps" in text
+    sheet = draw_sheet(found, findings, "title")
+    drawn = draw_sheet(replace(found, timelines=[]), findings, "title")
+    rows = sheet[np.flatnonzero((sheet[: len(drawn)] != drawn).any((1, 2)))[0] :]
+    red = (rows == (190, 30, 30)).all(2)[:, 640:].any(0)
+    runs = np.flatnonzero(np.diff(np.concatenate([[0], red.astype(int), [0]]))).reshape(-1, 2) / (1312 - 8 - 640) * 5.9
+    np.testing.assert_allclose(runs, uneven.gaps, atol=0.03)
+
+
+def test_time_stamps_that_repeat_are_a_warning():
+    same = Timeline("a", 3, np.array([0.0, 0.1, 0.1]), duplicates=(0.1,))
+    back = Timeline("b", 3, np.array([0.0, 0.2, 0.1]), duplicates=(0.1,))
+    good = Timeline("c", 3, np.array([0.0, 0.1, 0.2]))
+    text = "\n".join(map(str, diagnose(Survey(timelines=[good, same, back]))))
+    assert "warning: time stamps repeat or go back in 2 of 3 recordings, such as 'a'" in text

@@ -11,9 +11,9 @@ from typing import Any, Literal
 import numpy as np
 
 from saunet.data.loading.selecting import MIN_FLOW, UNREADABLE, Manifest
-from saunet.data.video.motion import CUT, PEAK, SAME_PICTURE
+from saunet.data.video.motion import CUT, PEAK
 from saunet.errors import UnreadableError
-from saunet.tools.doctor.survey import ABSENT, BANDS, CameraFacts, FrameFacts, Survey
+from saunet.tools.doctor.survey import ABSENT, BANDS, CameraFacts, FrameFacts, Survey, is_doubled
 
 DARK, BRIGHT = 0.08, 0.92
 """Mean brightness outside which a frame shows nothing."""
@@ -21,6 +21,8 @@ FLAT = 0.03
 """Contrast under which a frame shows nothing (fog on the lens, a wall, a cap)."""
 _STILL_BAND = 0.5
 """A band that moves less than this fraction of the whole picture is part of the car."""
+_UNEVEN = 1.5
+"""Highest over lowest rate of a recording from which it is worth a word."""
 _USE_MANIFEST = "train with data.manifest=<this manifest>"
 
 
@@ -47,6 +49,7 @@ def diagnose(survey: Survey) -> list[Finding]:
         _neighbors,
         _leak,
         _parallax,
+        _times,
         _cuts,
         _doubled,
         _static,
@@ -200,6 +203,31 @@ def _parallax(survey: Survey) -> Iterator[Finding]:
         yield Finding("warning", text, "use more frames a second or smaller data.offsets")
 
 
+def _times(survey: Survey) -> Iterator[Finding]:
+    lines = survey.timelines
+    gaps = [(end - start, start, line.drive) for line in lines for start, end in line.gaps]
+    if gaps:
+        longest, start, drive = max(gaps)
+        count = f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''} in time"
+        where = f"in {len({drive for *_, drive in gaps})} of {len(lines)} recordings"
+        text = f"{count} {where}, the longest {longest:.2f} s long, after {start:.2f} s of '{drive}'"
+        yield Finding("note", text, "no sample reaches across")
+    stamps = [line.drive for line in lines if (np.diff(line.times) <= 0).any()]
+    if stamps:
+        text = f"time stamps repeat or go back in {len(stamps)} of {len(lines)} recordings, such as '{stamps[0]}'"
+        yield Finding("warning", text, "speeds there are wrong: repair the stamps, or leave the frames out")
+    uneven = [(line, rates) for line in lines if (rates := line.rates) and rates[2] > _UNEVEN * rates[0]]
+    if uneven:
+        line, (low, _, high) = uneven[0]
+        text = f"the frame rate varies in {len(uneven)} of {len(lines)} recordings, such as '{line.drive}'"
+        fix = "data.fps (video) takes frames at equal steps of time"
+        yield Finding("note", f"{text} ({low:.3g} to {high:.3g} frames a second)", fix)
+    unknown = [line.drive for line in lines if not line.times.size]
+    if unknown and len(unknown) < len(lines):
+        text = f"frames have no times in {len(unknown)} of {len(lines)} recordings, such as '{unknown[0]}'"
+        yield Finding("note", text, "give fps in camera.yaml")
+
+
 def _cuts(survey: Survey) -> Iterator[Finding]:
     split = max((reasons.get("split at cuts", 0) for reasons in survey.left_out.values()), default=0)
     if split:
@@ -214,7 +242,7 @@ def _cuts(survey: Survey) -> Iterator[Finding]:
 
 def _doubled(survey: Survey) -> Iterator[Finding]:
     compared = survey.compared()
-    doubled = sum(frame.change is not None and frame.change < SAME_PICTURE for frame in compared)
+    doubled = sum(map(is_doubled, compared))
     if doubled > 0.02 * len(compared):
         text = f"{doubled} of {len(compared)} frames are the same picture as their neighbor"
         fix = "the video's frame rate was raised: use the original, or data=video, which drops doubled frames"
@@ -321,7 +349,7 @@ def _reason(frame: FrameFacts) -> str | None:
         "dark": frame.brightness < DARK,
         "bright": frame.brightness > BRIGHT,
         "flat": frame.contrast < FLAT,
-        "doubled": frame.change is not None and frame.change < SAME_PICTURE,
+        "doubled": is_doubled(frame),
         "static": frame.flow is not None and frame.flow < MIN_FLOW,
     }
     return next((reason for reason, holds in reasons.items() if holds), None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 from collections.abc import Sequence
 
@@ -11,20 +12,23 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from saunet.tools.doctor.findings import Finding, band_profile
-from saunet.tools.doctor.survey import Survey
+from saunet.tools.doctor.survey import Survey, Timeline
 
 WIDTH = 1312
 _GAP = 8
 _LINE = 22
 """Height of a line of text."""
 _INK, _GRID, _BAR, _RED = (40, 40, 40), (210, 210, 210), (70, 130, 180), (190, 30, 30)
-_COLORS = {"error": _RED, "warning": (190, 110, 0), "note": (60, 60, 60)}
+_ORANGE, _WHITE = (190, 110, 0), (255, 255, 255)
+_COLORS = {"error": _RED, "warning": _ORANGE, "note": (60, 60, 60)}
+_TIMELINES = 16
+"""Recordings whose timeline is drawn."""
 _Picture = NDArray[np.uint8]
 
 
 def draw_sheet(survey: Survey, findings: Sequence[Finding], title: str) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return a picture sheet, RGB: a title, up to eight frames, three charts, and the findings as text."""
-    rows = [_text(title, WIDTH, 0.7, _INK, bold=True), *_frames(survey), _charts(survey)]
+    """Return a picture sheet, RGB: a title, up to eight frames, three charts, timelines, and the findings as text."""
+    rows = [_text(title, WIDTH, 0.7, _INK, bold=True), *_frames(survey), _charts(survey), *_timelines(survey)]
     for finding in findings:
         lines = textwrap.wrap(str(finding), 165, subsequent_indent="    ")
         rows.append(np.concatenate([_text(line, WIDTH, 0.45, _COLORS[finding.level]) for line in lines]))
@@ -122,6 +126,52 @@ def _profile(profile: NDArray[np.float64] | None) -> _Picture:
         length = round((right - left - 4) * float(value) / max(most, 1e-6))
         cv2.rectangle(chart, (left + 1, first), (left + 1 + length, last), _BAR, -1)
     return chart
+
+
+def _timelines(survey: Survey) -> list[_Picture]:
+    """Draw recordings as bars over their time, as high as the rate is; those with gaps and duplicates come first."""
+    lines = sorted(
+        (line for line in survey.timelines if line.rates), key=lambda each: -len(each.gaps + each.duplicates)
+    )
+    if not lines:
+        return []
+    shown, rest = lines[:_TIMELINES], len(lines) - _TIMELINES
+    more = f"; {rest} more recordings, with fewer of both, are not drawn" if rest > 0 else ""
+    head = f"timelines: height is the frame rate, red are gaps, orange ticks duplicates{more}"
+    return [np.concatenate([_text(head, WIDTH, 0.45, _INK), *map(_timeline, shown)])]
+
+
+def _timeline(line: Timeline) -> _Picture:
+    row, left, right, top, bottom = _blank(_LINE + 12, WIDTH), 640, WIDTH - _GAP, 8, _LINE + 10
+    rates, name = line.rates or (0.0, 0.0, 0.0), line.drive
+    recorded = f" of {line.recorded:.3g}" if line.recorded and line.recorded > 1.2 * rates[1] else ""
+    facts = [
+        name if len(name) < 34 else f"...{name[-30:]}",
+        f"{line.frames} frames in {line.times[-1]:.1f} s",
+        f"{rates[1]:.3g}{recorded} a second",
+        *([f"{len(line.gaps)} gaps"] if line.gaps else []),
+        *([f"{len(line.duplicates)} duplicates"] if line.duplicates else []),
+    ]
+    _write(row, ", ".join(facts), (_GAP, bottom - 6))
+
+    def column(time: float) -> int:
+        return left + round((right - left) * min(max(time / max(line.times[-1], 1e-9), 0), 1))
+
+    def bar(start: float, end: float, height: float, color: tuple[int, int, int]) -> None:
+        first = column(start)
+        cv2.rectangle(
+            row, (first, bottom - round((bottom - top) * height)), (max(column(end), first + 1), bottom), color, -1
+        )
+
+    usual = 1 / rates[1]
+    for start, end in itertools.pairwise(line.times.tolist()):
+        bar(start, end, min(1.0, usual / max(end - start, usual)), _BAR)
+    for start, end in line.gaps:
+        bar(start, end, 1.0, _WHITE)
+        bar(start, end, 0.4, _RED)
+    for time in line.duplicates:
+        cv2.line(row, (column(time), top - 6), (column(time), top), _ORANGE, 1)
+    return row
 
 
 def _text(text: str, width: int, size: float, color: tuple[int, int, int], bold: bool = False) -> _Picture:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import tempfile
@@ -20,7 +21,7 @@ from saunet.data.loading.sampling import evenly
 from saunet.data.loading.selecting import optical_flow
 from saunet.data.loading.windows import WindowDataset
 from saunet.data.video.focal import WINDOW, FocalEstimate, drive_windows, estimate_focal
-from saunet.data.video.motion import relative_change, shrink
+from saunet.data.video.motion import SAME_PICTURE, relative_change, shrink
 from saunet.errors import DataError, SaunetError
 
 SPLITS = ("train", "val", "test")
@@ -84,6 +85,32 @@ class CameraFacts:
 
 
 @dataclass(frozen=True)
+class Timeline:
+    """When the frames of one recording were taken; seconds count from the first."""
+
+    drive: str
+    frames: int
+    times: NDArray[np.float64]
+    """Of each frame; empty if unknown."""
+    gaps: tuple[tuple[float, float], ...] = ()
+    """Between which times frames are missing."""
+    duplicates: tuple[float, ...] = ()
+    """Times of frames that repeat the picture or the time stamp before them."""
+    recorded: float | None = None
+    """Frames per second of the file, of which only some may be used."""
+
+    @property
+    def rates(self) -> tuple[float, float, float] | None:
+        """Lowest, usual and highest rate, frames per second, of 90 % of the steps outside gaps; None if unknown."""
+        steps = np.diff(self.times)[~np.isin(self.times[:-1], [start for start, _ in self.gaps])]
+        steps = steps[steps > 0]
+        if not steps.size:
+            return None
+        high, usual, low = (1 / np.quantile(steps, [0.05, 0.5, 0.95])).tolist()
+        return low, usual, high
+
+
+@dataclass(frozen=True)
 class TruthFacts:
     """One ground-truth map that was read."""
 
@@ -120,6 +147,7 @@ class Survey:
     focals: tuple[int, int] = 0, 0
     """How many cameras (of one K each) were looked at for their focal length, and how many there are."""
     camera_problems: list[str] = field(default_factory=list)
+    timelines: list[Timeline] = field(default_factory=list)
     truths: list[TruthFacts] = field(default_factory=list)
     truth_wanted: int = 0
     """Frames whose ground truth was asked for."""
@@ -159,9 +187,11 @@ def survey(
     if "train" in datasets and "val" in datasets:
         found.shared_frames = len(_read_by(datasets["train"]) & _read_by(datasets["val"]))
     drives: dict[str, Drive] = {}
+    timed: dict[str, Drive] = {}
     wanted: dict[str, set[int]] = {}
     for split, dataset in datasets.items():
         labels = [_label(drive, split, drives) for drive in dataset.drives]
+        timed |= {label: drive for label, drive in zip(labels, dataset.drives, strict=True) if drive.indices}
         for position, frame in dataset.windows:
             drives[labels[position]] = dataset.drives[position]
             wanted.setdefault(labels[position], set()).update(frame + offset for offset in (0, *dataset.offsets))
@@ -175,6 +205,7 @@ def survey(
     plan = _spread(everything, frames)
     found.known, found.judged = len(everything), len(plan)
     _read_frames(found, drives, plan, advance)
+    found.timelines = [_timeline(found, name, drive) for name, drive in timed.items()]
     for name in wanted:
         _look_at_camera(found, name, drives[name], min(wanted[name]))
     _estimate_focal(found, drives, min(frames or found.known, found.known))
@@ -288,6 +319,24 @@ def _complaints(found: list[str]) -> Iterator[None]:
                     found.append(line.decode(errors="replace").strip())
                 else:
                     os.write(2, line)
+
+
+def _timeline(found: Survey, name: str, drive: Drive) -> Timeline:
+    times, indices, cuts = drive.timestamps, drive.indices, drive.gaps
+    if times is None or not np.isfinite(times).all():
+        return Timeline(name, len(indices), np.empty(0), recorded=drive.fps)
+    start, same = float(times[0]), dict(zip(indices, times.tolist(), strict=True))
+    doubled = [frame.index for frame in found.compared() if frame.drive == name and is_doubled(frame)]
+    repeated = {*drive.duplicates, *times[1:][np.diff(times) <= 0].tolist(), *(same[i] for i in doubled if i in same)}
+    gaps = tuple(
+        (same[before] - start, same[after] - start) for before, after in itertools.pairwise(indices) if before in cuts
+    )
+    return Timeline(name, len(indices), times - start, gaps, tuple(sorted(t - start for t in repeated)), drive.fps)
+
+
+def is_doubled(frame: FrameFacts) -> bool:
+    """Return whether a frame is the same picture as its neighbor."""
+    return frame.change is not None and frame.change < SAME_PICTURE
 
 
 def _look_at_camera(found: Survey, name: str, drive: Drive, index: int) -> None:
