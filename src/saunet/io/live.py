@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 import av
 import cv2
 from av.error import FFmpegError
+from av.video.reformatter import VideoReformatter
 
 from saunet.errors import DataError, one_of
 from saunet.io.video import Deinterlacer, Picture, VideoFrame, to_rgb
@@ -202,6 +203,7 @@ class CameraReader:
                 stream.thread_type = "SLICE"  # threads that work on several frames would hold them back
                 self.fps = float(stream.average_rate or stream.guessed_rate or self.fps)
                 weave: Deinterlacer | None = None
+                converter = VideoReformatter()
                 for packet in container.demux(stream):
                     if self._stopped:
                         return
@@ -214,7 +216,7 @@ class CameraReader:
                         if weave is None and frame.interlaced_frame:
                             weave = Deinterlacer(stream)
                         for each in (frame,) if weave is None else weave.push(frame):
-                            yield _Arrived(to_rgb(each, self.name), at)
+                            yield _Arrived(to_rgb(each, self.name, converter), at)
         except (FFmpegError, OSError):
             return
 

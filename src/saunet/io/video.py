@@ -14,6 +14,7 @@ from typing import Any
 import av
 import numpy as np
 from av.error import FFmpegError
+from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
 from saunet.errors import ConfigError, DataError, UnreadableError, one_of, positive
@@ -80,14 +81,14 @@ class VideoReader(Session):
         if self.path.stat().st_size == 0:
             raise UnreadableError(f"{source} is empty (0 bytes); copy it again")
         self.missing = self.damaged = self.plain = self.count = 0
-        self._broken = False
+        self._broken, self._converter = False, VideoReformatter()
         with self._opened() as (container, stream):
             first = next(self._decoded(container, stream), None)
             if first is None:
                 raise UnreadableError(
                     f"{self.name} holds no frame that can be decoded; it may be truncated or have an unusual codec"
                 )
-            self.height, self.width = to_rgb(first, self.name).shape[:2]
+            self.height, self.width = to_rgb(first, self.name, self._converter).shape[:2]
             self._timed = container.format.name not in _RAW and first.time is not None
             self.origin = float(first.time) if self._timed else 0.0
             mean, usual = self._rates(container, stream)
@@ -108,7 +109,7 @@ class VideoReader(Session):
         if fps is not None and self._pace is not None and fps < self._pace * (1 - 1e-3):
             stamped = nearest_steps(stamped, positive("fps", fps))
         for number, seconds, frame in stamped:
-            image = to_rgb(frame, self.name)
+            image = to_rgb(frame, self.name, self._converter)
             if image.shape[:2] != (self.height, self.width):
                 raise DataError(
                     f"{self.name} changes its size from {self.width}x{self.height} to {image.shape[1]}x"
@@ -346,10 +347,13 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
         yield None
 
 
-def to_rgb(frame: Any, name: str) -> Picture:
-    """Convert by the frame's own tags of matrix and range, and turn it as its display matrix says."""
+def to_rgb(frame: Any, name: str, converter: VideoReformatter) -> Picture:
+    """Convert by the frame's own tags of matrix and range, and turn it as its display matrix says.
+
+    One converter serves all frames; a frame's own would be set up, with its threads, for each.
+    """
     try:
-        image = frame.to_ndarray(format="rgb24")
+        image = converter.reformat(frame, format="rgb24").to_ndarray()
     except (FFmpegError, ValueError) as reason:
         raise UnreadableError(
             f"{name} has pixels of format {frame.format.name}, which cannot be converted to RGB; convert it to H.264"
