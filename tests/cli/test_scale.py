@@ -255,10 +255,8 @@ def test_speeds_of_a_clip_of_which_every_third_frame_is_used(given: float | None
     (tmp_path / "speeds.csv").write_text("frame,speed\n0,0\n44,44\n")  # a meter a second more with each frame
     scale = ScaleOptions(method="speed", speeds=str(tmp_path / "speeds.csv"), fps=given)
     options = EvaluateOptions(data=Spec({}), checkpoint="x", scale=scale, output_dir=str(tmp_path / "out"))
-    inspect.unwrap(_scaled)(
-        options, SimpleNamespace(scale=None, offsets=(-1, 1)), (Flat(), StraightOn()), data, torch.device("cpu"),
-        first=True,
-    )  # fmt: skip
+    record = SimpleNamespace(scale=None, offsets=(-1, 1), intrinsics=None)
+    inspect.unwrap(_scaled)(options, record, (Flat(), StraightOn()), data, torch.device("cpu"), first=True)
     found = json.loads((tmp_path / "out" / "scale.json").read_text())["per_frame"]
     (drive,) = data.datasets["test"].drives
     assert len(found) >= 3

@@ -155,7 +155,7 @@ def _timeline(line: Timeline) -> _Picture:
     _write(row, ", ".join(facts), (_GAP, bottom - 6))
 
     def column(time: float) -> int:
-        return left + round((right - left) * min(max(time / max(line.times[-1], 1e-9), 0), 1))
+        return left + round(float((right - left) * min(max(time / max(line.times[-1], 1e-9), 0), 1)))
 
     def bar(start: float, end: float, height: float, color: tuple[int, int, int]) -> None:
         first = column(start)
