@@ -151,6 +151,7 @@ def components(arguments: Sequence[str]) -> None:
                 continue
             node, group = found[kind][name], "model" if kind == "model" else REGISTRIES[kind].group
             choose = f"{group}={name}" if group else f'saunet.build("{kind}", "{name}", ...)'
+            choose = f"+objective.extra.{name}.weight=..." if kind == "term" else choose
             print(f"  {name}\n      {node.summary}\n      choose: {choose}", *described(node.keys, "      "), sep="\n")
         print()
 

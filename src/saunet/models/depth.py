@@ -54,6 +54,12 @@ class DepthNet(nn.Module):
         frames = getattr(encoder, "frames", 1)  # a pose network's encoder may see several
         if frames != 1:
             raise ConfigError(f"the depth network's encoder has frames {frames}; depth comes from one image: frames=1")
+        for needed in ("features", "size_divisor"):
+            if not hasattr(encoder, needed):
+                raise ConfigError(
+                    f"the encoder {type(encoder).__name__} has no attribute '{needed}'; set it in __init__ "
+                    "(docs/add_encoder.md)"
+                )
         self.encoder = encoder
         self.decoder = decoder(features=encoder.features)
         self.features = encoder.features

@@ -18,7 +18,7 @@ from saunet.errors import CheckpointError, ConfigError, DataError, checked, divi
 from saunet.io.atomic import write_bytes
 from saunet.io.colormaps import colorize
 from saunet.io.display import display
-from saunet.io.images import as_rgb_bytes, encode_png, network_input, read_image, write_image
+from saunet.io.images import IMAGE_SUFFIXES, as_rgb_bytes, encode_png, network_input, read_image, write_image
 from saunet.runs.record import Scale
 from saunet.weights.locate import locate
 
@@ -101,6 +101,9 @@ class Prediction:
         """Write depth as float32 (``.npy``), disparity in colors (``.png``, ``.jpg`` ...), or a page (``.html``).
 
         The page shows image and disparity, and the depth under the cursor; it needs nothing but a browser.
+
+        Raises:
+            ConfigError: for another suffix.
         """
         suffix = Path(path).suffix.lower()
         if suffix == ".npy":
@@ -111,8 +114,19 @@ class Prediction:
             from saunet.prediction.page import depth_page
 
             write_bytes(path, depth_page(self).encode())
+        elif suffix in (".ply", ".pcd"):
+            raise ConfigError(f"{path} is for points; use .point_cloud(camera).save('{Path(path).stem}.ply')")
+        elif suffix not in IMAGE_SUFFIXES:
+            allowed = ", ".join((".npy", ".html", *sorted(IMAGE_SUFFIXES)))
+            raise ConfigError(f"the suffix of {Path(path).name} is '{suffix}', allowed: {allowed}")
         else:
             write_image(path, self.color())
+
+    def __repr__(self) -> str:
+        height, width = self.depth.shape
+        low, high = np.nanmin(self.depth), np.nanmax(self.depth)
+        name = f"{self.name}: " if self.name else ""
+        return f"Prediction({name}{width} x {height}, depth {low:.3g} to {high:.3g}, {self.unit})"
 
     def show(self) -> None:
         """Show image and disparity in the notebook; elsewhere open the page of `save` in the browser."""

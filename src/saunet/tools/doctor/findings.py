@@ -128,6 +128,10 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
     if known:
         text = f"the focal lengths of {len(known)} of {len(survey.cameras)} drives were compared with turns in them"
         yield Finding("note", text)
+    elif survey.cameras:
+        yield Finding(
+            "note", "K was not checked: no drive looked at turns enough; is this your camera's field of view?"
+        )
     if cameras > looked:
         text = f"turns were looked for in the drives of {looked} of {cameras} different K"
         yield Finding("note", text, "for another one: saunet calibrate video=DRIVE")
