@@ -62,7 +62,7 @@ KITTI = (
         ("--experiment selfsup", ("written without dashes: experiment=selfsup",)),
         ("objective.alpha=much", ("objective.alpha is 'much'; it must be float",)),
         ("model/encoder=resnet19", ("unknown model/encoder 'resnet19'", "did you mean 'resnet18'?", "stratified_tiny")),
-        ("experiment=nope", ("unknown experiment 'nope'", "available: demo")),
+        ("experiment=nope", ("unknown experiment 'nope'", "available: ", "demo")),
         ("data=kitti data.root=/nowhere/at/all", ("no data root at /nowhere/at/all", "set data.root")),
         ("experiment=smoke data.height=90", ("90x96", "nearest valid size is 96x96")),
         ("experiment=smoke seed=-1", ("seed is -1; it must be at least 0",)),

@@ -28,6 +28,7 @@ class Data:
     protocols = ("eigen_camera_z",)
     protocol = "eigen_camera_z"
     neighbors = ("train",)
+    guess_camera = False
 
     def __init__(self, kind="camera_z"):
         self.ground_truth, self.datasets, self.stages = kind, {}, []
@@ -45,7 +46,7 @@ class Data:
     def ground_truths(self, split):
         raise DataError("the training drives have no depth")
 
-    def batches(self, split, device):
+    def batches(self, split, device, place=None):
         for place in range(6):
             sources = 1 if split in self.neighbors else 0
             target = torch.rand(1, 3, 8, 16, generator=torch.Generator().manual_seed(place))

@@ -49,6 +49,7 @@ def assemble(batch: dict[str, Any], sigmoid: Sequence[Tensor], axisangle: Tensor
         sigmoid=tuple(sigmoid), disparity=disparity, depth=tuple(disparity_to_depth(d) for d in disparity)
     )
     poses = pose_matrix(axisangle, translation)
+    batch = {**batch, "T_predicted": poses}
     size = batch["loss_target"].shape[-2:]
     views = []
     for d in disparity:
@@ -87,6 +88,7 @@ def make_inputs() -> Callable[..., Inputs]:
             "target_teacher": rand(batch, 1, height, width) * 3 + 1,
             "distance": rand(batch, sources),
             "source_depth": rand(batch, sources, 1, height, width) * 0.5 + 2,
+            "T_tracked": pose_matrix(rand(batch, sources, 3) * 0.1, rand(batch, sources, 3) + 0.2),
         }
         data.update(replace)
         sigmoid = [rand(batch, 1, height >> s, width >> s) * 0.05 + 0.02 for s in range(scales)]

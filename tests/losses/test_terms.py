@@ -124,7 +124,8 @@ def test_nothing_left_is_zero_with_a_graph(name: str, options: dict[str, Any], m
     for key in ("target_depth", "target_teacher"):
         batch[key] = torch.zeros_like(batch[key])
     views = tuple(dataclasses.replace(view, valid=torch.zeros_like(view.valid)) for view in inputs.views)
-    batch["distance"] = torch.full_like(batch["distance"], torch.nan)
+    for key in ("distance", "T_tracked"):
+        batch[key] = torch.full_like(batch[key], torch.nan)
     elsewhere = torch.zeros(4, 4)
     elsewhere[0, 3] = 1e5
     result = build(name, options)(batch, inputs.pyramid, inputs.poses + elsewhere, views)

@@ -80,6 +80,11 @@ class SelfSupervisedDepth(LightningModule):
         self._prepared = False
         self._owed = False  # a validation that a killed run did not finish
 
+    @property
+    def compiled(self) -> bool:
+        """Whether networks, view synthesis and losses are compiled."""
+        return self.speed.compile
+
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> DepthPyramid:
         """Return the depth of images in [0, 1]."""
         pyramid: DepthPyramid = self.depth(image)

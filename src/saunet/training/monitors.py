@@ -273,7 +273,7 @@ class LoaderMonitor(Callback):
                 cacheable=data.cacheable and data.copies is None,
                 device=pl_module.device.type,
                 precision=str(trainer.precision),
-                compiled=getattr(getattr(pl_module, "speed", None), "compile", False),
+                compiled=getattr(pl_module, "compiled", False),
             )
             rank_zero_info(f"{pace}; to make it faster: {change}")
 
