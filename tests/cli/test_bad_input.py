@@ -56,6 +56,7 @@ KITTI = (
         ("max_epochs=3", ("unknown key 'max_epochs'", "did you mean 'trainer.max_epochs'?")),
         ("learning_rate=1e-4", ("unknown key 'learning_rate'", "did you mean 'lr'?")),
         ("imgsz=640", ("unknown key 'imgsz'", "did you mean 'size'?")),
+        ("size=192", ("size is '192'", "size=192x640")),
         ("+epochs=3", ("leave out the plus sign: trainer.max_epochs=...",)),
         ("+dta.root=x", ("unknown key 'dta'", "did you mean 'data'?")),
         ("model.encoder=resnet18", ("choose a component with a slash: model/encoder=resnet18",)),

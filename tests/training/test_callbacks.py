@@ -43,3 +43,19 @@ def test_without_a_terminal_lines_say_where_the_training_is(
     assert any(line.startswith("epoch 1/2, step 3, loss ") and "val/abs_rel" in line for line in rows)
     assert lines[-1].startswith("epoch 2/2, step 6, loss ")
     assert lines[-1].endswith("time left 0:00:00")
+
+
+def test_the_time_left_ends_with_the_last_step(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    clock = iter(range(0, 1000, 6))
+    monkeypatch.setattr("saunet.training.callbacks.time.monotonic", lambda: float(next(clock)))
+    for epochs in (80, -1):
+        limits = {"max_epochs": epochs, "max_steps": 3}
+        trainer = tiny.tiny_trainer(tmp_path, **limits, callbacks=[Progress()], enable_progress_bar=True)
+        with caplog.at_level("INFO"):
+            trainer.fit(tiny.tiny_model(), tiny.tiny_walls())
+        lines = [record.getMessage() for record in caplog.records if record.getMessage().startswith("epoch ")]
+        assert lines[-1].endswith("time left 0:00:00")
+        caplog.clear()

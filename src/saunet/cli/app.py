@@ -381,6 +381,8 @@ class _Reader:
         size = re.fullmatch(r"(\d+)x(\d+)", value) if key == "size" and own.key("size") is None else None
         if size:  # of images, height x width
             return [f"data.height={size[1]}", f"data.width={size[2]}"]
+        if key == "size" and own.key("size") is None and own.key("data") and not sign:
+            raise ConfigError(f"size is '{value}'; it needs height x width, such as size=192x640")
         if key == "data" and own.key("data") and self._is_path(value):
             return [f"{sign}data=video", f"data.root={self._meant(value, 'str')}"]
         group = key.replace(".", "/")

@@ -171,7 +171,8 @@ class PredictResult:
         lines = []
         if self.skipped is not None:
             before = f", {self.skipped} images were finished before" if self.skipped else ""
-            lines.append(f"{len(self.written)} files written{before}: {self.output}")
+            files = "1 file" if len(self.written) == 1 else f"{len(self.written)} files"
+            lines.append(f"{files} written{before}: {self.output}")
         for paths, what in ((self.clips, f"{self.frames} frames"), (self.finished, "finished before")):
             if paths:
                 lines.append(f"{what}: {', '.join(map(str, paths))}")

@@ -260,10 +260,11 @@ class Progress(TQDMProgressBar):
         for name, shown in (("train/loss", "loss"), ("val/loss", "val/loss"), ("val/abs_rel", "val/abs_rel")):
             if name in trainer.callback_metrics:
                 parts.append(f"{shown} {float(trainer.callback_metrics[name]):.4f}")
-        if epochs and epochs > 0 and done > self._first:
+        ends = [trainer.num_training_batches * epochs] if epochs and epochs > 0 else []
+        ends += [trainer.max_steps * trainer.accumulate_grad_batches] if trainer.max_steps > 0 else []
+        if ends and done > self._first:
             each = (self._said - self._began) / (done - self._first)
-            left = timedelta(seconds=round(each * max(trainer.num_training_batches * epochs - done, 0)))
-            parts.append(f"time left {left}")
+            parts.append(f"time left {timedelta(seconds=round(each * max(min(ends) - done, 0)))}")
         return ", ".join(parts)
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
