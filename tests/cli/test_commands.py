@@ -53,6 +53,10 @@ def test_resume_goes_on_from_the_last_checkpoint(tool: Tool, smoke_run: Path) ->
     outcome = tool("train", "experiment=smoke", *more)
     assert outcome.code == 0, outcome.err
     assert read_checkpoint(last).epoch == 0
+    assert "nothing was left" not in outcome.out
+    done = tool("train", "experiment=smoke", "model/pose=posecnn", f"resume={last}", "output_dir=done")
+    assert done.code == 0, done.err
+    assert "nothing was left to train" in done.out
 
 
 def test_evaluate_writes_a_table_beside_trivial_predictors(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:

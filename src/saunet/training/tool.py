@@ -273,6 +273,8 @@ def train(
                 found = model.found_intrinsics()
                 record.write(intrinsics=found.to_plain())
                 rank_zero_info(model.intrinsics.told(found))
+    if resume and trainer.global_step == steps:
+        print(f"nothing was left to train: it was complete after step {steps}; epochs=N goes on to a later end")
     if trainer.is_global_zero:
         if trainer.global_step >= DRAWN_FROM:
             _draw(folder)
