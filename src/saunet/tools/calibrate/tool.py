@@ -22,7 +22,8 @@ from saunet.io.atomic import check_folder
 from saunet.io.images import read_image, write_image
 from saunet.io.progress import bar
 from saunet.io.video import VideoReader
-from saunet.tools.calibrate.solve import MAGNIFIED, Board, Calibration, check_picture, place, solve
+from saunet.tools.calibrate.rig import place
+from saunet.tools.calibrate.solve import MAGNIFIED, Board, Calibration, check_picture, solve
 
 
 @checked
