@@ -106,7 +106,7 @@ def scaled_motion(
     inside = (column > -0.5) & (column < width - 0.5) & (row > -0.5) & (row < height - 0.5)  # false for NaN
     place = torch.where(inside, row.round() * width + column.round(), 0).long()
     found = depth.flatten(1)[:, None].expand(-1, points.shape[1], -1).gather(-1, place)
-    z = torch.where(inside, z, 1.0)
+    found, z = torch.where(inside, found, 1.0), torch.where(inside, z, 1.0)
     ratio = torch.where(inside, (found / z).log(), torch.nan).detach()
     off = (ratio - ratio.nanmedian(-1, keepdim=True).values) / _FAR_OFF
     weight = (1 - off.square()).clamp(min=0).square().where(inside, 0.0)
@@ -114,7 +114,7 @@ def scaled_motion(
     told = parallax > 0
     length = (weight / (found * z)).sum(-1) / parallax.where(told, 1.0)
     still, known = (T[..., :3, 3] == 0).all(-1), T.isfinite().flatten(-2).all(-1)
-    # Nothing that is no number may be multiplied by: a gradient of 0 would become one of NaN.
+    # NaN must not be a factor of anything learned: a gradient of 0 times NaN is NaN.
     T = torch.where(known[..., None, None], T, 0.0)
     scaled = _assemble(T[..., :3, :3], T[..., :3, 3] * length.where(told & ~still, 0.0)[..., None])
     return torch.where((known & (told | still))[..., None, None], scaled, torch.nan)

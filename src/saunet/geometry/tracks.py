@@ -31,14 +31,6 @@ class TrackedMotion(NamedTuple):
     depth: Float[F64, " n"]
     """Their depth, camera z, in lengths of the translation."""
 
-    def scaled(self, depth: Float[NDArray[np.float32], "h w"]) -> Float[F64, "4 4"]:
-        """Return T_src_tgt so long that the median ratio of a depth map to the points' own depth is 1."""
-        T = self.T_src_tgt.copy()
-        if len(self.points):
-            column, row = self.points.round().astype(int).T
-            T[:3, 3] *= np.median(depth[row, column] / self.depth)
-        return T
-
 
 def tracked_motion(
     target: UInt8[NDArray[np.uint8], "h w 3"],
@@ -115,16 +107,34 @@ def _gray(image: UInt8[NDArray[np.uint8], "h w 3"]) -> UInt8[NDArray[np.uint8], 
 
 def _follow(
     first: UInt8[NDArray[np.uint8], "h w"], second: UInt8[NDArray[np.uint8], "h w"]
-) -> tuple[Float[NDArray[np.float64], "n 2"], Float[NDArray[np.float64], "n 2"]] | None:
+) -> tuple[Float[F64, "n 2"], Float[F64, "n 2"]] | None:
     corners: Any = cv2.goodFeaturesToTrack(first, 1000, 0.003, 4)
     if corners is None:
         return None
-    start: Any = np.asarray(corners, np.float32).reshape(-1, 1, 2)
-    flow: Any = functools.partial(cv2.calcOpticalFlowPyrLK, nextPts=None, winSize=(15, 15), maxLevel=4)
-    end = flow(first, second, start)[0]
-    back = flow(second, first, end)[0]
-    inside = (end[:, 0] > 0).all(1) & (end[:, 0] < np.array(first.shape[::-1]) - 1).all(1)
-    good = inside & (np.linalg.norm((back - start)[:, 0], axis=1) < 0.5)
+    start = np.asarray(corners, np.float32).reshape(-1, 1, 2)
+    end, good = follow(first, second, start, tolerance=0.5)
     if good.sum() < _FEWEST:
         return None
     return start[good, 0].astype(np.float64), end[good, 0].astype(np.float64)
+
+
+def follow(
+    first: UInt8[NDArray[np.uint8], "h w"],
+    second: UInt8[NDArray[np.uint8], "h w"],
+    points: NDArray[np.float32],
+    *,
+    tolerance: float,
+    margin: int = 0,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Follow points (n 1 2) by Lucas and Kanade's method from one gray picture to another, and back.
+
+    Returns:
+        Where they are, and which can be relied on: they come back to within ``tolerance`` pixels, and are inside the
+        picture by more than ``margin``.
+    """
+    flow: Any = functools.partial(cv2.calcOpticalFlowPyrLK, nextPts=None, winSize=(15, 15), maxLevel=4)
+    moved = flow(first, second, points)[0]
+    back = flow(second, first, moved)[0]
+    last = np.array(second.shape[::-1]) - 1 - margin
+    inside = (moved[:, 0] > margin).all(1) & (moved[:, 0] < last).all(1)
+    return moved, inside & (np.linalg.norm((back - points)[:, 0], axis=1) < tolerance)

@@ -6,7 +6,6 @@ solved with the focal length free, each says how well it knows it, and only what
 
 from __future__ import annotations
 
-import functools
 import heapq
 import itertools
 import math
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from saunet.data.drive import Drive
 from saunet.data.loading.sampling import evenly
 from saunet.errors import DataError
+from saunet.geometry.tracks import follow
 
 F64 = NDArray[np.float64]
 WINDOW = 12
@@ -67,15 +67,10 @@ def track(frames: Sequence[NDArray[np.uint8]]) -> tuple[F64, NDArray[np.bool_]]:
         return np.zeros((0, len(frames), 2)), np.zeros((0, len(frames)), dtype=bool)
     points = np.asarray(corners, np.float32).reshape(-1, 1, 2)
     found, known = [points[:, 0].astype(np.float64)], [np.ones(len(points), dtype=bool)]
-    flow: Any = functools.partial(cv2.calcOpticalFlowPyrLK, nextPts=None, winSize=(15, 15), maxLevel=4)
     for before, after in itertools.pairwise(gray):
-        moved = flow(before, after, points)[0]
-        back = flow(after, before, moved)[0]
-        good = np.linalg.norm((back - points)[:, 0], axis=1) < 0.3
-        inside = (moved[:, 0] > 2).all(1) & (moved[:, 0] < np.array(after.shape[::-1]) - 3).all(1)
-        points = moved
-        found.append(moved[:, 0].astype(np.float64))
-        known.append(known[-1] & good & inside)
+        points, good = follow(before, after, points, tolerance=0.3, margin=2)
+        found.append(points[:, 0].astype(np.float64))
+        known.append(known[-1] & good)
     return np.stack(found, axis=1), np.stack(known, axis=1)
 
 
