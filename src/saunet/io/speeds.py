@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saunet.errors import DataError, positive
+from saunet.io.atomic import write_bytes
 
 _FORMAT = (
     "expected columns 'time' (seconds) or 'frame' (number), 'speed' (meters per second), and for several drives 'drive'"
@@ -73,6 +75,13 @@ class SpeedTable:
                 f"{self.path} gives speeds of the drives {_some(list(self.drives))}, which are not asked for; "
                 f"{expected} the column 'drive' out"
             )
+
+
+def write_speeds(path: Path, columns: Sequence[str], rows: Iterable[Sequence[float | int]]) -> None:
+    """Write a table that `read_speeds` reads, whole or not at all."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
+    write_bytes(path, text.getvalue().encode())
 
 
 def read_speeds(path: str | Path) -> SpeedTable:

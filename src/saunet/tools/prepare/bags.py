@@ -6,8 +6,6 @@ interrupted import resumes.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +24,7 @@ from saunet.io.atomic import remove_partial_files, write_bytes, write_json
 from saunet.io.images import encode_jpeg
 from saunet.io.plain import read_json
 from saunet.io.progress import bar
+from saunet.io.speeds import write_speeds
 from saunet.tools.prepare.gopro import RECORD
 from saunet.tools.prepare.pool import OnError
 
@@ -198,9 +197,7 @@ class Bag:
             write_camera(clip.home / FILE_NAME, camera, f"saunet prepare import: {name} of {self.path.name}")
         clip.about.append(f"camera from {name}" if name else f"no CameraInfo: add {FILE_NAME}, or set camera=FILE")
         if speeds is not None:
-            text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows([("time", "speed"), *speeds[1]])
-            write_bytes(clip.home / SPEEDS, text.getvalue().encode())
+            write_speeds(clip.home / SPEEDS, ("time", "speed"), speeds[1])
         clip.about.append(f"speeds from {speeds[0]}" if speeds else "no speeds")
         write_json(clip.home / RECORD, {**clip.state, "frames": len(clip.names)})
 

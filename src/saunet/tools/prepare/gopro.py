@@ -6,8 +6,6 @@ holds about a second; its samples are evenly spread over it. Packets are read on
 
 from __future__ import annotations
 
-import csv
-import io
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,8 +16,9 @@ from av.error import FFmpegError
 
 from saunet.data.video.module import SPEEDS
 from saunet.errors import DataError
-from saunet.io.atomic import remove_partial_files, write_bytes, write_json
+from saunet.io.atomic import remove_partial_files, write_json
 from saunet.io.plain import read_json
+from saunet.io.speeds import write_speeds
 from saunet.io.video import VideoReader
 
 RECORD = "import.json"
@@ -64,9 +63,7 @@ def import_video(video: Path, folder: Path) -> tuple[Path, str]:
         link.unlink(missing_ok=True)
         link.symlink_to(video.absolute())
         if rows:
-            text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows([_COLUMNS, *rows])
-            write_bytes(table, text.getvalue().encode())
+            write_speeds(table, _COLUMNS, rows)
         write_json(home / RECORD, {**state, "about": about})
     return home, about
 
