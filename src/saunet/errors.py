@@ -22,8 +22,16 @@ C = TypeVar("C", bound=Callable[..., Any])
 _ENDLESS = re.compile(r"\S{500,}|(?<=')[^']{500,}(?=')")
 """A word or quotation that is longer than what anybody reads, and than the paths of most systems."""
 
-ELSEWHERE = {"learning_rate": "lr", "gpus": "devices", "num_workers": "workers", "imgsz": "size"}
-ELSEWHERE |= {"source": "input", "model": "checkpoint", "weights": "checkpoint", "format": "formats"}
+ELSEWHERE = {
+    "learning_rate": "lr",
+    "gpus": "devices",
+    "num_workers": "workers",
+    "imgsz": "size",
+    "source": "input",
+    "model": "checkpoint",
+    "weights": "checkpoint",
+    "format": "formats",
+}
 """What other tools call a setting -> what it is called here."""
 
 if TYPE_CHECKING:

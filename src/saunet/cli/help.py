@@ -150,8 +150,10 @@ def components(arguments: Sequence[str]) -> None:
                 print(f"  {name:20}{count(kind, name):>12}")
                 continue
             node, group = found[kind][name], "model" if kind == "model" else REGISTRIES[kind].group
-            choose = f"{group}={name}" if group else f'saunet.build("{kind}", "{name}", ...)'
-            choose = f"+objective.extra.{name}.weight=..." if kind == "term" else choose
+            if kind == "term":  # added to an objective, not chosen in the place of another
+                choose = f"+objective.extra.{name}.weight=..."
+            else:
+                choose = f"{group}={name}" if group else f'saunet.build("{kind}", "{name}", ...)'
             print(f"  {name}\n      {node.summary}\n      choose: {choose}", *described(node.keys, "      "), sep="\n")
         print()
 

@@ -21,6 +21,7 @@ from torch import Tensor, distributed
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from saunet.data.loading.module import DepthDataModule
+from saunet.data.loading.sampling import share
 from saunet.errors import CheckpointError, DataError, SaunetError, in_range, one_of, positive
 from saunet.geometry import full_precision
 from saunet.runs.checkpoint import atomic_save
@@ -190,6 +191,9 @@ class Loading:
     seconds: float
     waited: float
 
+    def __add__(self, other: Loading) -> Loading:
+        return Loading(self.images + other.images, self.seconds + other.seconds, self.waited + other.waited)
+
     @property
     def share(self) -> float:
         """Fraction of the time that was spent waiting for the loader."""
@@ -242,13 +246,10 @@ class LoaderMonitor(Callback):
         since, self._since = self._since, (time.monotonic(), waited)
         if since is None:
             return
-        before, sources = self._measured, batch["sources"]
-        images = before.images + int(sources.shape[0] * (1 + sources.shape[1]))
-        seconds, late = self._since[0] - since[0], waited - since[1]
-        loading = Loading(images, before.seconds + seconds, before.waited + late)
-        self._measured, self._steps = loading, self._steps + 1
-        self._all = Loading(len(sources), self._all.seconds + seconds, self._all.waited + late)
-        self._all_steps += 1
+        count, neighbors = batch["sources"].shape[:2]
+        latest = Loading(int(count * (1 + neighbors)), self._since[0] - since[0], waited - since[1])
+        loading = self._measured = self._measured + latest
+        self._all, self._steps, self._all_steps = self._all + latest, self._steps + 1, self._all_steps + 1
         if self._steps < self.every_n_steps:
             return
         self._measured, self._steps = Loading(0, 0.0, 0.0), 0
@@ -265,7 +266,7 @@ class LoaderMonitor(Callback):
             return
         step, waiting = (total / self._all_steps for total in (self._all.seconds, self._all.waited))
         with contextlib.suppress(DataError):  # a file that is gone by now is no reason to fail a finished training
-            pace = measure(step, waiting, data, self._all.images, pl_module.device)
+            pace = measure(step, waiting, data, share(data.batch_size, trainer.world_size), pl_module.device)
             change = first_change(
                 pace,
                 share=self.share,

@@ -95,8 +95,6 @@ def _fetch(name: str) -> Path:
     try:
         from huggingface_hub import snapshot_download
     except ImportError as missing:
-        if Path(name).parent.is_dir():  # then it is a path
-            raise ConfigError(f"there is no file or folder '{name}'; check the path") from missing
         raise ConfigError(
             f"there is no file '{name}', and fetching it from the hub needs huggingface_hub; "
             "check the path, or run: pip install 'saunet[hub]'"
