@@ -11,6 +11,7 @@ import re
 import shlex
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import board_views
@@ -18,10 +19,11 @@ import numpy as np
 import pytest
 from pages import blocks, commands
 from processes import python
+from tiny_checkpoint import component_node
 from videos import write_video
 
 from saunet.io.images import write_image
-from saunet.runs.checkpoint import atomic_save
+from saunet.runs.checkpoint import atomic_save, build_networks
 from saunet.synthetic import SyntheticDrive
 from saunet.synthetic.kitti_writer import write_raw
 from saunet.tools.calibrate.solve import Board
@@ -39,12 +41,15 @@ SHORT = {
 KITTI = "split=all val_drives=[2011_09_26_drive_0002_sync]"
 """The frames of a KITTI that has two drives."""
 TUTORIALS = ["README.md", "your_camera.md", "kitti.md", "scale.md", "add_dataset.md"]
+ALIGNED = "needs a longer drive with stops: tests/cli/test_scale.py, tests/data/test_clock.py"
 ELSEWHERE = {
     "saunet train trainer=ddp data=kitti data.root=/data/kitti": "tests/training/test_ddp.py starts two processes",
     "saunet train -m 'experiment=glob(table3/*)' data.root=/data/kitti": "networks.md trains them on rendered frames",
     "saunet calibrate video=drive.mp4 output=camera.yaml": "test_driving.py has a drive with turns",
     "saunet predict checkpoint=last.ckpt input=image_02/data output=depth/ scale.method=camera_height": "measured once",
     "saunet train experiment=scratch data.stereo=true": "measured once",
+    "saunet predict checkpoint=best.ckpt input=drive.mp4 output=depth/ scale.method=speed scale.speeds=obd": ALIGNED,
+    "saunet train experiment=selfsup data=video data.root=clips data.with_speed=true data.align_speeds=true": ALIGNED,
 }
 """Beginnings of commands that are not run here -> where they are, or why they are not."""
 
@@ -99,8 +104,12 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         f"image_size: [384, 128]\nK: [{K[0, 0]}, {K[1, 1]}, {K[0, 2]}, {K[1, 2]}]\ncamera_height: 1.65\nfps: 10\n"
     )
     (folder / "speeds.csv").write_text("frame,speed\n0,8\n29,8\n")
-    model = read_model("street")
-    atomic_save({"state_dict": dict(model.state), "saunet": model.record.to_plain()}, folder / "best.ckpt")
+    model = read_model("street")  # with a pose network, which a training on video has and speed needs
+    record = replace(model.record, pose=component_node("pose", "posecnn"))
+    pose = build_networks(record)[1]
+    assert pose is not None
+    state = {**model.state, **{f"pose.{key}": value for key, value in pose.state_dict().items()}}
+    atomic_save({"state_dict": state, "saunet": record.to_plain()}, folder / "best.ckpt")
     return folder
 
 

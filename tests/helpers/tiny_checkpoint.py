@@ -14,16 +14,16 @@ from saunet.runs.checkpoint import atomic_save, build_networks
 from saunet.runs.record import ModelRecord
 
 
-def _node(kind: str, name: str) -> dict[str, Any]:
+def component_node(kind: str, name: str) -> dict[str, Any]:
     settings = dataclasses.asdict(structured(REGISTRIES[kind].node(name))())
     return {key: value for key, value in settings.items() if value != "???"}
 
 
 def write_checkpoint(path: Path, height: int = 64, width: int = 96) -> None:
     record = ModelRecord(
-        encoder={**_node("encoder", "lite_mono_tiny"), "dims": [8, 16, 16], "depths": [2, 2, 2]},
-        decoder=_node("decoder", "lite_mono"),
-        pose=_node("pose", "posecnn"),
+        encoder={**component_node("encoder", "lite_mono_tiny"), "dims": [8, 16, 16], "depths": [2, 2, 2]},
+        decoder=component_node("decoder", "lite_mono"),
+        pose=component_node("pose", "posecnn"),
         min_depth=0.1,
         max_depth=100.0,
         height=height,
