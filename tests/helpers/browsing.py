@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import pytest
@@ -25,12 +25,15 @@ def browser() -> Iterator[Any]:
         opened.close()
 
 
-def barriers(page: Any) -> list[str]:
-    """Return what keeps people out of a page, by axe-core: its serious and critical findings."""
+def barriers(page: Any, schemes: Sequence[str] = ("light", "dark")) -> list[str]:
+    """Return what keeps people out of a page, by axe-core: its serious and critical findings in each color scheme."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
-    found = axe.Axe().run(page).response["violations"]
-    return [
-        f"{each['id']}: {each['help']}: {each['nodes'][0]['html']}"
-        for each in found
-        if each["impact"] in ("serious", "critical")
-    ]
+    found = []
+    for scheme in schemes:
+        page.emulate_media(color_scheme=scheme)
+        found += [
+            f"{scheme}: {each['id']}: {each['help']}: {each['nodes'][0]['html']}"
+            for each in axe.Axe().run(page).response["violations"]
+            if each["impact"] in ("serious", "critical")
+        ]
+    return found

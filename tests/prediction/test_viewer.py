@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from browsing import barriers
 
 from saunet.errors import ConfigError, DataError
 from saunet.prediction.pointcloud import Camera, ViewerWriter
@@ -136,6 +137,7 @@ def test_orbit_scrub_and_play_in_a_browser(browser: Any, tmp_path: Path) -> None
     assert np.median(first[first[:, :, 0] > 40][:, 0]) == pytest.approx(60, abs=8), "the wall of frame 0"
     post = green_columns(first)
     assert 300 < post.mean() < 420, "the post is near the middle"
+    zoom = float(page.locator("body").get_attribute("data-zoom"))
     page.locator("#scrub").fill("2")
     page.wait_for_selector('body[data-frame="2"]')
     last = picture()
@@ -149,6 +151,12 @@ def test_orbit_scrub_and_play_in_a_browser(browser: Any, tmp_path: Path) -> None
     assert green_columns(picture()).mean() == pytest.approx(516.6, abs=4)
     page.get_by_role("button", name="reset view").click()
     assert float(page.locator("body").get_attribute("data-yaw")) == 0
+    for key in ("d", "s", "+"):
+        page.keyboard.press(key)
+    turned = [float(page.locator("body").get_attribute(f"data-{name}")) for name in ("yaw", "pitch", "zoom")]
+    assert turned == pytest.approx([0.1, 0.1, 0.9 * zoom], abs=1e-3)
+    page.get_by_role("button", name="reset view").click()
+    assert barriers(page) == []
     page.mouse.wheel(0, 500)
     page.get_by_role("button", name="play").click()
     page.wait_for_selector('body[data-frame="0"]')

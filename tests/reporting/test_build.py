@@ -7,10 +7,12 @@ import io
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from browsing import barriers
 from made_runs import ERRORS, add_checkpoint, make_evaluation, make_run
 from rich.console import Console
 
@@ -49,6 +51,21 @@ def _state(file: Path) -> dict[str, object]:
 
     depth, _ = read_checkpoint(file).networks()
     return dict(depth.named_parameters())
+
+
+@pytest.mark.slow  # fast, but only the session of the slow tests installs playwright
+def test_a_report_is_readable_in_both_color_schemes(
+    browser: Any, everything: list[Path], picture: Path, tmp_path: Path
+) -> None:
+    result = report(ReportOptions(runs=tuple(map(str, everything)), scenes={"kitti": str(picture)}))
+    files = write(result.document, tmp_path / "report")
+    (tmp_path / "notebook.html").write_text(
+        f"<!doctype html><html lang=en><title>output</title><main><h1>output</h1>{result._repr_html_()}</main>"
+    )
+    page = browser.new_page()
+    for file in (files["report.html"], tmp_path / "notebook.html"):
+        page.goto(file.as_uri())
+        assert barriers(page) == []
 
 
 def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path: Path) -> None:

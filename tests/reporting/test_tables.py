@@ -164,7 +164,7 @@ def test_runs_that_share_no_images_are_not_set_against_each_other(tmp_path: Path
     ]  # fmt: skip
     assert len({row.group for row in table.rows}) == 3
     assert table.rows[-1].group == "Without a score"
-    assert table.notes[-1] == "Errors of different groups do not compare."
+    assert table.notes[-1] == "Errors in different groups cannot be compared."
 
 
 def test_one_drawing_holds_what_compares(sweep: Path) -> None:

@@ -18,7 +18,7 @@ from saunet.fingerprint import fingerprint
 from saunet.io.atomic import write_bytes, write_json
 from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
 from saunet.metrics.protocols import Protocol
-from saunet.tables import Row, Table, columns, csv_text, show
+from saunet.tables import Row, Table, columns, csv_text, notebook_html, show
 from saunet.tables.drawing import Drawing, colors, new_figure, svg
 
 ERROR_COLUMNS = columns(*(f"{heading}|.3f" for heading in ERROR_HEADINGS))
@@ -404,9 +404,9 @@ class EvaluationResult:
         for predictor, tint in zip(self.predictors, colors(len(self.predictors)), strict=True):
             values = np.sort(self.errors(predictor, protocol.name)[:, column])
             axis.plot(np.arange(1, len(values) + 1), values, color=tint, label=predictor, drawstyle="steps-mid")
-        axis.set_title(f"{ERROR_COLUMNS[column].heading} of each image, sorted", loc="left", fontsize=10)
-        axis.set_xlabel(f"images under {protocol.name}")
-        axis.legend()
+        axis.set_title(f"{ERROR_COLUMNS[column].heading} of each image", loc="left", fontsize=10)
+        axis.set_xlabel(f"images, sorted; protocol {protocol.name}")
+        axis.legend(frameon=False)
         return Drawing(svg(figure))
 
     def _compared(self) -> Protocol:
@@ -416,7 +416,7 @@ class EvaluationResult:
         return next(rules for rules in self.protocols if any(row.protocol == rules.name for row in self.rows))
 
     def _repr_html_(self) -> str:
-        return "".join(table.html() for table in self.tables())
+        return notebook_html(self.tables())
 
     def show(self) -> None:
         """Print the tables, those of each source of a mixture, the warnings, and where the files are."""
@@ -450,7 +450,7 @@ class EvaluationResult:
 def _interval(of: Spread | Comparison) -> str:
     """Return what intervals mean, such as ``95 % bootstrap over 28 drives``."""
     note = f"{of.level:.0%} bootstrap over {of.groups} {of.by}s".replace("%", " %")
-    return note if of.by == "drive" else f"{note}, which are alike: too narrow"
+    return note if of.by == "drive" else f"{note}; neighboring frames are alike, so this is too narrow"
 
 
 def _view_table(protocol: Protocol, views: Sequence[ViewSummary]) -> Table:

@@ -66,6 +66,8 @@ def plot_curves(
         axis.set_title(title, loc="left", fontsize=10)
         axis.set_xlabel("epoch")
         axis.set_xlim(left=0)
+        if axis.get_ylim()[0] < 0 <= axis.dataLim.y0:  # no negative values below a curve that has none
+            axis.set_ylim(bottom=0)
         if axis.get_xlim()[1] > 2:
             axis.xaxis.get_major_locator().set_params(integer=True)
 
@@ -179,7 +181,7 @@ def speed(
         missing.append(Missing("Fig. 10", "no benchmark given; name the folder that saunet benchmark wrote"))
         return [], None, missing
     headings = columns("Method", "Device", "Size", "δ < 1.25 ↑|.3f", "ms per image|.1f")
-    notes = ("Times of different devices do not compare; the paper's were taken on an AGX Orin.",)
+    notes = ("Times on different devices cannot be compared; the paper's were taken on an AGX Orin.",)
     printed = [(one.method, one.device, "", one.a1, one.seconds * 1e3) for one in published().figure10]
     ours = [row for members in rows.values() for row in members]
     table = (*(Row(cells, "published", "Published") for cells in printed), *ours, *alone)

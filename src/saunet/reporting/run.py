@@ -72,7 +72,7 @@ class Run(folder.Run):
         return runs_table("run", f"{self.name}: {self.path}", {self.name: self}, swept=False)
 
     def plot(self) -> Drawing:
-        """Draw the curves of its losses and errors against epochs.
+        """Draw the curves of its losses and errors by epoch.
 
         Returns:
             What a notebook shows and `Drawing.save` writes.
@@ -97,7 +97,7 @@ class Run(folder.Run):
 
     def _repr_html_(self) -> str:
         drawn = draw_curves({self.name: self}, _CURVES) if find_spec("matplotlib") else None
-        return self.table.html() + (drawn or b"").decode()
+        return self.table._repr_html_() + (drawn or b"").decode()
 
 
 def write_results(folder: Path) -> Path | None:
@@ -134,7 +134,7 @@ def page_of(path: str | Path) -> Document:
         missing += [Missing(section.title, section.intro) for section in found if not section.blocks]
     running = sum(run.status == "running" for run in inputs.all_runs)
     states = f"{len(inputs.all_runs)} runs, {running} running" if several else inputs.all_runs[0].status
-    facts = (states, str(path), f"read {datetime.now(timezone.utc):%Y-%m-%d %H:%M:%S} UTC", f"saunet {__version__}")
+    facts = (states, str(path), f"as of {datetime.now(timezone.utc):%Y-%m-%d %H:%M:%S} UTC", f"saunet {__version__}")
     title = Path(path).resolve().name if several else inputs.all_runs[0].name
     return Document(title, facts, tuple(sections), tuple(missing))
 
@@ -146,12 +146,12 @@ def _named(runs: tuple[folder.Run, ...]) -> dict[str, folder.Run]:
 def _overview(name: str, title: str, runs: Mapping[str, folder.Run], *, swept: bool, draw: bool) -> Section:
     """Return how runs stand, and their curves."""
     ended = sum(run.status not in ("running", "unfinished") for run in runs.values())
-    heading = f"{ended} of {len(runs)} jobs have ended" if swept else "How far it is"
+    heading = f"{ended} of {len(runs)} jobs have ended" if swept else "Current state"
     blocks: list[Table | Figure] = [runs_table(name, heading, runs, swept=swept)]
     drawn = draw_curves(runs, _CURVES) if draw else None
     if drawn:
-        caption = "Against epochs. Losses of different weights do not compare."
-        blocks.append(Figure("Curves", Picture(f"{name}.svg", drawn, "losses and errors against epochs"), caption))
+        caption = "By epoch. Losses with different weights cannot be compared."
+        blocks.append(Figure("Curves", Picture(f"{name}.svg", drawn, "losses and errors by epoch"), caption))
     return Section(title[0].upper() + title[1:] if len(runs) > 1 else "Progress", tuple(blocks))
 
 
@@ -188,10 +188,10 @@ def _health(run: folder.Run, draw: bool) -> Section:
     if not rows:
         return Section("Health", (), "nothing was logged yet")
     verdict = f"Noticed: {', '.join(said)}" if said else "Nothing unusual was seen"
-    blocks: list[Table | Figure] = [Table("health", verdict, columns("figure", "now|.4g"), tuple(rows))]
+    blocks: list[Table | Figure] = [Table("health", verdict, columns("Measure", "Latest value|.4g"), tuple(rows))]
     if draw and (drawn := draw_curves({run.name: run}, _health_panels())):
-        picture = Picture("health.svg", drawn, "figures of health against epochs")
-        blocks.append(Figure("Figures of health", picture, "Against epochs."))
+        picture = Picture("health.svg", drawn, "health measures by epoch")
+        blocks.append(Figure("Health measures", picture, "By epoch."))
     return Section("Health", tuple(blocks))
 
 
@@ -200,12 +200,12 @@ def _data(run: folder.Run) -> Section:
     blocks = []
     if used := run.record.get("samples"):
         rows = tuple(Row((split, line.strip())) for split, text in used.items() for line in str(text).splitlines())
-        blocks.append(Table("samples", "Frames used", (Column("split"), Column("what is used and left out")), rows))
+        blocks.append(Table("samples", "Frames used", (Column("Split"), Column("Frames")), rows))
     data = run.config.get("data")
     manifest = data.get("manifest") if isinstance(data, Mapping) else None
     findings = read_mapping(Path(str(manifest))).get("findings") if manifest else None
     if isinstance(findings, list):
         told = [each for each in findings if isinstance(each, Mapping)]
         cells = tuple(Row(tuple(str(each.get(key, "")) for key in ("level", "text", "fix"))) for each in told)
-        blocks.append(Table("findings", "What saunet doctor found", columns("level", "finding", "what to do"), cells))
+        blocks.append(Table("findings", "What saunet doctor found", columns("Level", "Finding", "What to do"), cells))
     return Section("Data", tuple(blocks), "" if blocks else "this run did not record which frames it used")

@@ -80,7 +80,7 @@ def table1(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
         who = score.predictor if score.trivial else name
         rows.append(Row((who, _pattern(runs[name], score), *score.errors), "measured", group(score)))
     notes = (
-        "Numbers of different groups do not compare: other images, other ground truth, other training. "
+        "Numbers of different groups cannot be compared: the images, the ground truth or the training differ. "
         "Bold is the best of its group.",
         "Pattern: D = depth as supervision, M = monocular video, S = stereo pairs.",
         "Eigen's last two numbers are equal in the paper; Klodt's RMSE log is a dash there.",
@@ -202,12 +202,12 @@ def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -
         )
         place = (group(score) if score else "Without a score") if len(groups) > 1 else ""
         rows.append(Row(cells, "failed" if run.error else "measured", place, run.error or ""))
-    notes = ["Loss: mean over the last tenth of the logged steps; losses of different weights do not compare."]
+    notes = ["Loss: mean over the last tenth of the logged steps; losses with different weights cannot be compared."]
     if len(groups) == 1:
         notes.append(f"Errors — {groups[0]}.")
     elif groups:
         rows.sort(key=lambda row: [*groups, "Without a score"].index(row.group))
-        notes.append("Errors of different groups do not compare.")
+        notes.append("Errors in different groups cannot be compared.")
     return Table(name, title, headings, tuple(rows), tuple(notes))
 
 

@@ -25,7 +25,7 @@ from saunet.reporting.scenes import Seen, View, look, read_views, scene
 from saunet.reporting.tables import Groups, comparable
 from saunet.runs.folder import Run
 from saunet.runs.sweep import differing, labels, sweeps_ratio
-from saunet.tables import Table, show
+from saunet.tables import Table, notebook_html, show
 from saunet.tables.drawing import Point, draw_speed, svg
 
 Named = dict[str, Run]
@@ -93,7 +93,7 @@ class ReportResult:
     """Where the files were written."""
 
     def _repr_html_(self) -> str:
-        return "".join(table.html() for table in self.tables)
+        return notebook_html(self.tables)
 
     def show(self) -> None:
         """Print a comparison, or where the page is and what it lacks."""
@@ -257,7 +257,7 @@ def _curves(group: _Group, missing: list[Missing]) -> list[Figure]:
     ordered = sweeps_ratio(list(group.runs.values()))
     wanted = (
         ("Fig. 4", "loss", (("train/loss", "training loss, total"), ("train/photometric", "photometric term")),
-         "Totals of different weights do not compare; the photometric term, eqs. (8) to (12), does."),
+         "Totals with different weights cannot be compared; the photometric term, eqs. (8) to (12), can be."),
         ("Fig. 5", "accuracy", (("val/a1", "accuracy, δ < 1.25"), ("val/abs_rel", "Abs Rel")),
          "On validation frames, after each epoch."),
     )  # fmt: skip

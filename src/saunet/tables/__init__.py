@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from saunet.tables.table import Cell, Column, Row, Table, columns, csv_text, show, stdout
+from saunet.tables.table import Cell, Column, Row, Table, columns, csv_text, notebook_html, show, stdout
 
-__all__ = ["Cell", "Column", "Row", "Table", "columns", "csv_text", "show", "stdout"]
+__all__ = ["Cell", "Column", "Row", "Table", "columns", "csv_text", "notebook_html", "show", "stdout"]

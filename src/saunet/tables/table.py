@@ -22,6 +22,14 @@ Kind = Literal["plain", "published", "measured", "failed", "dim"]
 Mark = Literal["good", "bad"]
 
 _STYLES = {"": "", "best": "bold", "good": "bold green", "bad": "bold red"}
+_NOTEBOOK = """<style>
+.saunet table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+.saunet th, .saunet td { padding: 3px 10px; text-align: left; }
+.saunet thead th { border-bottom: 1px solid; vertical-align: bottom; }
+.saunet .number { text-align: right; white-space: nowrap; }
+.saunet .scroll { overflow-x: auto; }
+.saunet .note { margin: 4px 0; font-size: smaller; }
+</style>"""
 _PLAIN_WIDTH = 160
 """Characters in a line where the output is not a terminal."""
 
@@ -191,7 +199,8 @@ class Table:
         kinds = ["number" if self.numeric(index) else "text" for index in range(len(self.columns))]
         return rendered("tables/table.html", table=self, kinds=kinds)
 
-    _repr_html_ = html
+    def _repr_html_(self) -> str:
+        return notebook_html([self])
 
     def csv(self) -> str:
         """Return the table as CSV: numbers in full, columns for the group and the note where there are any."""
@@ -220,6 +229,11 @@ def stdout() -> Console:
 
     console = Console()
     return console if console.is_terminal or console.is_jupyter else Console(width=_PLAIN_WIDTH)
+
+
+def notebook_html(tables: Iterable[Table]) -> str:
+    """Return tables as HTML that brings its own look, for pages that have none for tables."""
+    return f"<div class=saunet>{_NOTEBOOK}{''.join(table.html() for table in tables)}</div>"
 
 
 def show(tables: Iterable[Table], console: Console | None = None) -> None:

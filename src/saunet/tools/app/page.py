@@ -33,13 +33,20 @@ footer { display: none !important; }
 .gradio-container { max-width: 1500px !important; }
 .dark .download-link { color: #b4bcff !important; }
 #hint, .or { color: var(--body-text-color-subdued) !important; }
+:focus-visible { outline: 2px solid #4c8dff !important; outline-offset: 1px; }
+#depth { container-type: inline-size; }
+#depth iframe { height: calc(50cqw * var(--ratio) + 110px) !important; }
+@container (max-width: 680px) { #depth iframe { height: calc(200cqw * var(--ratio) + 170px) !important; } }
 """
 SCRIPT = """<script>
 // Gradio leaves some of its own parts without a name that a screen reader could say.
 new MutationObserver(() => {
   document.documentElement.lang ||= "en";
   for (const [part, name] of [["input[type=file]", "choose a file"], ["button.center", "drop a file here, or press to choose one"]])
-    for (const each of document.querySelectorAll(part)) if (!each.ariaLabel) each.ariaLabel = name;
+    for (const each of document.querySelectorAll(part)) {
+      const label = each.closest(".block")?.querySelector("[data-testid=block-label]")?.textContent.trim();
+      each.ariaLabel = label ? label + ": " + name : name;
+    }
 }).observe(document.documentElement, { childList: true, subtree: true });
 </script>"""  # noqa: E501
 
@@ -57,6 +64,10 @@ def THEME() -> Any:  # noqa: N802
         body_text_color_subdued_dark=quiet_dark,
         block_info_text_color=quiet,
         block_info_text_color_dark=quiet_dark,
+        button_primary_background_fill="*primary_600",
+        button_primary_background_fill_dark="*primary_600",
+        button_primary_background_fill_hover="*primary_700",
+        button_primary_background_fill_hover_dark="*primary_700",
     )
 
 
@@ -75,7 +86,7 @@ def build(options: AppOptions, folder: Path) -> Any:
                 colormap = gradio.Dropdown(list(COLORMAPS), value="magma", label="Colors")
                 with gradio.Accordion("Camera: for points and meters", open=True):
                     view = gradio.Slider(
-                        20, 150, _VIEW, step=0.5, label="Field of view, degrees", info="left to right; without a file"
+                        20, 150, _VIEW, step=0.5, label="Field of view, degrees", info="horizontal; a file overrides it"
                     )
                     camera = gradio.File(label="camera.yaml", file_types=[".yaml", ".yml"], height=140)
                     height = gradio.Number(
@@ -85,10 +96,10 @@ def build(options: AppOptions, folder: Path) -> Any:
             with gradio.Column(scale=3, min_width=480):
                 words = "The depth appears here: its colors, and its value under the cursor."
                 hint = gradio.Markdown(words, elem_id="hint")
-                depth = gradio.HTML(visible=False)
+                depth = gradio.HTML(visible=False, elem_id="depth")
                 video = gradio.Video(visible=False, label="Image and disparity", interactive=False)
                 points = gradio.HTML(visible=False)
-                files = gradio.File(visible=False, label="Take away", file_count="multiple", interactive=False)
+                files = gradio.File(visible=False, label="Downloads", file_count="multiple", interactive=False)
 
         def run(path: str | None, *settings: Any) -> list[Any]:
             if path is None:
@@ -153,14 +164,14 @@ def answer(
     pages = [path for path in result.clips if path.suffix == ".html"]
     small = [path for path in pages if path.stat().st_size <= _EMBEDDED]
     movie = next((path for path in result.clips if path.suffix == ".mp4"), None)
-    rows = round(480 * min(1.0, size[0] / size[1])) + 100
     text = depth_page(first, colormap)
     (made / "depth.html").write_text(text, encoding="utf-8")
+    shown = iframe(text, "depth under the cursor", 480)
     cloud = iframe(small[0].read_text(encoding="utf-8"), "points in space: drag to orbit", 480) if small else ""
     taken = [*result.written, *result.clips, made / "depth.html"]
     return (
         gradio.update(visible=bool(result.failures), value="; ".join(result.failures)),
-        gradio.update(visible=True, value=iframe(text, "depth under the cursor", rows)),
+        gradio.update(visible=True, value=f'<div style="--ratio: {size[0] / size[1]:.4f}">{shown}</div>'),
         gradio.update(visible=movie is not None, value=movie and str(movie)),
         gradio.update(visible=bool(cloud), value=cloud),
         gradio.update(visible=True, value=[str(path) for path in taken]),
