@@ -84,7 +84,7 @@ def options(place: Path, **changes: object) -> EvaluateOptions:
     settings = {"kitti": {"split": "all", "test_split": "all", "cameras": ["left"]}}
     data = {"root": str(place / "sets"), "settings": settings, "batch_size": 2, "workers": 0, **changes}
     spec = Spec.of("data", "all_present", **data)
-    return EvaluateOptions(data=spec, checkpoint=str(place / "model.ckpt"), device="cpu")
+    return EvaluateOptions(data=spec, checkpoint=place / "model.ckpt", device="cpu")
 
 
 def rows(folder: Path) -> dict[str, dict[str, str]]:

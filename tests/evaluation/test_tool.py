@@ -189,7 +189,7 @@ def test_views_refuse_protocols_that_compare_depth():
 
 def test_statistics_and_the_earlier_run(options, tmp_path):
     folder = tmp_path / "first"
-    result = evaluate(options(protocols=("metric",), output_dir=str(folder)))
+    result = evaluate(options(protocols=("metric",), output_dir=folder))
     assert result.folder == folder
     for earlier in (folder, folder / "per_image.csv"):
         found = evaluate(options(protocols=("metric",), compare=str(earlier), intervals=0.9))

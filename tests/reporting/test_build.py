@@ -57,7 +57,7 @@ def _state(file: Path) -> dict[str, object]:
 def test_a_report_is_readable_in_both_color_schemes(
     browser: Any, everything: list[Path], picture: Path, tmp_path: Path
 ) -> None:
-    result = report(ReportOptions(runs=tuple(map(str, everything)), scenes={"kitti": str(picture)}))
+    result = report(ReportOptions(runs=tuple(everything), scenes={"kitti": str(picture)}))
     files = write(result.document, tmp_path / "report")
     (tmp_path / "notebook.html").write_text(
         f"<!doctype html><html lang=en><title>output</title><main><h1>output</h1>{result._repr_html_()}</main>"
@@ -150,7 +150,7 @@ def test_without_matplotlib_the_page_has_no_drawings_and_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("saunet.reporting.tool.find_spec", lambda name: None)
-    result = report(ReportOptions(runs=(str(make_run(tmp_path / "a")),), output_dir=str(tmp_path / "page")))
+    result = report(ReportOptions(runs=(make_run(tmp_path / "a"),), output_dir=tmp_path / "page"))
     (told,) = (sentence for sentence in result.left_out if sentence.startswith("Figs. 4, 5 and 10: "))
     assert "pip install 'saunet[plot]'" in told
     assert (tmp_path / "page" / "report.html").is_file()

@@ -80,7 +80,7 @@ def get(address: str, host: str | None = None, tag: str | None = None) -> tuple[
 
 
 def test_the_page_follows_the_run_and_answers_this_machine_only(folder: Path) -> None:
-    with serving(WatchOptions(run=str(folder), port=0)) as address:
+    with serving(WatchOptions(run=folder, port=0)) as address:
         assert address.startswith("http://127.0.0.1:")
         status, before, tag = get(address)
         assert status == 200
@@ -106,7 +106,7 @@ def test_what_cannot_be_served_is_said_at_once(tmp_path: Path, folder: Path) -> 
 @pytest.mark.slow  # fast, but only the session of the slow tests installs playwright
 def test_the_open_page_renews_itself_in_a_browser(browser: Any, folder: Path) -> None:
     requests: list[str] = []
-    with serving(WatchOptions(run=str(folder), port=0, every=0.2)) as address:
+    with serving(WatchOptions(run=folder, port=0, every=0.2)) as address:
         page = browser.new_page()
         page.on("request", lambda request: requests.append(request.url))
         page.goto(address)

@@ -258,14 +258,14 @@ class OdometryOptions:
         5
     """
 
-    checkpoint: str
+    checkpoint: str | Path
     data: Spec
     snippet: int = 5
     lengths: tuple[float, ...] | None = None
     batch_size: int = 8
     figure: bool = True
     device: str = "auto"
-    output_dir: str | None = None
+    output_dir: str | Path | None = None
 
     def __post_init__(self) -> None:
         if self.snippet < 2:
@@ -351,5 +351,5 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
         notes.append("paths are not drawn, which needs matplotlib: run `pip install 'saunet[plot]'`")
     scale = None if record.scale is None else {"factor": record.scale.factor, "source": record.scale.source}
     if folder is not None:
-        write_errors(errors, folder, {"checkpoint": options.checkpoint, "scale": scale})
+        write_errors(errors, folder, {"checkpoint": str(options.checkpoint), "scale": scale})
     return OdometryResult(tuple(paths), tuple(errors), tuple(notes), folder)

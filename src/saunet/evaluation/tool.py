@@ -120,7 +120,7 @@ class EvaluateOptions:
     """
 
     data: Spec
-    checkpoint: str | None = None
+    checkpoint: str | Path | None = None
     predictions: str | None = None
     predicted: str | None = None
     match: str = "order"
@@ -139,7 +139,7 @@ class EvaluateOptions:
     truth_cache: str | None = None
     export: str | None = None
     device: str = "auto"
-    output_dir: str | None = None
+    output_dir: str | Path | None = None
 
     def __post_init__(self) -> None:
         if (self.checkpoint is None) == (self.predictions is None):
@@ -200,7 +200,7 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         passes = _passes(options, options.data.changed(**size), motion=False, shifted=shifted)
         model = NetworkPredictor(PredictorNetwork(loaded))
         about = {key: value for key, value in asdict(options.foreign).items() if value is not None}
-        settings |= {"checkpoint": options.checkpoint, **({"foreign": about} if options.foreign.given else {})}
+        settings |= {"checkpoint": str(options.checkpoint), **({"foreign": about} if options.foreign.given else {})}
     elif options.checkpoint is not None:
         checkpoint = read_model(options.checkpoint)
         networks, found = checkpoint.networks(), checkpoint.record.intrinsics
@@ -210,7 +210,7 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth is of the same images
         depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device, first=team.rank == 0)
         model = NetworkPredictor(depth, options.flip)
-        settings |= {"checkpoint": options.checkpoint, "scale": scale}
+        settings |= {"checkpoint": str(options.checkpoint), "scale": scale}
     else:
         passes = _passes(options, options.data.changed(batch_size=1), motion=False)  # files may differ in size
         existing(Path(str(options.predictions)))

@@ -59,7 +59,7 @@ class ReportOptions:
         2
     """
 
-    runs: tuple[str, ...] = ()
+    runs: tuple[str | Path, ...] = ()
     compare: bool = False
     checkpoint: str = "best"
     title: str = "saunet report"
@@ -70,7 +70,7 @@ class ReportOptions:
     figures: bool = True
     device: str = "auto"
     flip: bool = False
-    output_dir: str | None = None
+    output_dir: str | Path | None = None
 
     def __post_init__(self) -> None:
         one_of("checkpoint", self.checkpoint, ("best", "last"))

@@ -40,7 +40,7 @@ class WatchOptions:
         '127.0.0.1'
     """
 
-    run: str
+    run: str | Path
     host: str = "127.0.0.1"
     port: int = 6007
     every: float | int = 5.0

@@ -59,7 +59,7 @@ class BenchmarkOptions(Plan):
     threads: int | None = None
     figure: bool = False
     abs_rel: Mapping[str, float] = field(default_factory=dict)
-    output_dir: str | None = None
+    output_dir: str | Path | None = None
 
     def __post_init__(self) -> None:
         Plan.__post_init__(self)

@@ -37,7 +37,7 @@ class DoctorOptions:
 
     data: Spec
     """The data module, with the settings of the training to come."""
-    output_dir: str | None = None
+    output_dir: str | Path | None = None
     """Folder for ``doctor.png`` and ``manifest.json``; None, as in Python, writes none."""
     splits: Sequence[str] = SPLITS
     """Which of ``train``, ``val`` and ``test``."""
