@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from saunet.errors import DataError
-from saunet.evaluation.result import EvaluationResult, ImageRow
-from saunet.evaluation.statistics import bootstrap_mean, compare, drive_of, spreads
+from saunet.evaluation.result import EvaluationResult, ImageRow, ViewRow, read_rows, write_results
+from saunet.evaluation.statistics import bootstrap_mean, compare, drive_of, spreads, with_statistics
 from saunet.metrics.protocols import protocol
 
 
@@ -178,3 +178,18 @@ def test_no_spread_where_no_image_has_truth():
 def test_drive_of():
     assert drive_of("synthetic 7 0000000005") == "synthetic 7"
     assert drive_of("2011_09_26/2011_09_26_drive_0001_sync 0000000005 l") == "2011_09_26/2011_09_26_drive_0001_sync"
+
+
+def test_an_earlier_evaluation_without_ground_truth_is_compared_too(tmp_path):
+    def explained(shift):
+        views = [ViewRow("model", "campus", f"a {i:06d}", "a", 0.1 + shift + 0.01 * i, 0.3, 0.7, 0.9) for i in range(6)]
+        return EvaluationResult((protocol("campus"),), ("model",), (), views=tuple(views))
+
+    write_results(explained(0.0), tmp_path)
+    earlier = read_rows(tmp_path)
+    assert earlier == explained(0.0).views
+    (comparison,) = with_statistics(explained(0.02), None, earlier, "before").comparisons
+    assert [(row.name, row.better) for row in comparison.differences] == [("warped", 0.0), ("explained", 0.5)]
+    assert comparison.differences[0].difference == pytest.approx(0.02)
+    write_results(dataclasses.replace(explained(0.0), views=()), tmp_path)
+    assert read_rows(tmp_path) == ()  # of the later evaluation in this folder

@@ -17,6 +17,8 @@ from made_runs import ERRORS, add_checkpoint, make_evaluation, make_run
 from rich.console import Console
 
 from saunet.errors import ConfigError, DataError
+from saunet.evaluation.result import EvaluationResult, ViewRow, write_results
+from saunet.metrics.protocols import protocol
 from saunet.reporting import ReportOptions, collect, report
 from saunet.reporting.compare import compared
 from saunet.reporting.figures import speed
@@ -212,13 +214,58 @@ def test_what_cannot_be_paired_is_said(tmp_path: Path) -> None:
     make_evaluation(runs[1] / "test", "x", images=5)
     text = " ".join(_compared(*runs).split())
     assert "do not pair up" in text
-    assert "were not both evaluated under one protocol" in text
+    assert "are not compared (beta = 0.3 not evaluated)" in text
     with pytest.raises(DataError, match="not enough to compare"):
         _compared(runs[0])
 
 
 def _two(tmp_path: Path) -> list[Path]:
     return [make_run(tmp_path / name, beta=beta, status="finished") for name, beta in (("a", 0.1), ("b", 0.2))]
+
+
+def _explained(folder: Path, warped: float, images: int = 6) -> Path:
+    """Write an evaluation of clips without ground truth."""
+    rows = tuple(
+        ViewRow("model", "campus", f"seq {index:06d}", "seq", warped + 0.01 * index, 0.3, 0.8, 0.9)
+        for index in range(images)
+    )
+    settings = {"data": "video"}
+    write_results(EvaluationResult((protocol("campus"),), ("model",), (), views=rows, settings=settings), folder)
+    return folder
+
+
+def test_runs_on_clips_without_ground_truth_are_compared_frame_by_frame(tmp_path: Path) -> None:
+    one, two = _two(tmp_path)
+    _explained(one / "test", 0.1)
+    _explained(two / "test", 0.2)
+    text = _compared(one, two)
+    assert "campus: second 'beta = 0.2' against first 'beta = 0.1'" in text
+    assert re.search(r"warped ↓\s+0\.1250\s+0\.2250\s+\+0\.1000\s+\+0\.1000\s+\+0\.1000\s+0%", text)
+    assert re.search(r"explained ↑\s+0\.8000\s+0\.8000\s+\+0\.0000", text)
+    assert "left out" not in text
+    assert "status" not in text  # both are finished
+    assert re.search(r"beta = 0\.1\s+3\s+1\.2000", text)  # the loss of the last of nine steps, in epoch 3
+    assert "these losses do not compare" in " ".join(text.split())  # their objectives have other weights
+
+
+def test_what_is_not_compared_names_the_commands_after_which_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    one, two = _two(tmp_path)
+    for folder in (one, two):
+        add_checkpoint(folder)
+    _explained(one / "test", 0.1)
+    _explained(two / "test", 0.2, images=5)
+    commands = [f"`saunet evaluate {name} data=synthetic output_dir={name}/compared`" for name in "ab"]
+    text = _compared(one, two)
+    assert "6 of video, test split against 5 of video, test split" in text
+    assert " and ".join(commands) in text
+    for folder, warped in ((one, 0.1), (two, 0.2)):
+        _explained(folder / "compared", warped, images=8)
+    text = _compared(one, two)
+    assert "8 images, paired" in text
+    assert "left out" not in text
 
 
 def test_among_all_evaluations_those_of_the_same_images_are_paired(tmp_path: Path) -> None:

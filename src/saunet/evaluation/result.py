@@ -5,10 +5,10 @@ from __future__ import annotations
 import csv
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,12 @@ from saunet.metrics.protocols import Protocol
 from saunet.tables import Row, Table, columns, csv_text, notebook_html, show
 from saunet.tables.drawing import Drawing, colors, new_figure, svg
 
+T = TypeVar("T")
 ERROR_COLUMNS = columns(*(f"{heading}|.3f" for heading in ERROR_HEADINGS))
+COMPARED = dict(
+    zip((*ERROR_NAMES, "warped", "explained"), (*ERROR_COLUMNS, *columns("warped ↓", "explained ↑")), strict=True)
+)
+"""What of an image is compared between two predictors, by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +42,11 @@ class ImageRow:
     """Factor on the depth: that of the alignment, or under none median(truth)/median(prediction)."""
     errors: tuple[float, ...]
     """In the order of `saunet.metrics.functional.ERROR_NAMES`, as everywhere below."""
+
+    @property
+    def compared(self) -> dict[str, float]:
+        """What two predictors are compared by, one of `COMPARED` each; empty where nothing was measured."""
+        return dict(zip(ERROR_NAMES, self.errors, strict=True)) if self.pixels else {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +98,11 @@ class ViewRow:
     """Fraction of pixels that warping brings closer, SAU-Net eq. (11)."""
     visible: float
     """Fraction of pixels that any neighbor sees."""
+
+    @property
+    def compared(self) -> dict[str, float]:
+        """As in `ImageRow`."""
+        return {"warped": self.warped, "explained": self.explained} if self.visible else {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +168,7 @@ class Difference:
     """The means of one error of two predictors on the same images."""
 
     name: str
-    """One of `saunet.metrics.functional.ERROR_NAMES`."""
+    """One of `COMPARED`."""
     first: float
     second: float
     difference: float
@@ -189,7 +204,8 @@ class Comparison:
             *("second better|.0%", "p|.2g"),
         )
         rows = []
-        for column, one in zip(ERROR_COLUMNS, self.differences, strict=True):
+        for one in self.differences:
+            column = COMPARED[one.name]
             sure = one.low > 0 or one.high < 0
             good = (one.difference > 0) == (column.better > 0)
             cells = (column.label, *astuple(one)[1:])
@@ -518,6 +534,8 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
     texts["metrics.md"] = markdown(result)
     for name, text in texts.items():
         write_bytes(folder / name, text.encode())
+    for name in {"buckets.csv", "shapes.csv", "views.csv", "comparison.csv"} - texts.keys():
+        (folder / name).unlink(missing_ok=True)  # of an earlier evaluation in this folder, which these replace
     write_json(folder / "metrics.json", as_json(result))
     return {name: folder / name for name in (*texts, "metrics.json")}
 
@@ -547,23 +565,31 @@ def as_json(result: EvaluationResult) -> dict[str, object]:
     return plain
 
 
-def read_rows(path: Path) -> tuple[ImageRow, ...]:
-    """Read the rows of an evaluation back, for comparisons."""
+def read_rows(path: Path) -> tuple[ImageRow | ViewRow, ...]:
+    """Read the rows of an evaluation back, for comparisons, from its folder or its ``per_image.csv``."""
     path = path / "per_image.csv" if path.is_dir() else path
+    views = path.with_name("views.csv")
+    return (*_read(path, ImageRow, _image), *(_read(views, ViewRow, _view) if views.is_file() else ()))
+
+
+def _image(row: Mapping[str, str]) -> ImageRow:
+    start = (row["predictor"], row["protocol"], row["name"], int(row["pixels"]), float(row["scale"] or math.nan))
+    return ImageRow(*start, tuple(float(row[name] or math.nan) for name in ERROR_NAMES))
+
+
+def _view(row: Mapping[str, str]) -> ViewRow:
+    numbers = (float(row[name] or math.nan) for name in ("warped", "unwarped", "explained", "visible"))
+    return ViewRow(row["predictor"], row["protocol"], row["name"], row["condition"], *numbers)
+
+
+def _read(path: Path, kind: type, made: Callable[[Mapping[str, str]], T]) -> list[T]:
     try:
         with path.open(encoding="utf-8", newline="") as file:
             table = csv.DictReader(file)
-            missing = [name for name in _names(ImageRow) if name not in (table.fieldnames or ())]
+            missing = [name for name in _names(kind) if name not in (table.fieldnames or ())]
             if missing:
-                raise DataError(f"'{path}' has no column '{missing[0]}'; give a per_image.csv written by an evaluation")
-            return tuple(
-                ImageRow(
-                    *(row["predictor"], row["protocol"], row["name"], int(row["pixels"])),
-                    scale=float(row["scale"] or math.nan),
-                    errors=tuple(float(row[name] or math.nan) for name in ERROR_NAMES),
-                )
-                for row in table
-            )
+                raise DataError(f"'{path}' has no column '{missing[0]}'; give a {path.name} written by an evaluation")
+            return list(map(made, table))
     except DataError:
         raise
     except OSError as error:

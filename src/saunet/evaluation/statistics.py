@@ -14,8 +14,7 @@ from numpy import ndarray
 from scipy import stats
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation.result import ERROR_COLUMNS, Comparison, Difference, EvaluationResult, ImageRow, Spread
-from saunet.metrics.functional import ERROR_NAMES
+from saunet.evaluation.result import COMPARED, Comparison, Difference, EvaluationResult, ImageRow, Spread, ViewRow
 
 FEWEST_DRIVES = 5
 """With fewer drives than this, resampling them says nothing: images are resampled, and the result says so."""
@@ -90,7 +89,10 @@ def bootstrap_mean(
 
 
 def with_statistics(
-    result: EvaluationResult, level: float | None, earlier: Sequence[ImageRow] | None = None, source: str | None = None
+    result: EvaluationResult,
+    level: float | None,
+    earlier: Sequence[ImageRow | ViewRow] | None = None,
+    source: str | None = None,
 ) -> EvaluationResult:
     """Add bootstrap intervals of the means, and what changed since another evaluation of the same images.
 
@@ -103,7 +105,8 @@ def with_statistics(
         names = (f"{who} of {source}", result.predictors[0])
         for rules in result.protocols:
             rows = [row for row in earlier if (row.predictor, row.protocol) == (who, rules.name)]
-            now = result.select(result.predictors[0], rules.name)
+            mine = (result.predictors[0], rules.name)
+            now = [row for row in (*result.rows, *result.views) if (row.predictor, row.protocol) == mine]
             if rows and now:
                 comparisons.append(compare(rows, now, names=names, level=level or 0.95))
         if not comparisons:
@@ -116,8 +119,8 @@ def with_statistics(
 
 
 def compare(
-    first: Sequence[ImageRow],
-    second: Sequence[ImageRow],
+    first: Sequence[ImageRow | ViewRow],
+    second: Sequence[ImageRow | ViewRow],
     *,
     names: tuple[str, str] = ("first", "second"),
     level: float = 0.95,
@@ -138,18 +141,21 @@ def compare(
     protocols = sorted({row.protocol for row in (*first, *second)})
     if len(protocols) != 1:
         raise DataError(f"the rows come from protocols {', '.join(protocols) or 'without a row'}; compare under one")
-    images = [name for name, row in one.items() if row.pixels and other[name].pixels]
-    ours, theirs = (
-        np.array([rows[name].errors for name in images], dtype=np.float64).reshape(-1, 7) for rows in (one, other)
-    )
+    pairs = {name: (row.compared, other[name].compared) for name, row in one.items()}
+    pairs = {name: pair for name, pair in pairs.items() if all(pair)}
+    if not pairs:
+        raise DataError("0 rows were measured in both; compare results with ground truth on the same images")
+    values = np.array([[[*found.values()] for found in pair] for pair in pairs.values()], dtype=np.float64)
+    ours, theirs = values[:, 0], values[:, 1]
     delta = theirs - ours
-    by, count, groups = groups_of(images)
+    by, count, groups = groups_of(list(pairs))
     low, high = (bound.tolist() for bound in bootstrap_mean(delta, groups, level=level))
-    p_values = _sign_flip(_by_group(delta, groups)[0]) if by == "drive" else [None] * 7
-    better = ((np.sign(delta) * [column.better for column in ERROR_COLUMNS] + 1) / 2).mean(0).tolist()
+    what = list(next(iter(pairs.values()))[0])
+    p_values = _sign_flip(_by_group(delta, groups)[0]) if by == "drive" else [None] * len(what)
+    better = ((np.sign(delta) * [COMPARED[name].better for name in what] + 1) / 2).mean(0).tolist()
     means = (array.mean(0).tolist() for array in (ours, theirs, delta))
-    differences = itertools.starmap(Difference, zip(ERROR_NAMES, *means, low, high, better, p_values, strict=True))
-    return Comparison(protocols[0], *names, len(images), level, by, count, tuple(differences))
+    differences = itertools.starmap(Difference, zip(what, *means, low, high, better, p_values, strict=True))
+    return Comparison(protocols[0], *names, len(pairs), level, by, count, tuple(differences))
 
 
 def _sign_flip(sums: Float64[ndarray, "g k"]) -> list[float]:

@@ -1,19 +1,24 @@
-"""Two or more runs against each other: differing settings, scores side by side, and a paired comparison."""
+"""Two or more runs against each other: differing settings, losses, scores side by side, and a paired comparison."""
 
 from __future__ import annotations
 
 import itertools
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation.result import ERROR_COLUMNS, ImageRow, read_rows
+from saunet.evaluation.result import ERROR_COLUMNS, ImageRow, ViewRow, read_rows
 from saunet.evaluation.statistics import compare as paired
 from saunet.reporting.inputs import Evaluation, Inputs, read_evaluation
-from saunet.reporting.tables import Groups
+from saunet.reporting.tables import Groups, explained_table, health_tables, losses_table
 from saunet.runs.folder import SUBJECTS, Run
 from saunet.runs.sweep import differing, labels, values
 from saunet.tables import Column, Row, Table
+
+_OF_TRAINING = ("height", "width", "offsets", "batch_size", "workers", "crop_margin", "flip_prob", "color_jitter_prob")
+"""Settings of the data that an evaluation takes from the checkpoint, or has no use for."""
 
 
 def settings_table(runs: Mapping[str, Run]) -> Table:
@@ -21,11 +26,14 @@ def settings_table(runs: Mapping[str, Run]) -> Table:
     members = list(runs.values())
     keys = differing(members)
     rows = [Row(cells) for cells in zip(keys, *(values(run, keys) for run in members), strict=True)]
-    rows.append(Row(("status", *(f"{run.status}{f': {run.error}' if run.error else ''}" for run in members))))
+    ended = [f"{run.status}{f': {run.error}' if run.error else ''}" for run in members]
+    if len(set(ended)) > 1:
+        rows.append(Row(("status", *ended)))
     commits = [(run.record.get("git") or {}).get("commit") for run in members]
     if len(set(commits)) > 1:
         rows.append(Row(("code", *(str(commit or "unknown")[:12] for commit in commits))))
-    return Table("settings", "Settings that differ", (Column("key"), *map(Column, runs)), tuple(rows))
+    notes = () if rows else ("no setting differs",)
+    return Table("settings", "Settings that differ", (Column("key"), *map(Column, runs)), tuple(rows), notes)
 
 
 def scores_table(runs: Mapping[str, Run]) -> Table:
@@ -39,9 +47,9 @@ def scores_table(runs: Mapping[str, Run]) -> Table:
 
 @dataclass(frozen=True)
 class Scored:
-    """One run's errors on each image under one protocol, from one evaluation."""
+    """What one run reached on each image under one protocol, in one evaluation."""
 
-    rows: tuple[ImageRow, ...]
+    rows: tuple[ImageRow | ViewRow, ...]
     of: Evaluation
 
     @property
@@ -64,19 +72,21 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
     for other in names[1:]:
         both = [protocol for protocol in found[names[0]] if protocol in found[other]]
         if not both:
-            left_out.append(
-                f"{names[0]} and {other} were not both evaluated under one protocol, so nothing is paired; "
-                "run saunet evaluate on both with the same data"
-            )
+            without = [name for name in (names[0], other) if not found[name]]
+            why = f"{' and '.join(without)} not evaluated" if without else "not evaluated under one protocol"
+            said = f"the scores of {names[0]} and {other} are not compared ({why}); "
+            left_out.append(said + _remedy(runs[names[0]], runs[other]))
         for protocol in both:
             ours, theirs = found[names[0]][protocol], found[other][protocol]
             pairs = [(one, two) for one, two in itertools.product(ours, theirs) if one.pairs(two)]
             try:
                 for one, two in pairs:
                     comparison = paired(one.rows, two.rows, names=(names[0], other))
-                    tables.append(comparison.table(_told(one.of, two.of)))
+                    notes = [_told(one.of, two.of), *_sizes(runs[names[0]], runs[other], one)]
+                    tables.append(comparison.table(*notes))
                 if not pairs:
-                    left_out.append(f"{names[0]} and {other} under {protocol}: {_apart(ours, theirs)}")
+                    why = f"{_apart(ours, theirs)}; {_remedy(runs[names[0]], runs[other])}"
+                    left_out.append(f"{names[0]} and {other} under {protocol}: {why}")
             except DataError as reason:
                 left_out.append(f"{names[0]} and {other} under {protocol}: {reason}")
     return tables, left_out
@@ -89,8 +99,8 @@ def _scored(run: Run) -> dict[str, list[Scored]]:
         if not (folder / "per_image.csv").is_file():
             continue
         evaluation = read_evaluation(folder)
-        table: dict[str, list[ImageRow]] = {}
-        for row in read_rows(folder / "per_image.csv"):
+        table: dict[str, list[ImageRow | ViewRow]] = {}
+        for row in read_rows(folder):
             if row.predictor in SUBJECTS:
                 table.setdefault(row.protocol, []).append(row)
         for protocol, rows in table.items():
@@ -107,20 +117,46 @@ def _told(one: Evaluation, two: Evaluation) -> str:
     return f"{one.data}; the first {first}, the second {second}"
 
 
+def _sizes(first: Run, other: Run, scored: Scored) -> list[str]:
+    """Say that two runs see images of different sizes, which photometric errors depend on."""
+    data = [run.config.get("data") or {} for run in (first, other)]
+    sizes = [f"{each.get('height')}x{each.get('width')}" for each in data]
+    if sizes[0] == sizes[1] or not isinstance(scored.rows[0], ViewRow):
+        return []
+    return [
+        f"the runs see images of other sizes, {sizes[0]} and {sizes[1]}, so these errors are not of the same pixels"
+    ]
+
+
 def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
     """Say why no evaluation of one run pairs with any of the other."""
     for one, two in itertools.product(ours, theirs):
         if one.images == two.images:
             first, second = (each.of.how or "no flip or scale" for each in (one, two))
-            return (
-                f"the first was evaluated with {first} and the second with {second}; "
-                "run saunet evaluate on both with the same settings"
-            )
+            return f"the first was evaluated with {first} and the second with {second}"
     counts = [", ".join(f"{len(one.images)} of {one.of.data}" for one in each) for each in (ours, theirs)]
-    return (
-        f"the images do not pair up ({counts[0]} against {counts[1]}, by their names not the same); "
-        "run saunet evaluate on both with the same data"
-    )
+    return f"the images do not pair up ({counts[0]} against {counts[1]}, by their names not the same)"
+
+
+def _remedy(first: Run, other: Run) -> str:
+    """Say what to run so that two runs compare: both on the data of the first, with results where we look."""
+    data, choice = first.config.get("data") or {}, first.choices.get("data")
+    if not choice or not all(run.path.is_dir() and run.checkpoint for run in (first, other)):
+        return "run saunet evaluate on both with the same data and settings, and name the results too"
+    given = {f"data.{key}": str(data[key]) for key in ("root",) if data.get(key)}
+    given |= {key: value for key, value in first.overrides.items() if key.startswith(("data.", "plugins"))}
+    words = [f"{key}={value}" for key, value in given.items() if key.removeprefix("data.") not in _OF_TRAINING]
+    places = [
+        str(run.path.relative_to(Path.cwd()) if run.path.is_relative_to(Path.cwd()) else run.path)
+        for run in (first, other)
+    ]
+    commands = [
+        shlex.join(["saunet", "evaluate", place, f"data={choice}", *words, f"output_dir={place}/compared"])
+        for place in places
+    ]
+    splits = [(run.record.get("splits") or {}).get("val") for run in (first, other)]
+    seen = "" if splits[0] == splits[1] else " (frames that the second may have been trained on)"
+    return f"run `{commands[0]}` and `{commands[1]}`{seen}, then compare again"
 
 
 def compared(inputs: Inputs, wanted: Sequence[str]) -> tuple[list[Table], list[str]]:
@@ -132,5 +168,7 @@ def compared(inputs: Inputs, wanted: Sequence[str]) -> tuple[list[Table], list[s
         raise ConfigError(f"labels holds {len(set(wanted))} names for {len(members)} runs; give each its own")
     runs = dict(zip(wanted or labels([members])[0], members, strict=True))
     scores = scores_table(runs)
+    side_by_side = (losses_table(runs), scores if scores.rows else None, explained_table(runs))
     found, left_out = comparisons(runs)
-    return [settings_table(runs), *([scores] if scores.rows else []), *found], left_out
+    tables = [settings_table(runs), *(table for table in side_by_side if table), *health_tables(runs), *found]
+    return tables, left_out

@@ -216,12 +216,35 @@ def networks(run: Run) -> str:
     return f"{run.component('model/encoder')} + {run.component('model/decoder')}"
 
 
+def last_mean(run: Run, key: str) -> float | None:
+    """Return the mean of a logged figure over the last tenth of the rows that have it."""
+    found = [row[key] for row in run.history if key in row]
+    last = found[-max(1, len(found) // 10) :]
+    return sum(last) / len(last) if last else None
+
+
 def _progress(run: Run) -> tuple[Cell, Cell]:
     """Return how many epochs a run went and its last mean training loss."""
-    losses = [row["train/loss"] for row in run.history if "train/loss" in row]
     epochs = [row["epoch"] for row in run.history if "epoch" in row]
-    last = losses[-max(1, len(losses) // 10) :]
-    return (int(max(epochs)) + 1 if epochs else None), (sum(last) / len(last) if last else None)
+    return (int(max(epochs)) + 1 if epochs else None), last_mean(run, "train/loss")
+
+
+def losses_table(runs: Mapping[str, Run]) -> Table | None:
+    """Return the losses that runs have logged, and the fraction of pixels that they are of; None if none has."""
+    rows = []
+    for name, run in runs.items():
+        validated = [row["val/loss"] for row in run.history if "val/loss" in row]
+        cells = (*_progress(run), min(validated, default=None), last_mean(run, "health/automask"))
+        rows.append(Row((name, *cells), "measured"))
+    notes = [
+        "Loss: mean over the last tenth of the logged steps; of those pixels alone that teach, where there is an "
+        "auto-mask: with few of them left, it says little."
+    ]
+    if any(key.split(".")[0] in ("objective", "loss") for key in differing(list(runs.values()))):
+        notes.append("The objectives differ, so these losses do not compare.")
+    headings = columns("run", "epochs", "loss|.4f", "lowest val/loss|.4f", "pixels that teach|.3f")
+    logged = any(cell is not None for row in rows for cell in row.cells[2:])
+    return Table("losses", "Losses", headings, tuple(rows), tuple(notes)) if logged else None
 
 
 def _scored(runs: Mapping[str, Run]) -> list[tuple[str, Score]]:

@@ -90,7 +90,7 @@ def labels(groups: Sequence[Sequence[Run]]) -> list[list[str]]:
     taken: Counter[str] = Counter()
 
     def unique(run: Run, name: str) -> str:
-        name = name if counts[name] == 1 else f"{name} ({run.name})"
+        name = name if counts[name] == 1 else f"{name} ({run.path.name})"
         taken[name] += 1
         return name if taken[name] == 1 else f"{name} {taken[name]}"
 
@@ -104,7 +104,9 @@ def _labels(runs: Sequence[Run]) -> list[str]:
     keys = differing(runs, by_overrides=all(run.job is not None for run in runs))
     named = [_label(run, keys) for run in runs]
     single = any(run.job is None for run in runs)
-    return [run.name for run in runs] if single and max(map(len, named), default=0) > _LONGEST_LABEL else named
+    if single and max(map(len, named), default=0) > _LONGEST_LABEL:
+        return [run.path.name if run.config else run.name for run in runs]
+    return named
 
 
 def _label(run: Run, keys: Sequence[str]) -> str:
