@@ -16,7 +16,7 @@ from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.registry import objectives
 from saunet.runs.folder import RunRecord
-from saunet.training.monitors import HealthMonitor, LoaderMonitor, Loading, health, holes, sentence
+from saunet.training.monitors import HealthMonitor, LoaderMonitor, Loading, doubt, health, holes, sentence
 from saunet.training.optim import Recipe
 from saunet.training.pace import Pace, first_change
 from saunet.types import DepthPyramid, LossTerms
@@ -167,6 +167,39 @@ def test_a_training_that_is_really_sick_says_so_in_its_record(
     found = json.loads((tmp_path / "run.json").read_text())["health"]
     assert figures <= found.keys()
     assert all(sentence in caplog.text for sentence in found.values())
+
+
+@pytest.mark.parametrize(
+    ("figures", "words"),
+    [
+        ({"automask": 0.005, "rotation": 0.0}, ["0.5% of the pixels"]),
+        ({"automask": 0.5, "rotation": 0.8}, ["0.80 rad"]),
+        ({"automask": 0.005, "rotation": 0.8}, ["0.5% of the pixels", "0.80 rad"]),
+        ({"automask": 0.5, "rotation": 0.01}, None),
+        ({}, None),
+    ],
+)
+def test_a_loss_of_few_pixels_or_a_spinning_camera_says_little(figures: Any, words: list[str] | None) -> None:
+    said = doubt(figures)
+    assert (said is None) == (words is None)
+    assert all(word in str(said) for word in words or ())
+
+
+@pytest.mark.parametrize(("sicken", "marks"), [(turning, 1), (lambda model: None, 0)])
+def test_a_short_training_says_that_its_loss_means_little(
+    sicken: Any, marks: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = tiny.tiny_model(Recipe(lr=1e-3, freeze=["pose"]))
+    sicken(model)
+    model.run_record = RunRecord(tmp_path, "short")
+    model.run_record.start()
+    monitor = HealthMonitor(automask=0.0)  # of fresh networks
+    trainer = tiny.tiny_trainer(tmp_path, max_steps=10, limit_val_batches=0, callbacks=[monitor])
+    with caplog.at_level("INFO"):
+        trainer.fit(model, tiny.tiny_walls())
+    found = json.loads((tmp_path / "run.json").read_text())["health"]
+    assert list(found) == ["loss"] * marks
+    assert caplog.text.count("the loss says little about this training: the predicted camera turns by") == marks
 
 
 def test_a_healthy_training_has_no_marks(tmp_path: Path) -> None:

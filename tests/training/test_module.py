@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -180,6 +181,56 @@ def test_where_more_is_better_the_highest_is_kept(
     make_trainer(max_epochs=3, callbacks=[best]).fit(assemble(train_options(config), walls), walls)
     assert read_checkpoint(tmp_path / "best.ckpt").epoch == 1
     assert best.cost == pytest.approx(-0.9)
+
+
+@pytest.mark.parametrize(
+    ("states", "chosen", "cost"),
+    [
+        ([(0.5, 0.01), (0.4, 0.3), (0.1, 0.005)], 1, 0.4),
+        ([(0.5, 0.01), (0.1, 0.005), (0.3, 0.01)], 1, math.inf),
+        ([(0.5, 0.3), (0.4, 0.3), (0.6, 0.3)], 1, 0.4),
+    ],
+)
+def test_a_loss_of_few_pixels_does_not_choose_the_best_while_there_is_another(
+    states: list[tuple[float, float]],
+    chosen: int,
+    cost: float,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr("saunet.training.callbacks.FEW", 1)
+
+    class Best(BestCheckpoint):
+        def _monitor_candidates(self, trainer: Trainer) -> dict[str, torch.Tensor]:
+            loss, automask = map(torch.tensor, states[trainer.current_epoch])
+            found = {**super()._monitor_candidates(trainer), "val/loss": loss, "val/automask": automask}
+            return {**found, "val/rotation": torch.tensor(0.0)}
+
+    def fit(folder: Path, epochs: int, resume: Path | None = None) -> BestCheckpoint:
+        callbacks = [best := Best(str(folder), "val/loss"), LastCheckpoint(str(folder))]
+        trainer = tiny.tiny_trainer(folder, max_epochs=epochs, limit_train_batches=1, callbacks=callbacks)
+        with caplog.at_level("INFO"):
+            trainer.fit(tiny.tiny_model(), tiny.tiny_walls(), ckpt_path=resume, weights_only=True)
+        return best
+
+    def kept(folder: Path) -> int:
+        return int(torch.load(folder / "best.ckpt", weights_only=True)["epoch"])
+
+    assert fit(tmp_path / "a", 3).cost == pytest.approx(cost)
+    assert kept(tmp_path / "a") == chosen
+    doubted = any(automask < 0.05 for _, automask in states)
+    assert caplog.text.count("the loss says little about this state: it is of") == doubted
+    fit(tmp_path / "b", 1)
+    assert fit(tmp_path / "b", 3, tmp_path / "b" / "last.ckpt").cost == pytest.approx(cost)  # stopped and resumed
+    assert kept(tmp_path / "b") == chosen
+
+
+def test_the_auto_mask_of_the_validation_is_measured(tmp_path: Path) -> None:
+    trainer = tiny.tiny_trainer(tmp_path, max_epochs=1, limit_train_batches=1)
+    trainer.fit(tiny.tiny_model(), tiny.tiny_walls())
+    assert 0 <= trainer.callback_metrics["val/automask"] <= 1
+    assert trainer.callback_metrics["val/rotation"] >= 0
 
 
 def test_without_validation_the_mean_loss_of_the_epoch_decides(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 from collections.abc import Sequence
@@ -29,8 +30,10 @@ from saunet.metrics.functional import RISING
 from saunet.prediction.panel import panel
 from saunet.runs.checkpoint import atomic_save
 from saunet.training.module import EPOCH_LOSS
+from saunet.training.monitors import DOUBTED, FEW, doubt
 from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
 
+_IN_DOUBT = " in doubt"
 EVERY = 10.0
 """Seconds between two lines of a training whose output is no terminal."""
 
@@ -87,20 +90,23 @@ class BestCheckpoint(ModelCheckpoint):
     Args:
         folder: Where it goes.
         monitor: What decides; where it is not measured (no validation frame has ground truth), ``val/loss`` does, and
-            without validation ``train/loss``, its mean over the epoch.
+            without validation ``train/loss``, its mean over the epoch. A state whose loss says little (see
+            `saunet.training.monitors.doubt`) is only taken while there is no other.
     """
 
     def __init__(self, folder: str, monitor: str = "val/abs_rel") -> None:
         super().__init__(folder, "best", monitor, mode=_direction(monitor), enable_version_counter=False)
         self.wanted = monitor
-        self._scored_by, self._said = monitor, False
+        self._scored_by, self._said, self._doubted = monitor, False, False
         self._beside: Path | None = None
 
     @property
     def cost(self) -> float | None:
-        """The best monitored value as what a search minimizes: its negative where more is better."""
+        """The best monitored value as what a search minimizes: negative where more is better, infinite if in doubt."""
         if self.best_model_score is None:
             return None
+        if self._scored_by.endswith(_IN_DOUBT):
+            return math.inf
         return -float(self.best_model_score) if self.mode == "max" else float(self.best_model_score)
 
     @property
@@ -127,7 +133,10 @@ class BestCheckpoint(ModelCheckpoint):
         own_state = {"dirpath": str(self.dirpath), "best_model_path": path, "best_model_score": score}
         own_state |= {"best_k_models": known, "kth_best_model_path": path if known else ""}
         super().load_state_dict({**state_dict, **own_state})
-        self._scored_by = state_dict["monitor"]
+        self._scored_by = state_dict.get("scored_by", state_dict["monitor"])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), "scored_by": self._scored_by}
 
     def _save_topk_checkpoint(self, trainer: Trainer, monitor_candidates: dict[str, Tensor]) -> None:
         """Choose what to monitor, then save."""
@@ -139,10 +148,27 @@ class BestCheckpoint(ModelCheckpoint):
             self._said = True
             named = "the epoch's mean train/loss" if self.monitor == EPOCH_LOSS else self.monitor
             rank_zero_info(f"{self.wanted} is not measured in this run; best.ckpt is chosen by {named}")
-        if self.monitor != self._scored_by:  # what is known of the best is of another kind
-            self._scored_by = self.monitor
+        why = self._doubt(trainer, monitor_candidates)
+        if why and not self._doubted:
+            self._doubted = True
+            rank_zero_info(
+                f"step {trainer.global_step}: the loss says little about this state: {why}; best.ckpt is such a state "
+                "only while there is no other"
+            )
+        if why and self.best_model_path and self._scored_by == self.monitor:
+            return
+        kind = f"{self.monitor}{_IN_DOUBT if why else ''}"
+        if kind != self._scored_by:  # what is known of the best is of another kind
+            self._scored_by = kind
             self.best_k_models, self.kth_best_model_path, self.best_model_score = {}, "", None
         super()._save_topk_checkpoint(trainer, monitor_candidates)
+
+    def _doubt(self, trainer: Trainer, measured: dict[str, Tensor]) -> str | None:
+        """Say why the loss that decides says little; None if it does not, or something else decides."""
+        if self.monitor not in ("val/loss", EPOCH_LOSS) or trainer.global_step < FEW:
+            return None
+        place = "val" if self.monitor == "val/loss" else "health"
+        return doubt({name: float(measured[f"{place}/{name}"]) for name in DOUBTED if f"{place}/{name}" in measured})
 
 
 def _direction(monitor: str) -> Literal["min", "max"]:

@@ -25,7 +25,7 @@ from saunet.metrics.depth import DepthMetrics
 from saunet.runs.folder import RunRecord
 from saunet.runs.record import Intrinsics
 from saunet.training.intrinsics import FocalLengths
-from saunet.training.monitors import health
+from saunet.training.monitors import DOUBTED, health
 from saunet.training.optim import MovingAverage, Recipe
 from saunet.training.resume import continuation, owe_validation, validation_due
 from saunet.training.speed import Speed
@@ -176,8 +176,10 @@ class SelfSupervisedDepth(LightningModule):
         """Score depth where there is ground truth, and the loss where the batch has neighbors."""
         count = len(batch["name"])
         if batch["sources"].shape[1] > 0:
-            pyramid, _, _, terms = self.step(batch)
-            self.log_dict(terms.named("val"), sync_dist=True, batch_size=count)
+            pyramid, poses, _, terms = self.step(batch)
+            watched = health(pyramid, poses, terms, torch.inf)
+            figures = {f"val/{name}": watched[name] for name in DOUBTED if name in watched}
+            self.log_dict({**terms.named("val"), **figures}, sync_dist=True, batch_size=count)
         else:
             pyramid = self(batch["target"])
         disparity = pyramid.disparity[0]

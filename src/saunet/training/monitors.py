@@ -37,6 +37,8 @@ NAMED = 3
 """Bad batches named at most in one message."""
 AHEAD = 8
 """Batches that the device may lag behind before their flags are waited for."""
+FEW = 10
+"""Steps from which on it is said that a loss says little: before, networks are fresh and nobody looks at it."""
 _ENOUGH = 20
 """Steps from which a training says what set its pace."""
 _LOOK = 0.5
@@ -62,6 +64,23 @@ def health(
     if "automask" in terms.maps:
         figures["automask"] = terms.maps["automask"].float().mean()
     return figures
+
+
+DOUBTED = ("automask", "rotation")
+"""Figures that tell whether a loss means anything."""
+
+
+def doubt(figures: Mapping[str, float], automask: float = 0.05, rotation: float = 0.5) -> str | None:
+    """Say why the loss tells little about networks with these figures; None if nothing speaks against it.
+
+    A mean over the few pixels that an auto-mask leaves is small where depth and motion are wrong almost everywhere.
+    """
+    reasons = []
+    if figures.get("automask", 1.0) < automask:
+        reasons.append(f"it is of {figures['automask']:.1%} of the pixels (auto-mask)")
+    if figures.get("rotation", 0.0) > rotation:
+        reasons.append(f"the predicted camera turns by {figures['rotation']:.2f} rad between frames")
+    return " and ".join(reasons) or None
 
 
 def holes(far: Bool[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
@@ -131,16 +150,19 @@ class HealthMonitor(Callback):
             self._look(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Look at a short training too, unless its networks are still fresh."""
+        """Look at a short training too; where its networks are still fresh, only at whether its loss means anything."""
         if trainer.global_step >= min(self.after, self.every_n_steps):
             self._look(trainer, pl_module)
+        elif trainer.global_step >= FEW:
+            self._look(trainer, pl_module, fresh=True)
 
-    def _look(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def _look(self, trainer: Trainer, pl_module: LightningModule, fresh: bool = False) -> None:
         if not trainer.is_global_zero:
             return
         logged = {**{f"health/{name}": name for name in (*self.least, *self.most)}, "train/loss": "loss"}
         metrics = trainer.callback_metrics
-        said = self.judge({name: float(metrics[key]) for key, name in logged.items() if key in metrics})
+        figures = {name: float(metrics[key]) for key, name in logged.items() if key in metrics}
+        said = self.judge_loss(figures) if fresh else self.judge(figures)
         for sentence in said:
             rank_zero_info(f"step {trainer.global_step}: {sentence}")
         record = getattr(pl_module, "run_record", None)
@@ -162,12 +184,22 @@ class HealthMonitor(Callback):
         self.found.update(said)
         return list(said.values())
 
+    def judge_loss(self, figures: Mapping[str, float]) -> list[str]:
+        """Return a sentence if the loss of a short training says little."""
+        why = doubt(figures, self.least["automask"], self.most["rotation"])
+        said = (
+            f"the loss says little about this training: {why}; lower optim.lr or train longer, and do not compare by it"
+        )
+        self.found.update({"loss": said} if why else {})
+        return [said] if why else []
+
 
 TOO_LOW = {
     "disparity_spread": "disparity is nearly flat (it varies by {:.2%} of its mean), so depth has collapsed; lower "
     "optim.lr, check data.offsets and the intrinsics, or start from public weights",
-    "automask": "only {:.1%} of the pixels teach (auto-mask): the camera stands still in most frames, or exposure "
-    "jumps between them; leave static frames out, or use larger data.offsets",
+    "automask": "only {:.1%} of the pixels teach (auto-mask), so the loss says little: the camera stands still in most "
+    "frames, exposure jumps between them, or optim.lr is too high; leave static frames out, use larger data.offsets, "
+    "or lower optim.lr",
     "translation": "the predicted motion is nearly zero ({:.1e}), so the pose network has collapsed; lower optim.lr, "
     "or leave static frames out",
     "loss": "the loss is nearly zero ({:.1e}), so there is nothing to learn: target and sources are the same picture; "
