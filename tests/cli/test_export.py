@@ -39,6 +39,8 @@ def test_a_trained_model_becomes_a_folder(
     code, out, err = export(*arguments)
     assert code == 0, err
     assert "so only random images were compared" in err
+    steps = ["making model.safetensors", "checking it", r"differs by 0\.0e\+00 of its range; \d+\.\d s", "timing"]
+    assert re.search(".*\n.*".join(steps), err), err  # a line each, in a pipe
     assert re.search(r"model\.safetensors +\d+\.\d +any +0\.0e\+00 +2 +0 +\d+\.\d +\d+\.\d", out), out
     assert saunet.load(tmp_path / "model").fingerprint == saunet.load(checkpoint).fingerprint
     assert json.loads((tmp_path / "model" / "report.json").read_text())["files"][0]["difference"] == 0

@@ -122,6 +122,7 @@ def test_predict_finds_the_unknown_factor(
     assert "middle half" in said
     assert "known to about" in said
     assert "measure on more frames" in said
+    assert "scale.store=true keeps it" in said
     report = json.loads((recording / "out" / "scale.json").read_text())
     assert report["factor"] == predictor.scale.factor
     assert report["frames"] == 3
@@ -190,6 +191,18 @@ def test_a_stored_scale_changes_nothing_else(checkpoint: Path) -> None:
     assert all((after.state[key] == value).all() for key, value in before.state.items())
     with pytest.raises(CheckpointError, match="no checkpoint at"):
         store_scale(checkpoint.with_name("nowhere.ckpt"), Scale(3.0, "speed"))
+
+
+def test_predict_stores_what_it_measures(
+    recording: Path, street: SyntheticDrive, checkpoint: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    predictor, K = TrueDepth(street), Camera(street.intrinsics(), 64, 192)
+    options = ScaleOptions(method="camera_height", camera_height=1.65, store=True)
+    scale_predictor(options, predictor, str(recording / "left"), K, recording / "out", checkpoint)
+    assert read_checkpoint(checkpoint).record.scale == predictor.scale
+    said = capsys.readouterr().out
+    assert f"stored in {checkpoint}" in said
+    assert "scale.store=true" not in said
 
 
 def test_evaluate_measures_stores_and_predict_uses_it(tool: Tool, checkpoint: Path, tmp_path: Path) -> None:

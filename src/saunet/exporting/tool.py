@@ -7,6 +7,7 @@ import json
 import math
 import platform
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -24,7 +25,6 @@ from saunet.exporting.parity import Parity, Run, compare, parity_table, random_i
 from saunet.io.atomic import remove_partial_files, replacing, write_bytes, write_json
 from saunet.io.images import network_input, read_image
 from saunet.io.plain import read_json
-from saunet.io.progress import bar
 from saunet.models.depth import DepthNet
 from saunet.prediction.sources import find_sources
 from saunet.runs.record import Intrinsics, ModelRecord
@@ -160,30 +160,31 @@ def export(options: ExportOptions) -> ExportResult:
     remove_partial_files(folder)
     eager, span = exporters.run_eager(network), 1 / record.min_depth - 1 / record.max_depth
     reports, runs = list[Parity](), list[Run]()
-    with bar() as shown:
-        task = shown.add_task("exporting", total=len(formats))
-        for name in formats:
-            path = folder / FILES[name]
-            with replacing(path) as temporary, _weights_beside(folder, name) as weights:
-                if name == "safetensors":
-                    takes, parts = "any", {"depth": network} if pose is None else {"depth": network, "pose": pose}
-                    write_safetensors(named_state(parts), temporary)
-                else:
-                    takes = _EXPORTERS[name](network, record, temporary, options, weights)
-                run = _RUNNERS[name](temporary, record, weights)
-                size = sum(each.stat().st_size for each in (temporary, weights) if each is not None)
-                report = compare(path.name, eager, run, random, real, span, takes, size / 2**20)
-                found = f"{report.difference:.2g} of the disparity range, more than {TOLERANCE:g}"
-                wrong = "gives NaN where the network gives disparity"
-                if not math.isnan(report.difference):
-                    wrong = f"differs from the network by {found}"
-                if not report.difference <= TOLERANCE:
-                    raise CheckpointError(
-                        f"the exported {path.name} {wrong}, so it is not written; report encoder and decoder"
-                    )
-            reports.append(report)
-            runs.append(run)
-            shown.advance(task)
+    for name in formats:
+        path, begun = folder / FILES[name], time.monotonic()
+        _say(f"{name}: making {path.name}")
+        with replacing(path) as temporary, _weights_beside(folder, name) as weights:
+            if name == "safetensors":
+                takes, parts = "any", {"depth": network} if pose is None else {"depth": network, "pose": pose}
+                write_safetensors(named_state(parts), temporary)
+            else:
+                takes = _EXPORTERS[name](network, record, temporary, options, weights)
+            _say(f"{name}: checking it against the network on {len(random) + len(real)} images")
+            run = _RUNNERS[name](temporary, record, weights)
+            size = sum(each.stat().st_size for each in (temporary, weights) if each is not None)
+            report = compare(path.name, eager, run, random, real, span, takes, size / 2**20)
+            found = f"{report.difference:.2g} of the disparity range, more than {TOLERANCE:g}"
+            wrong = "gives NaN where the network gives disparity"
+            if not math.isnan(report.difference):
+                wrong = f"differs from the network by {found}"
+            if not report.difference <= TOLERANCE:
+                raise CheckpointError(
+                    f"the exported {path.name} {wrong}, so it is not written; report encoder and decoder"
+                )
+        _say(f"{name}: differs by {report.difference:.1e} of its range; {time.monotonic() - begun:.1f} s")
+        reports.append(report)
+        runs.append(run)
+    _say("timing the files and the network on one image each")
     reports = timed(reports, eager, runs, random[0])
     about: dict[str, Any] = {"threads": torch.get_num_threads(), "machine": platform.machine(), "versions": _versions()}
     if "onnx" in formats:
@@ -194,6 +195,11 @@ def export(options: ExportOptions) -> ExportResult:
     write_json(folder / CONFIG, record.to_plain())  # last: with it, the folder is a model
     address = push(folder, options.push) if options.push else None
     return ExportResult(output=folder, reports=tuple(reports), address=address)
+
+
+def _say(what: str) -> None:
+    """Say how far it is, in a pipe too: a format can take minutes."""
+    print(what, file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

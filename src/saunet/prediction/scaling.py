@@ -59,6 +59,8 @@ def apply_scale(
             height = camera_height if options.camera_height is None else options.camera_height
             estimate = estimate_scale(options.method, batches, depth, pose, height)
         predictor.scale = keep_scale(estimate, store_in, folder)
+        if store_in is None and str(checkpoint).endswith(".ckpt"):
+            print("it counts for this command; scale.store=true keeps it in the checkpoint, for all later ones")
     predictor.scale = options.chosen(predictor.scale)
 
 
