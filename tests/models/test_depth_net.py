@@ -5,11 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 from networks import assert_all_have_gradients
+from torch import nn
 
 from saunet.errors import ConfigError
 from saunet.models.depth import DepthNet
 from saunet.registry import decoders, encoders, poses
-from saunet.types import DepthPyramid
+from saunet.types import DepthPyramid, FeatureSpec
 
 HEIGHT, WIDTH = 64, 96
 
@@ -61,6 +62,45 @@ def test_size_error(size, valid):
         ConfigError, match=rf"image {size[0]}x{size[1]} .* stride 32; the nearest valid size is {valid}"
     ):
         net(torch.zeros(1, 3, *size))
+
+
+class _Announces(nn.Module):
+    """Maps of 4 and 8 channels at 1/2 and 1/4, and whatever it says of them."""
+
+    size_divisor = 4
+
+    def __init__(self, features: object) -> None:
+        super().__init__()
+        self.features = features
+
+    def forward(self, image: torch.Tensor) -> list[torch.Tensor]:
+        batch, _, height, width = image.shape
+        return [torch.rand(batch, 4, height // 2, width // 2), torch.rand(batch, 8, height // 4, width // 4)]
+
+
+@pytest.mark.parametrize(
+    ("features", "said"),
+    [
+        ([(4, 2), (9, 4)], r"maps of 4x16x24, 8x8x12 for an image of 32x48.*'features' announce 4x16x24, 9x8x12"),
+        ([(4, 2), (8, 8)], r"announce 4x16x24, 8x4x6"),
+        ([(4, 2)], r"announce 4x16x24;"),
+        ([(4, 2), (8, 4), (8, 8)], r"announce 4x16x24, 8x8x12, 8x4x6"),
+    ],
+)
+def test_maps_that_are_not_what_the_encoder_announces_are_one_sentence(features, said):
+    net = DepthNet(_Announces([FeatureSpec(*each) for each in features]), decoders.partial("unet"))
+    with pytest.raises(ConfigError, match=f"_Announces returns {said}" if said.startswith("maps") else said):
+        net(torch.rand(1, 3, 32, 48))
+
+
+def test_features_that_are_no_features_are_one_sentence():
+    with pytest.raises(ConfigError, match=r"'features' of the encoder _Announces is \[\(4, 2\)\].*FeatureSpec"):
+        DepthNet(_Announces([(4, 2)]), decoders.partial("unet"))
+
+
+def test_maps_as_announced_are_decoded():
+    net = DepthNet(_Announces([FeatureSpec(4, 2), FeatureSpec(8, 4)]), decoders.partial("unet"))
+    assert net(torch.rand(1, 3, 32, 48)).depth[0].shape == (1, 1, 32, 48)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from jaxtyping import Float
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from saunet.errors import ConfigError, checked, divisible
 from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
 from saunet.models.layers.conv import channels_last_weights
-from saunet.types import DepthPyramid
+from saunet.types import DepthPyramid, FeatureSpec
 
 torch.export.register_dataclass(DepthPyramid)  # so that a depth network can be exported with its result as it is
 
@@ -60,6 +60,11 @@ class DepthNet(nn.Module):
                     f"the encoder {type(encoder).__name__} has no attribute '{needed}'; set it in __init__ "
                     "(docs/add_encoder.md)"
                 )
+        if not all(isinstance(each, FeatureSpec) for each in encoder.features):  # type: ignore[union-attr]
+            raise ConfigError(
+                f"'features' of the encoder {type(encoder).__name__} is {encoder.features!r}; it needs a "
+                "FeatureSpec(channels, stride) for each map that it returns (docs/add_encoder.md)"
+            )
         self.encoder = encoder
         self.decoder = decoder(features=encoder.features)
         self.features = encoder.features
@@ -74,8 +79,8 @@ class DepthNet(nn.Module):
             image: RGB in [0, 1].
 
         Raises:
-            ConfigError: if the image is not of this shape or not of floating point, or height or width is not a
-                multiple of the encoder's stride.
+            ConfigError: if the image is not of this shape or not of floating point, height or width is not a multiple
+                of the encoder's stride, or the encoder's maps are not what its ``features`` say.
         """
         if image.ndim != 4 or image.shape[1] != 3 or not image.dtype.is_floating_point:
             raise ConfigError(
@@ -84,6 +89,23 @@ class DepthNet(nn.Module):
             )
         divisible(image.shape[-2], image.shape[-1], self.size_divisor)
         features = self.encoder(image.contiguous(memory_format=torch.channels_last))
+        if not torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]  # there, sizes are tensors
+            self._check(features, *image.shape[-2:])
         sigmoid = tuple(self.decoder(features))
         disparity = tuple(sigmoid_to_disparity(x, self.min_depth, self.max_depth) for x in sigmoid)
         return DepthPyramid(sigmoid, disparity, tuple(disparity_to_depth(x) for x in disparity))
+
+    def _check(self, maps: Sequence[Tensor], height: int, width: int) -> None:
+        """Check that the encoder's maps are what it announced, on which the decoder was built."""
+        got = [tuple(each.shape[1:]) for each in maps]
+        announced = [(each.channels, height // each.stride, width // each.stride) for each in self.features]
+        if got != announced:
+            raise ConfigError(
+                f"the encoder {type(self.encoder).__name__} returns maps of {_sizes(got)} for an image of "
+                f"{height}x{width}, and its 'features' announce {_sizes(announced)}; set channels and stride of each "
+                "map there, finest first (docs/add_encoder.md)"
+            )
+
+
+def _sizes(maps: Iterable[tuple[int, ...]]) -> str:
+    return ", ".join("x".join(map(str, each)) for each in maps) or "nothing"
