@@ -160,6 +160,7 @@ poses = Registry("pose", "model/pose", "saunet.models.poses")
 terms = Registry("term", "term", "saunet.losses.terms")
 objectives = Registry("objective", "objective", "saunet.losses.objectives")
 datamodules = Registry("data", "data", "saunet.data")
+outputs = Registry("output", None, "saunet.prediction.sinks", late=("clip",))  # of `saunet predict`: no part of a model
 models = Registry("model", None, "saunet.models.systems")  # its members choose members of other groups
 
 _ALL = (models, encoders, decoders, attentions, poses, terms, objectives, datamodules)

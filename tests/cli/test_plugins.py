@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from processes import python
 
@@ -42,6 +44,35 @@ class Mine(nn.Module):
             features.append(image)
         return features
 '''
+OUTPUT = '''
+"""An output of my own."""
+
+from pathlib import Path
+
+from saunet.prediction.sinks import ClipInfo, Sink
+from saunet.registry import outputs
+
+
+@outputs.register("lines")
+class Lines(Sink):
+    """A line per frame."""
+
+    def __init__(self, clip: ClipInfo) -> None:
+        self.paths, self.lines = (Path(f"{clip.stem}lines.txt"),), []
+
+    def session(self):
+        yield
+        self.paths[0].write_text("".join(self.lines))
+
+    def add(self, frame, result, limits) -> None:
+        self.lines.append(f"{frame.stem} {result.depth.shape}\\n")
+
+
+@outputs.register("no_sink")
+def no_sink(clip: ClipInfo) -> ClipInfo:
+    """Nothing that takes predictions."""
+    return clip
+'''
 QUICK = ("experiment=smoke", "model/encoder=mine", "model.encoder.width=4", "model/decoder=unet", "model/pose=posecnn")
 
 
@@ -57,6 +88,18 @@ def test_an_encoder_in_a_file_trains_evaluates_and_is_asked_for(tmp_path: Path) 
     evaluate = ("evaluate", "run", "data=synthetic_tiny", "data.workers=0", "baselines=false")
     assert "plugins=[my_parts]" in _saunet(*evaluate, folder=tmp_path, code=1)
     assert "model" in _saunet(*evaluate, "plugins=my_parts.py", folder=tmp_path)
+
+
+def test_an_output_in_a_file_is_written_by_predict(tmp_path: Path) -> None:
+    (tmp_path / "my_outputs.py").write_text(OUTPUT)
+    cv2.imwrite(str(tmp_path / "road.png"), np.full((48, 96, 3), 99, np.uint8))
+    predict = ("predict", "road.png", "output=out", "plugins=[my_outputs]", "runtime=torch")
+    said = _saunet(*predict, "outputs=[lines,npy]", folder=tmp_path)
+    assert "out/road_lines.txt" in said
+    assert (tmp_path / "out" / "road_lines.txt").read_text() == "road (48, 96)\n"
+    assert (tmp_path / "out" / "road_depth.npy").is_file()
+    assert "did you mean 'lines'" in _saunet(*predict, "outputs=[line]", folder=tmp_path, code=1)
+    assert "the output 'no_sink' is a ClipInfo" in _saunet(*predict, "outputs=[no_sink]", folder=tmp_path, code=1)
 
 
 def test_help_and_unknown_names_know_it(tmp_path: Path) -> None:

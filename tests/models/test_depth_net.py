@@ -88,7 +88,7 @@ class _Announces(nn.Module):
     ],
 )
 def test_maps_that_are_not_what_the_encoder_announces_are_one_sentence(features, said):
-    net = DepthNet(_Announces([FeatureSpec(*each) for each in features]), decoders.partial("unet"))
+    net = DepthNet(_Announces([FeatureSpec(*each) for each in features]), decoders.partial("unet", scales=(0,)))
     with pytest.raises(ConfigError, match=f"_Announces returns {said}" if said.startswith("maps") else said):
         net(torch.rand(1, 3, 32, 48))
 
@@ -99,7 +99,7 @@ def test_features_that_are_no_features_are_one_sentence():
 
 
 def test_maps_as_announced_are_decoded():
-    net = DepthNet(_Announces([FeatureSpec(4, 2), FeatureSpec(8, 4)]), decoders.partial("unet"))
+    net = DepthNet(_Announces([FeatureSpec(4, 2), FeatureSpec(8, 4)]), decoders.partial("unet", scales=(0,)))
     assert net(torch.rand(1, 3, 32, 48)).depth[0].shape == (1, 1, 32, 48)
 
 

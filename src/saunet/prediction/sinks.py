@@ -31,6 +31,7 @@ from saunet.prediction.panel import fit, label
 from saunet.prediction.pointcloud import Camera, ViewerWriter, point_cloud
 from saunet.prediction.prediction import ImagePredictor, Prediction
 from saunet.prediction.sources import Frame
+from saunet.registry import outputs as clip_outputs
 
 if TYPE_CHECKING:
     from saunet.prediction.odometer import Odometer
@@ -53,6 +54,27 @@ class Style:
     limits: tuple[float, float] | None = None
     camera: Camera | None = None
     max_depth: float | int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ClipInfo:
+    """What an output of a whole recording is made for."""
+
+    stem: str
+    """How the names of its files begin, with their folder: ``out/drive_``."""
+    title: str
+    """Of the recording."""
+    fps: float
+    """Frames per second of results."""
+    timed: bool
+    """Whether frames have times of their own."""
+    style: Style
+    retimed: bool = False
+    """Whether results run at a rate of their own all the same."""
+    layout: str = "auto"
+    codec: str = "h264"
+    odometer: Odometer | None = None
+    """What follows the camera, where a trajectory is asked for too."""
 
 
 class Manifest:
@@ -261,6 +283,38 @@ class TrajectorySink(Sink):
         write_trajectory(self.paths[0], poses, self._odometer.scale is not None)
         for path in self.paths[2:]:
             write_tum(path, poses, np.array(self._times))
+
+
+# Outputs of whole recordings, in the order in which they are filled: the odometer moves with the trajectory.
+
+
+@clip_outputs.register("mp4")
+def _video(clip: ClipInfo) -> Sink:
+    """Image and disparity."""
+    path, timed = Path(f"{clip.stem}disparity.mp4"), clip.timed and not clip.retimed
+    return VideoSink(path, clip.fps, clip.layout, clip.style.colormap, clip.codec, timed)
+
+
+@clip_outputs.register("html")
+def _viewer(clip: ClipInfo) -> Sink | None:
+    """Points to orbit; nothing for a recording without a frame, whose camera is unknown."""
+    path, style = Path(f"{clip.stem}points.html"), clip.style
+    return None if style.camera is None else ViewerSink(path, style.camera, clip.fps, style.max_depth, clip.title)
+
+
+@clip_outputs.register("trajectory")
+def _trajectory(clip: ClipInfo) -> Sink:
+    """The camera's path."""
+    assert clip.odometer is not None  # it is asked for
+    return TrajectorySink(Path(f"{clip.stem}trajectory.png"), clip.odometer, clip.timed)
+
+
+@clip_outputs.register("rrd")
+def _rerun(clip: ClipInfo) -> Sink:
+    """All of it for Rerun's viewer."""
+    from saunet.prediction.rerun import RerunSink
+
+    return RerunSink(Path(f"{clip.stem}rerun.rrd"), clip.style.camera, clip.style.max_depth, clip.odometer)
 
 
 def compose(

@@ -22,6 +22,7 @@ from saunet.prediction.prediction import ImagePredictor, load
 from saunet.prediction.scaling import apply_scale
 from saunet.prediction.sinks import LAYOUTS, OUTPUTS, Sink, Style
 from saunet.prediction.sources import Frame, Input, Recording
+from saunet.registry import outputs as clip_outputs
 from saunet.scale.options import ScaleOptions
 from saunet.weights.locate import locate
 
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from saunet.prediction.odometer import Odometer
 
 RUNTIMES: tuple[str, ...] = ("auto", "torch", "openvino", "onnx")
-CLIP_OUTPUTS: tuple[str, ...] = ("mp4", "html", "trajectory", "rrd")
-"""What can be written for a recording as a whole, besides `OUTPUTS` for each of its frames."""
 
 
 @checked
@@ -50,8 +49,8 @@ class PredictOptions:
         outputs: ``color`` (disparity in colors), ``png16`` (depth x 256), ``npy`` (depth in float32), ``ply`` (points),
             ``pairs`` (images and depth in meters, to train on) for each image; ``mp4`` (image and disparity), ``html``
             (points to orbit), ``trajectory`` (from above, as KITTI poses, and where times are known for TUM's tools)
-            and ``rrd`` (all of it for Rerun's viewer) for the whole. By default color and png16 of images, mp4 of
-            videos.
+            and ``rrd`` (all of it for Rerun's viewer) for the whole; and what plugins register. By default color and
+            png16 of images, mp4 of videos.
         colormap: magma, inferno, viridis, turbo or gray.
         camera: True intrinsics, which ``ply`` and ``html`` need: a camera.yaml; fx, fy, cx, cy in pixels of the first
             image; the nine numbers of K; one number, the horizontal field of view in degrees; or ``checkpoint`` for the
@@ -107,10 +106,11 @@ class PredictOptions:
 
     def __post_init__(self) -> None:
         if self.outputs is not None:
+            known = (*OUTPUTS, *clip_outputs.names())
             for output in self.outputs:
-                one_of("outputs", output, (*OUTPUTS, *CLIP_OUTPUTS))
+                one_of("outputs", output, known)
             if not self.outputs:
-                raise ConfigError(f"outputs is empty; allowed: {', '.join((*OUTPUTS, *CLIP_OUTPUTS))}")
+                raise ConfigError(f"outputs is empty; allowed: {', '.join(known)}")
         one_of("colormap", self.colormap, COLORMAPS)
         one_of("layout", self.layout, LAYOUTS)
         one_of("codec", self.codec, CODECS)
@@ -173,7 +173,8 @@ class PredictResult:
             before = f", {self.skipped} images were finished before" if self.skipped else ""
             files = "1 file" if len(self.written) == 1 else f"{len(self.written)} files"
             lines.append(f"{files} written{before}: {self.output}")
-        for paths, what in ((self.clips, f"{self.frames} frames"), (self.finished, "finished before")):
+        count = "1 frame" if self.frames == 1 else f"{self.frames} frames"
+        for paths, what in ((self.clips, count), (self.finished, "finished before")):
             if paths:
                 lines.append(f"{what}: {', '.join(map(str, paths))}")
         return "\n".join([*lines, *self.notes])
@@ -318,21 +319,23 @@ def _clip_sinks(
     options: PredictOptions, outputs: Sequence[str], recording: Recording, style: Style, odometer: Odometer | None
 ) -> list[Sink]:
     """Return what takes the outputs that are made of a recording as a whole."""
-    stem, fps, found = f"{Path(options.output) / recording.title}_", recording.fps, list[Sink]()
-    if "mp4" in outputs:
-        path, timed = Path(f"{stem}disparity.mp4"), recording.timed and options.fps is None
-        found.append(sinks.VideoSink(path, fps, options.layout, style.colormap, options.codec, timed))
-    if "html" in outputs and style.camera is not None:
-        path = Path(f"{stem}points.html")
-        found.append(sinks.ViewerSink(path, style.camera, fps, options.max_depth, recording.title))
-    if "trajectory" in outputs and odometer is not None:
-        found.append(sinks.TrajectorySink(Path(f"{stem}trajectory.png"), odometer, recording.timed))
-    if "rrd" in outputs:
-        from saunet.prediction.rerun import RerunSink
-
-        moves = odometer if "trajectory" in outputs else None
-        found.append(RerunSink(Path(f"{stem}rerun.rrd"), style.camera, options.max_depth, moves))
-    return found
+    clip = sinks.ClipInfo(
+        stem=f"{Path(options.output) / recording.title}_",
+        title=recording.title,
+        fps=recording.fps,
+        timed=recording.timed,
+        style=style,
+        retimed=options.fps is not None,
+        layout=options.layout,
+        codec=options.codec,
+        odometer=odometer if "trajectory" in outputs else None,
+    )
+    names = [entry.name for entry in clip_outputs.registered() if entry.name in outputs]
+    found = {name: clip_outputs.build(name, clip=clip) for name in names}
+    for name, sink in found.items():
+        if sink is not None and not isinstance(sink, Sink):
+            raise ConfigError(f"the output '{name}' is a {type(sink).__name__}; derive it from saunet's Sink")
+    return [sink for sink in found.values() if sink is not None]
 
 
 def _state(frames: Sequence[Frame]) -> str:
