@@ -284,6 +284,34 @@ def test_help_says_where_results_go(tool: str, capsys: pytest.CaptureFixture[str
     assert f" = outputs/{'NAME' if tool == 'train' else tool}/DATE_TIME" in said
 
 
+def test_loader_processes_that_end_with_the_group_make_no_failure_of_a_stop(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def alarm(*_: object) -> None:  # as torch's loader has it
+        raise RuntimeError("DataLoader worker is killed by signal: Terminated")
+
+    def work(*_: object) -> int:
+        signal.signal(signal.SIGCHLD, alarm)
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(10)
+        finally:
+            os.kill(os.getpid(), signal.SIGCHLD)
+            time.sleep(0.1)
+        return 0
+
+    monkeypatch.setattr(app, "_run", work)
+    before = [signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGCHLD)]
+    try:
+        with pytest.raises(SystemExit) as stop:
+            app.run("train", [])
+    finally:
+        signal.signal(signal.SIGTERM, before[0])
+        assert signal.signal(signal.SIGCHLD, before[1]) == alarm  # as it was
+    assert stop.value.code == 128 + signal.SIGTERM
+    assert "saunet train: stopped by SIGTERM" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_signal_ends_any_tool_with_a_word(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

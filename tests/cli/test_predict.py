@@ -152,7 +152,7 @@ def test_folder_into_files_and_a_page(tool: Callable[..., Any], checkpoint: Path
     outcome = tool("predict", *arguments)
     assert outcome.code == 0, outcome.err
     assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == [".html", ".json", ".npy"]
-    assert f"1 frames: {Path('out') / tmp_path.name}_points.html" in outcome.out
+    assert f"1 frame: {Path('out') / tmp_path.name}_points.html" in outcome.out
     again = tool("predict", *arguments)
     assert again.code == 0, again.err
     assert "0 files written, 1 images were finished before: out" in again.out

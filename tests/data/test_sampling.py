@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
+
 import numpy as np
 import pytest
 import torch
 from drives import NumberDrive
+from torch.utils.data import DataLoader
 
-from saunet.data.loading.sampling import EvalBatches, ResumableLoader, TrainBatches, evenly
+from saunet.data.loading.sampling import EvalBatches, Loader, ResumableLoader, TrainBatches, evenly, processes
 from saunet.data.loading.windows import WindowDataset, collate
 from saunet.errors import ConfigError
 
@@ -89,6 +94,20 @@ def test_loader_goes_on_where_it_was_saved(workers):
     assert [batch["name"] for batch in again] == whole
     assert len(again) == 4
     assert np.shape(whole) == (4, 2)
+
+
+def test_a_loader_process_ends_without_an_alarm_when_it_is_asked_to():
+    """With the whole process group: torch's alarm would end the first process before it has saved."""
+    data = WindowDataset([NumberDrive()], [(0, i) for i in range(8)], offsets=(), height=20, width=30)
+    loader = Loader(data, batch_size=None, **processes(1))
+    batches = DataLoader.__iter__(loader)
+    next(batches)
+    (worker,) = batches._workers
+    other = multiprocessing.get_context("fork").Process(target=os.kill, args=(worker.pid, signal.SIGTERM))
+    other.start()  # not from here: torch's processes end well when their own parent asks them
+    other.join(30)
+    worker.join(30)
+    assert worker.exitcode == 0
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, cast, runtime_checkable
 
 from saunet import __version__, plugins
 from saunet.cli.table import PLUGINS, TOOLS, Table, Tool, config_dir, imported, read
@@ -139,11 +139,17 @@ def _ended_by_signals() -> Iterator[None]:
     def stop(number: int, _: object) -> NoReturn:
         from saunet.runs.folder import Stopped
 
+        # A signal to the whole process group ends torch's loader processes too. Its handler for that raises wherever
+        # the program is, and would make a failure of the stop that is under way.
+        if hasattr(signal, "SIGCHLD"):
+            before[signal.SIGCHLD] = signal.signal(signal.SIGCHLD, lambda *_: None) or signal.SIG_DFL
         raise Stopped(f"stopped by {signal.Signals(number).name}; what is complete stays", 128 + number)
 
     main = threading.current_thread() is threading.main_thread()
     wanted = [getattr(signal, each) for each in ("SIGTERM", "SIGHUP") if main and hasattr(signal, each)]
-    before = {each: signal.signal(each, stop) for each in wanted if signal.getsignal(each) == signal.SIG_DFL}
+    before: dict[int, Any] = {
+        each: signal.signal(each, stop) for each in wanted if signal.getsignal(each) == signal.SIG_DFL
+    }
     try:
         yield
     finally:

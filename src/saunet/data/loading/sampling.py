@@ -6,6 +6,8 @@ A sampler yields lists of items, one list a batch, to a loader with ``batch_size
 from __future__ import annotations
 
 import math
+import os
+import signal
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -106,13 +108,17 @@ def processes(wanted: int) -> dict[str, Any]:
         "prefetch_factor": AHEAD if workers else None,
         "pin_memory": torch.cuda.is_available(),
         "persistent_workers": workers > 0,
-        "worker_init_fn": _single_threaded,
+        "worker_init_fn": _prepare,
     }
 
 
-def _single_threaded(worker: int) -> None:
+def _prepare(worker: int) -> None:
+    """Compute with one thread, and end without an alarm if the process group is told to: the first process saves."""
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), lambda *_: os._exit(0))
 
 
 class Loader(DataLoader[Any]):
