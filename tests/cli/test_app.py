@@ -16,6 +16,7 @@ from echo_tool import ECHOED, EchoOptions
 
 from saunet.cli import app, table
 from saunet.cli.table import Tool
+from saunet.errors import ConfigError
 
 ECHO = Tool(
     "echo",
@@ -178,7 +179,8 @@ def test_plain_words_are_the_input(echo: Said, tmp_path: Path) -> None:
         ("data=synthetic data.wrokers=3", ("unknown key 'data.wrokers'", "did you mean 'workers'?")),
         ("data=sinthetic", ("unknown data 'sinthetic'", "did you mean 'synthetic'?")),
         ("count=many", ("count is 'many'; it must be int",)),
-        ("count=1,2", ("count=1,2 has several values", "-m", "count=[1,2]")),
+        ("count=1,2", ("count=1,2: a comma means a sweep", "needs --multirun (-m)\n")),
+        ("data=synthetic,kitti", ("data=synthetic,kitti: a comma means a sweep", "needs --multirun (-m)\n")),
         ("count=-1", ("count is -1; it must be at least 0",)),
         ("--count 3", ("no option --count", "count=3")),
         ("--count=3", ("no option --count=3", "written without dashes: count=3")),
@@ -197,6 +199,19 @@ def test_a_mistake_is_one_sentence(echo: Said, words: str, expected: tuple[str, 
     for each in expected:
         assert each in err
     assert list(Path().iterdir()) == []
+
+
+def test_what_may_be_a_list_or_text_says_how_they_are_written(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        app.main(["predict", "road.png", "camera=707,707,601,183"])
+    said = capsys.readouterr().err
+    for each in ("needs --multirun (-m)", "camera=[707,707,601,183]", "\"camera='707,707,601,183'\""):
+        assert each in said
+
+
+def test_a_model_behind_the_input_is_told_its_key() -> None:
+    with pytest.raises(ConfigError, match=r"'runs/first' is not KEY=VALUE; .* write checkpoint=runs/first"):
+        app.read_words(["road.png", "runs/first"], app.TOOLS["predict"], table.read())
 
 
 def test_an_address_is_an_input_whatever_is_in_it(echo: Said) -> None:
@@ -235,10 +250,25 @@ def test_nothing_is_written_by_the_command_line_itself(echo: Said) -> None:
 
 def test_help_says_what_each_key_is(echo: Said) -> None:
     _, out, _ = echo("--help")
-    for each in ("input: str = null  A file.", "inner.factor: float = 1.0  How much.", "mode: a|b = a", "data=NAME"):
+    for each in ("input: str (not set)  A file.", "inner.factor: float = 1.0  How much.", "mode: a|b = a", "data=NAME"):
         assert each in out
     _, out, _ = echo("data=synthetic_tiny", "--help")
     assert "data.workers: int" in out
+
+
+def test_help_shows_the_values_that_a_command_has(capsys: pytest.CaptureFixture[str]) -> None:
+    app.main(["train", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    for each in ("trainer.max_epochs: Optional[int] = 80", "trainer.log_every_n_steps: Optional[int] = 10"):
+        assert each in said  # of our YAML files; Lightning's own are null
+    assert "trainer.gradient_clip_val: Union[int, float, NoneType] (as Lightning has it)" in said
+    assert "resume: str (not set)" in said
+    assert "null" not in said
+    app.main(["demo", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "trainer.max_steps: int = 150" in said
+    assert "data.height: int = 96" in said
+    assert "model=NAME (now street)" in said
 
 
 def test_the_first_word_is_a_tool(capsys: pytest.CaptureFixture[str]) -> None:

@@ -76,6 +76,14 @@ def test_every_printed_command_composes() -> None:
     assert not wrong, "\n".join(wrong)
 
 
+def test_help_and_pages_keep_each_kitti_in_one_place() -> None:
+    texts = [page.read_text(encoding="utf-8") for page in PAGES]
+    texts += [path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py")]
+    places = {place for text in texts for place in re.findall(r"[/ \"]data/kitti[\w/]*", text)}
+    known = {"data/kitti", "data/kitti/2011_09_26", "data/kitti_odometry", "data/kitti_360"}
+    assert {place[1:].rstrip("/") for place in places} == known
+
+
 def _python(page: str) -> str:
     """Return all Python blocks of a page as one program."""
     return "".join(block.text for block in blocks("python") if block.page == page)

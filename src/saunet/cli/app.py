@@ -184,13 +184,13 @@ def _run(name: str, argv: Sequence[str]) -> int:
     plugins.load(named_plugins(argv))
     table = read()
     flags, overrides = read_words(argv, tool, table)
-    if flags.help:
-        print(help_.tool_help(tool, table, choices(overrides)))
-        return 0
     from saunet.cli import compose
 
     config, given = flags.config_name or tool.config or name, [*tool.preset, *overrides]
     with compose.hydra(tool, table, flags.config_dir) as hydra:
+        if flags.help:
+            print(help_.tool_help(tool, table, *compose.effective(hydra, config, given, flags.multirun)))
+            return 0
         if flags.cfg:
             hydra.show_cfg(config, given, flags.cfg, flags.package, flags.resolve)
             return 0
@@ -371,7 +371,12 @@ class _Reader:
             return []
         key = self.tool.positional
         if not key or (len(plain) > 1 and not key.endswith("*")):
-            raise ConfigError(f"'{plain[-1]}' is not KEY=VALUE; see `saunet {self.tool.name} --help` for the keys")
+            model = key == "input" and self.table.tools[self.tool.name].key("checkpoint") is not None
+            hint = f"; if it is the model, write checkpoint={plain[-1]}" if key and model else ""
+            hint += "; several images are a folder or a pattern" if key and model else ""
+            raise ConfigError(
+                f"'{plain[-1]}' is not KEY=VALUE{hint}; see `saunet {self.tool.name} --help` for the keys"
+            )
         name = key.rstrip("*")
         if any(word.startswith(f"{name}=") for word in words):
             raise ConfigError(f"{name} is given twice, as {name}=... and as {plain[0]}; leave out one")

@@ -192,6 +192,25 @@ def single(hydra: Hydra, name: str, overrides: list[str]) -> Composed | None:
         HydraConfig.instance().cfg = None
 
 
+def effective(
+    hydra: Hydra, name: str, overrides: list[str], multirun: bool
+) -> tuple[dict[str, object], dict[str, str]]:
+    """Return the values that a command has, by dotted key and not resolved, and the choice of each config group."""
+    cfg = hydra.compose_config(name, overrides, RunMode.MULTIRUN if multirun else RunMode.RUN)
+    chosen = {str(group): str(each) for group, each in cfg.hydra.runtime.choices.items() if each is not None}
+    with open_dict(cfg):
+        del cfg["hydra"]
+    return dict(_flat(OmegaConf.to_container(cfg), "")), chosen
+
+
+def _flat(node: object, prefix: str) -> Iterator[tuple[str, object]]:
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            yield from _flat(value, f"{prefix}{key}.")
+    else:
+        yield prefix.removesuffix("."), node
+
+
 def of_job(cfg: DictConfig, hydra_cfg: DictConfig) -> Composed:
     """Return what a job of a sweep, or a single run, is to do."""
     missing = sorted(OmegaConf.missing_keys(cfg))

@@ -51,7 +51,11 @@ def _of_hydra(unread: str, text: str, table: Table | None) -> str:
         return f"unknown {listed[1]} '{name}'{suggest(name, options) or ';'} available: {', '.join(options)}"
     if ambiguous := re.search(r"Ambiguous value for argument '([^=]+)=(.*)'", text):
         key, value = ambiguous.groups()
-        return f"{key}={value} has several values; add -m to run once for each, or write a list: {key}=[{value}]"
+        sweep = f"{key}={value}: a comma means a sweep, one run for each value, and needs --multirun (-m)"
+        kinds = {table.type(tool, key).rstrip("?") for tool in table.tools} if table else set()
+        if "/" in key or kinds & {"int", "float", "bool"} or (table and key in table.groups):
+            return sweep  # one number, or one choice
+        return f"{sweep}; a list is written {key}=[{value}], and text with a comma in quotes: \"{key}='{value}'\""
     full_key = re.search(r"full_key: (\S+)", text)
     if unknown := re.search(r"Key '([\w-]+)' (?:is )?not in '(\w+)'", text):
         node = table.by_name(unknown[2]) if table else None

@@ -8,6 +8,7 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 from saunet import plugins, schema
 from saunet.cli.app import choices, is_plugins, named_plugins
@@ -44,20 +45,19 @@ complete -c saunet -f -a '(_saunet)'""",
 """Shell -> what it has to evaluate: ``eval "$(saunet --completion bash)"``."""
 
 
-def tool_help(tool: Tool, table: Table, given: Mapping[str, str]) -> str:
-    """Return the help of one tool, where the command line chooses ``given`` by group."""
+def tool_help(tool: Tool, table: Table, values: Mapping[str, object], chosen: Mapping[str, str]) -> str:
+    """Return the help of one tool, with the values that its keys have and what is chosen by group."""
     plain = f" [{tool.positional.upper().replace('*', ' ...')}]" if tool.positional else ""
     node, said = table.tools[tool.name], f"saunet {tool.name}"
     lines = [f"{said}: {tool.summary}", "", f"usage: {said}{plain} [KEY=VALUE ...]", "", "examples:"]
     lines += [f"  $ saunet {example}" for example in tool.examples]
     if tool.aliases:
         lines += ["", "short forms:", *(f"  {short}=... is {key}=..." for short, key in tool.aliases.items())]
-    lines += ["", "keys:", *described(_with_folder(node.keys, tool), "  ")]
-    chosen = chosen_names(tool, table, given)
+    lines += ["", "keys:", *described(_with_folder(node.keys, tool), "  ", values)]
     for group in groups(node):
         now = chosen.get(group)
         lines += ["", f"{group}=NAME{f' (now {now})' if now else ''}, one of: {', '.join(table.choices(group))}"]
-        lines += described(chosen_keys(group, chosen, table), f"  {group.replace('/', '.')}.")
+        lines += described(chosen_keys(group, chosen, table), f"  {group.replace('/', '.')}.", values)
     return "\n".join(
         each for line in lines for each in (textwrap.wrap(line, WIDTH, subsequent_indent=" " * 8) if line else [""])
     )
@@ -75,12 +75,18 @@ def _yaml(tool: Tool) -> str:
     return file.read_text(encoding="utf-8") if file.is_file() else ""
 
 
-def described(keys: Sequence[schema.Key], prefix: str) -> Iterator[str]:
-    """Yield a line for each key that holds a value, with what stands before its name."""
+def described(
+    keys: Sequence[schema.Key], prefix: str, values: Mapping[str, object] = MappingProxyType({})
+) -> Iterator[str]:
+    """Yield a line for each key that holds a value, with what stands before its name; ``values`` go before defaults."""
     for name, key in leaves(keys, prefix):
         if key.name not in PARTS:
             shown = "|".join(map(str, key.choices)) if key.choices else key.annotation.replace(" | None", "")
-            default = " (required)" if key.default == schema.REQUIRED else f" = {written(key.default)}"
+            value = values.get(name.strip(), key.default)
+            value = key.default if "${" in str(value) else value  # it follows another key
+            default = " (required)" if value == schema.REQUIRED else f" = {written(value)}"
+            if value is None:
+                default = " (as Lightning has it)" if name.strip().startswith(f"{TRAINER[0]}.") else " (not set)"
             yield f"{name}: {shown}{default}{f'  {key.help}' if key.help else ''}"
 
 

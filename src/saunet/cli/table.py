@@ -26,7 +26,7 @@ from saunet.registry import REGISTRIES, Entry
 
 _TEXT = """\
 train: train a depth network on driving video
-    train experiment=selfsup data=kitti data.root=/data/kitti/raw
+    train experiment=selfsup data=kitti data.root=/data/kitti
     train experiment=smoke model/encoder=resnet18 epochs=2 lr=2e-4
     train -m sweep=loss_ablation experiment=smoke
     resume outputs/train/2026-01-31_12-00-00
@@ -37,10 +37,10 @@ app checkpoints*: a page in the browser: drop a picture or a video, see its dept
     app
     app last.ckpt port=8000
 evaluate checkpoint: score a checkpoint, or predictions made elsewhere
-    evaluate last.ckpt data=kitti data.root=/data/kitti/raw
+    evaluate last.ckpt data=kitti data.root=/data/kitti
     evaluate predictions=maps data=kitti
 odometry checkpoint: the camera's path through whole sequences, with its errors
-    odometry last.ckpt data.root=/data/kitti/odometry
+    odometry last.ckpt data.root=/data/kitti_odometry
 export checkpoint: write a checkpoint as files to deploy or share, each checked against the network
     export last.ckpt output=exported
 report runs*: one page of tables, curves and pictures from finished runs; how runs differ
@@ -52,13 +52,13 @@ benchmark: parameters, FLOPs, time and memory of networks
     benchmark models=[sau_net,street]
     benchmark model/encoder=resnet18 sizes=192x640,320x1024
 doctor: look at a data set before hours of training
-    doctor data=kitti data.root=/data/kitti/raw
+    doctor data=kitti data.root=/data/kitti
 calibrate input: make camera.yaml from a video or pictures of a board
     calibrate print_board=board.png
     calibrate board.mp4 columns=10 rows=7 square=0.025
     calibrate video=drive.mp4
 prepare job: do once before training: dense depth, a teacher's depth, small images, clips of bags and GoPros, a pack
-    prepare densify root=/data/kitti/raw
+    prepare densify root=/data/kitti
     prepare import input=drive.bag folder=clips
 components: list every registered component with its keys
     components encoder

@@ -26,7 +26,7 @@ class PresentDataModule(DepthDataModule):
 
     Args:
         root: Folder of the data sets; None looks at ``roots`` alone.
-        roots: Data sets that are elsewhere, name -> root, such as ``{kitti: /data/kitti/raw}``.
+        roots: Data sets that are elsewhere, name -> root, such as ``{kitti: /data/kitti}``.
         sets: Names of the data sets to look for; all that are registered if empty.
         settings: Settings of single data sets, such as ``{kitti: {test_split: eigen_benchmark_test}}``.
         **loading: Loader settings, as in `LoadOptions`, for all of them.

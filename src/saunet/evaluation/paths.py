@@ -253,7 +253,7 @@ class OdometryOptions:
         ConfigError: if an option cannot work.
 
     Examples:
-        >>> data = saunet.Spec.of("data", "kitti_odometry", root="/data/kitti/odometry")
+        >>> data = saunet.Spec.of("data", "kitti_odometry", root="/data/kitti_odometry")
         >>> saunet.OdometryOptions(checkpoint="best.ckpt", data=data).snippet
         5
     """

@@ -134,7 +134,7 @@ def inspect(data: str | Path | Spec, *, frames: int = 200, **settings: Any) -> D
     Args:
         data: A folder of clips or a video, a data module's name (one of ``available("data")``), or its `Spec`.
         frames: Frames to read at most, evenly spread; 0 reads all.
-        **settings: Parameters of the data module, such as ``root="/data/kitti/raw"``.
+        **settings: Parameters of the data module, such as ``root="/data/kitti"``.
 
     Returns:
         The findings; a notebook shows them with pictures.

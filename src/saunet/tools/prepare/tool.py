@@ -47,7 +47,7 @@ class PrepareOptions:
         ConfigError: for a wrong value, or an option that the job does not have.
 
     Examples:
-        >>> options = saunet.PrepareOptions(job="densify", root="/data/kitti/raw", kinds=["linear"])
+        >>> options = saunet.PrepareOptions(job="densify", root="/data/kitti", kinds=["linear"])
         >>> options.cameras
         ('left', 'right')
     """
