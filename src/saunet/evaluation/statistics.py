@@ -103,10 +103,11 @@ def with_statistics(
     if earlier is not None:
         who = earlier[0].predictor if earlier else ""
         names = (f"{who} of {source}", result.predictors[0])
+        everything: Sequence[ImageRow | ViewRow] = (*result.rows, *result.views)
         for rules in result.protocols:
             rows = [row for row in earlier if (row.predictor, row.protocol) == (who, rules.name)]
             mine = (result.predictors[0], rules.name)
-            now = [row for row in (*result.rows, *result.views) if (row.predictor, row.protocol) == mine]
+            now = [row for row in everything if (row.predictor, row.protocol) == mine]
             if rows and now:
                 comparisons.append(compare(rows, now, names=names, level=level or 0.95))
         if not comparisons:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -60,9 +61,10 @@ class DepthNet(nn.Module):
                     f"the encoder {type(encoder).__name__} has no attribute '{needed}'; set it in __init__ "
                     "(docs/add_encoder.md)"
                 )
-        if not all(isinstance(each, FeatureSpec) for each in encoder.features):  # type: ignore[union-attr]
+        announced: Any = encoder.features
+        if not all(isinstance(each, FeatureSpec) for each in announced):
             raise ConfigError(
-                f"'features' of the encoder {type(encoder).__name__} is {encoder.features!r}; it needs a "
+                f"'features' of the encoder {type(encoder).__name__} is {announced!r}; it needs a "
                 "FeatureSpec(channels, stride) for each map that it returns (docs/add_encoder.md)"
             )
         self.encoder = encoder
