@@ -50,6 +50,7 @@ ALLOWED: dict[str, set[str]] = {
     },
     "prediction": {
         "errors",
+        "registry",
         "lazy",
         "types",
         "io",
