@@ -205,8 +205,8 @@ def build(
 
 
 _READING = (
-    "Disparity, bright where it is near; each picture has its own range of colors, for the scale of a model means "
-    "nothing. Boxes lie where the models see depth jump on edges of the image, the same ones for all models."
+    "Disparity, bright where it is near; each picture has its own range of colors, since the scale of a model is "
+    "arbitrary. Boxes mark where the models see depth jump at edges of the image; they are the same for all models."
 )
 
 

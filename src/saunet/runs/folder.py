@@ -412,7 +412,7 @@ def _state(folder: Path, record: Mapping[str, Any]) -> tuple[Status, str | None]
         return "unknown", None
     if _alive(folder, record):
         return "running", None
-    return "unfinished", f"it was never ended: {_LOST}"
+    return "unfinished", f"it did not end normally: {_LOST}"
 
 
 def alive_elsewhere(folder: Path) -> bool:
