@@ -75,6 +75,16 @@ def test_frozen_parts_stay_as_they_are_statistics_included(tmp_path: Path) -> No
     assert changed == {"depth.decoder.weight", "depth.decoder.bias", "pose.layer.weight", "pose.layer.bias"}
 
 
+def test_fixed_statistics_stay_while_the_weights_around_them_learn(tmp_path: Path) -> None:
+    model = tiny.tiny_model(Recipe(lr=1e-2, freeze_statistics=["depth"]))
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    tiny.tiny_trainer(tmp_path, max_epochs=1, limit_val_batches=0).fit(model, tiny.tiny_walls())
+    changed = {name for name, value in model.state_dict().items() if not torch.equal(value, before[name])}
+    statistics = {name for name in before if "running_" in name or "num_batches" in name}
+    assert len(statistics) == 3
+    assert changed == before.keys() - statistics
+
+
 def test_accumulated_batches_draw_different_noise_and_a_step_alone_draws_what_it_always_did(tmp_path: Path) -> None:
     class Draw(Callback):
         def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:

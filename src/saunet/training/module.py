@@ -212,16 +212,18 @@ class SelfSupervisedDepth(LightningModule):
             return
         self._prepared = True
         for part in self.recipe.frozen(self):
-            part.requires_grad_(False).eval()
+            part.requires_grad_(False)
+        for part in self.recipe.fixed(self):
+            part.eval()
             warnings.filterwarnings("ignore", message=r"Found \d+ module\(s\) in eval mode")  # as it is meant to be
         # A convolution of 1x1 has several right strides, and DDP copies a gradient that comes in another one.
         warnings.filterwarnings("ignore", message=r"Grad strides do not match bucket view strides")
         self.speed.apply(self)
 
     def train(self, mode: bool = True) -> SelfSupervisedDepth:
-        """Change between training and evaluation; frozen parts stay in evaluation."""
+        """Change between training and evaluation; frozen parts and statistics stay in evaluation."""
         super().train(mode)
-        for part in self.recipe.frozen(self) if mode and self._prepared else ():
+        for part in self.recipe.fixed(self) if mode and self._prepared else ():
             part.eval()
         return self
 

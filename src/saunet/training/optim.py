@@ -12,6 +12,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor, nn
 from torch.nn import Parameter
+from torch.nn.modules.batchnorm import _BatchNorm
 from torch.optim.lr_scheduler import LRScheduler
 
 from saunet.errors import ConfigError, in_range, one_of, positive, suggest
@@ -38,6 +39,7 @@ class Recipe:
         encoder_lr: Learning rate of the depth encoder, which often starts from public weights; ``lr`` if None.
         freeze: Parts that are not trained, by name: ``depth.encoder``, ``pose``, ``depth.encoder.stages.0``. Their
             normalization statistics stay too.
+        freeze_statistics: Parts that are trained while their batch normalization keeps its running statistics, by name.
         ema: Decay of the moving average of the weights, such as 0.999; the average is what is validated and saved. 0
             keeps none.
         fused: One kernel for the whole optimizer step.
@@ -53,6 +55,7 @@ class Recipe:
     warmup: float = 0.0
     encoder_lr: float | None = None
     freeze: Sequence[str] = ()
+    freeze_statistics: Sequence[str] = ()
     ema: float = 0.0
     fused: bool = False
 
@@ -99,14 +102,13 @@ class Recipe:
 
     def frozen(self, model: nn.Module) -> list[nn.Module]:
         """Return the parts of a model that are not trained, by the names in ``freeze``."""
-        parts = dict(model.named_modules())
-        for name in self.freeze:
-            allowed = [part for part in parts if part.startswith(("depth", "pose"))]
-            if name not in allowed:
-                upper = ", ".join(part for part in allowed if part.count(".") < 2)
-                hint = suggest(name, allowed) or ","
-                raise ConfigError(f"optim.freeze is '{name}'{hint} allowed: {upper}, and parts of these by their names")
-        return [parts[name] for name in self.freeze]
+        return _parts(model, "freeze", self.freeze)
+
+    def fixed(self, model: nn.Module) -> list[nn.Module]:
+        """Return the parts that stay in evaluation: frozen ones, and batch normalization of fixed statistics."""
+        named = _parts(model, "freeze_statistics", self.freeze_statistics)
+        norms = [module for part in named for module in part.modules() if isinstance(module, _BatchNorm)]
+        return self.frozen(model) + norms
 
     def groups(self, model: nn.Module) -> list[dict[str, Any]]:
         """Return the trainable parameters of a model, the depth encoder's apart where it has a rate of its own."""
@@ -151,6 +153,17 @@ class Recipe:
         parts = [f"keeps the checkpoint's {', '.join(kept)}"] * bool(kept)
         parts += [f"uses the new {', '.join(taken)}"] * bool(taken)
         return f"the resumed run {' and '.join(parts)}; {OTHER_SETTINGS}" if parts else None
+
+
+def _parts(model: nn.Module, key: str, names: Sequence[str]) -> list[nn.Module]:
+    parts = dict(model.named_modules())
+    for name in names:
+        allowed = [part for part in parts if part.startswith(("depth", "pose"))]
+        if name not in allowed:
+            upper = ", ".join(part for part in allowed if part.count(".") < 2)
+            hint = suggest(name, allowed) or ","
+            raise ConfigError(f"optim.{key} is '{name}'{hint} allowed: {upper}, and parts of these by their names")
+    return [parts[name] for name in names]
 
 
 class RecipeSchedule(LRScheduler):
