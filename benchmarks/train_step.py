@@ -119,7 +119,7 @@ def main() -> None:
     model.to(options.device).train()
     data.augment.to(options.device)
     model.speed = Speed(compile=options.compile, checkpoint_activations=options.checkpoint_activations)
-    model.speed.apply(model)
+    model.speed.apply(model, torch.device(options.device))
     frames = random_frames(options.batch, len(data.offsets), options.device)
     fused = options.device == "cuda"
     optimizer = torch.optim.Adam(model.parameters(), 1e-4, fused=fused)

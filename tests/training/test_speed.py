@@ -18,6 +18,7 @@ from lightning import Callback, LightningModule, Trainer
 
 import saunet
 from saunet.models.depth import DepthNet
+from saunet.models.layers.conv import training_format
 from saunet.training.optim import Recipe
 from saunet.training.speed import Speed, blocks
 
@@ -68,11 +69,16 @@ def network() -> DepthNet:
     return DepthNet(saunet.build("encoder", "resnet18"), partial(saunet.build, "decoder", "unet"))
 
 
+def applied(speed: Speed, network: DepthNet, device: str = "cpu") -> None:
+    holder: Any = torch.nn.Module()
+    holder.depth, holder.pose, holder.objective = network, None, None
+    speed.apply(holder, torch.device(device))
+
+
 def test_recomputed_activations_give_the_same_gradients_and_statistics(network: DepthNet) -> None:
     twin = copy.deepcopy(network)
-    holder: Any = torch.nn.Module()
-    holder.depth, holder.pose, holder.objective = twin, None, None
-    Speed(checkpoint_activations=True).apply(holder)
+    applied(Speed(), network)
+    applied(Speed(checkpoint_activations=True), twin)
     assert len(blocks(twin.encoder)) == 8  # the residual blocks
     image = torch.rand(2, 3, 64, 96)
     for each in (network, twin):
@@ -85,6 +91,36 @@ def test_recomputed_activations_give_the_same_gradients_and_statistics(network: 
         assert torch.equal(plain, recomputed), name
     with torch.no_grad():
         torch.testing.assert_close(network(image).depth[0], twin(image).depth[0])
+
+
+@pytest.mark.parametrize(
+    ("capability", "device", "expected"),
+    [
+        ("AVX2", "cpu", torch.contiguous_format),
+        ("AVX512", "cpu", torch.channels_last),
+        ("AVX2", "cuda", torch.channels_last),
+    ],
+)
+def test_convolutions_train_in_the_memory_format_that_is_fast_there(
+    capability: str, device: str, expected: torch.memory_format, network: DepthNet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    image = torch.rand(1, 3, 64, 96)
+    before = network.eval()(image).depth[0]
+    applied(Speed(), network, device)
+    seen = []
+    for module in network.modules():
+        if isinstance(module, torch.nn.Conv2d) and module.out_channels > 1:
+            module.register_forward_hook(lambda _, inputs, output: seen.append(output.stride(1) == 1))
+    torch.testing.assert_close(network(image).depth[0], before)
+    assert set(seen) == {expected is torch.channels_last}
+    assert len(seen) > 25
+
+
+def test_pointwise_and_depthwise_convolutions_always_train_channels_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX2")
+    network = saunet.build("encoder", "efficientnet_lite0")
+    assert training_format(network, torch.device("cpu")) is torch.channels_last
 
 
 COMPILED = """

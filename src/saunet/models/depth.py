@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from saunet.errors import ConfigError, checked, divisible
 from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
-from saunet.models.layers.conv import channels_last_weights
+from saunet.models.layers.conv import lay_out
 from saunet.types import DepthPyramid, FeatureSpec
 
 torch.export.register_dataclass(DepthPyramid)  # so that a depth network can be exported with its result as it is
@@ -46,6 +46,8 @@ class DepthNet(nn.Module):
         [(64, 96), (32, 48), (16, 24), (8, 12)]
     """
 
+    memory_format = torch.channels_last
+
     def __init__(
         self, encoder: nn.Module, decoder: Callable[..., nn.Module], min_depth: float = 0.1, max_depth: float = 100.0
     ) -> None:
@@ -72,7 +74,7 @@ class DepthNet(nn.Module):
         self.features = encoder.features
         self.size_divisor = int(encoder.size_divisor)  # type: ignore[arg-type]
         self.min_depth, self.max_depth = float(min_depth), float(max_depth)
-        channels_last_weights(self)
+        lay_out(self)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> DepthPyramid:
         """Return disparity and depth at each of the decoder's scales.
@@ -90,7 +92,7 @@ class DepthNet(nn.Module):
                 "in [0, 1] of shape batch x 3 x height x width; saunet.load(...).predict takes any picture"
             )
         divisible(image.shape[-2], image.shape[-1], self.size_divisor)
-        features = self.encoder(image.contiguous(memory_format=torch.channels_last))
+        features = self.encoder(image.contiguous(memory_format=self.memory_format))
         if not torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]  # there, sizes are tensors
             self._check(features, *image.shape[-2:])
         sigmoid = tuple(self.decoder(features))

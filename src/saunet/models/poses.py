@@ -13,7 +13,7 @@ from saunet.errors import ConfigError, divisible, one_of
 from saunet.geometry.pose import pose_matrix
 from saunet.models.encoders.efficientnet_lite import EfficientNetLite
 from saunet.models.encoders.resnet import Normalization, ResNet
-from saunet.models.layers.conv import channels_last_weights
+from saunet.models.layers.conv import lay_out
 from saunet.registry import poses
 
 MOTION_SCALE = 0.01
@@ -22,6 +22,8 @@ MOTION_SCALE = 0.01
 
 class PoseNetwork(nn.Module):
     """What pose networks share: which motion to predict, and the step from numbers to matrices."""
+
+    memory_format = torch.channels_last
 
     def __init__(self, offsets: Sequence[int]) -> None:
         super().__init__()
@@ -53,7 +55,7 @@ class PoseNetwork(nn.Module):
         for index, offset in enumerate(self.offsets):
             source = sources[:, index]
             pairs.append(torch.cat([source, target] if offset < 0 else [target, source], 1))
-        return torch.cat(pairs).contiguous(memory_format=torch.channels_last)
+        return torch.cat(pairs).contiguous(memory_format=self.memory_format)
 
 
 def motions_to_sources(motion: Float[Tensor, "s b 6"], offsets: Sequence[int]) -> Float[Tensor, "b s 4 4"]:
@@ -86,7 +88,7 @@ class StackedPose(PoseNetwork):
         triplet = input == "triplet"
         self.encoder = encoder(3 if triplet else 2)
         self.head = PoseHead(self.encoder.features[-1].channels, motions=2 if triplet else 1)
-        channels_last_weights(self)
+        lay_out(self)
 
     def motions(self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b s 3 h w"]) -> Float[Tensor, "s b 6"]:
         divisible(target.shape[-2], target.shape[-1], self.encoder.size_divisor)
@@ -94,7 +96,7 @@ class StackedPose(PoseNetwork):
             motion = self.head(self.encoder(self.pairs(target, sources))[-1])
             return motion.reshape(len(self.offsets), target.shape[0], 6)  # type: ignore[no-any-return]
         by_time = sorted([(0, target), *zip(self.offsets, sources.unbind(1), strict=True)], key=lambda frame: frame[0])
-        frames = torch.cat([image for _, image in by_time], 1).contiguous(memory_format=torch.channels_last)
+        frames = torch.cat([image for _, image in by_time], 1).contiguous(memory_format=self.memory_format)
         motion = self.head(self.encoder(frames)[-1]).transpose(0, 1)
         # the head's outputs are in the order of time, the sources need not be
         return motion if self.offsets[0] < self.offsets[1] else motion.flip(0)  # type: ignore[no-any-return]
@@ -201,7 +203,7 @@ class PoseCNN(PoseNetwork):
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(module.bias)  # type: ignore[arg-type]
-        channels_last_weights(self)
+        lay_out(self)
 
     def motions(self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b s 3 h w"]) -> Float[Tensor, "s b 6"]:
         motion = self.project(self.layers((self.pairs(target, sources) - 0.45) / 0.225)).mean((2, 3))

@@ -218,7 +218,7 @@ class SelfSupervisedDepth(LightningModule):
             warnings.filterwarnings("ignore", message=r"Found \d+ module\(s\) in eval mode")  # as it is meant to be
         # A convolution of 1x1 has several right strides, and DDP copies a gradient that comes in another one.
         warnings.filterwarnings("ignore", message=r"Grad strides do not match bucket view strides")
-        self.speed.apply(self)
+        self.speed.apply(self, self.trainer.strategy.root_device)
 
     def train(self, mode: bool = True) -> SelfSupervisedDepth:
         """Change between training and evaluation; frozen parts and statistics stay in evaluation."""

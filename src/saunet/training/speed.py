@@ -2,7 +2,7 @@
 
 Mixed precision, gradient accumulation and the number of devices are the trainer's (``trainer.precision``,
 ``trainer.accumulate_grad_batches``, ``trainer.devices``), the fused optimizer is the recipe's (``optim.fused``), and
-convolutions always run channels-last.
+the memory format of convolutions goes by the device.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.utils.checkpoint import checkpoint
 
+from saunet.models.layers.conv import lay_out, training_format
+
 
 @dataclass(frozen=True)
 class Speed:
@@ -32,9 +34,11 @@ class Speed:
     compile: bool = False
     checkpoint_activations: bool = False
 
-    def apply(self, model: Any) -> None:
-        """Switch on what is wanted in a `SelfSupervisedDepth`, in place; names of weights stay as they are."""
+    def apply(self, model: Any, device: torch.device) -> None:
+        """Prepare a `SelfSupervisedDepth` to train on a device, in place; names of weights stay as they are."""
         parts: list[nn.Module] = [part for part in (model.depth, model.pose) if isinstance(part, nn.Module)]
+        for part in parts:
+            lay_out(part, training_format(part, device))
         if self.checkpoint_activations:
             for part in parts:
                 for block in blocks(part):

@@ -93,8 +93,28 @@ def sum_of(fresh: Float[Tensor, "b c h w"], x: Float[Tensor, "b c h w"]) -> Floa
     return fresh.add_(x)
 
 
-def channels_last_weights(network: nn.Module) -> None:
-    """Store the weights of 2-D convolutions in channels-last order, so that no forward pass has to reorder them."""
+def lay_out(network: nn.Module, memory_format: torch.memory_format = torch.channels_last) -> None:
+    """Store the weights of 2-D convolutions in a memory format, so that no forward pass has to reorder them.
+
+    The network gives its input the same format, ``network.memory_format``.
+    """
+    network.memory_format = memory_format  # type: ignore[assignment]
     for parameter in network.parameters():
         if parameter.ndim == 4:  # 3-D convolutions have another format of that kind, which gains nothing here
-            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+            # a 1x1 kernel counts as contiguous in either format, and its strides still choose that of the output
+            parameter.data = torch.empty_like(parameter, memory_format=memory_format).copy_(parameter.data)
+
+
+def training_format(network: nn.Module, device: torch.device) -> torch.memory_format:
+    """Return the memory format in which a network's convolutions train fastest on a device.
+
+    Without AVX-512 oneDNN (torch 2.13) has no fast gradient of dense kernels for channels-last maps: that of a 3x3
+    convolution of 64 channels takes 1.8 times as long as for contiguous maps, ResNet-18's whole step 1.28 times.
+    Pointwise and depthwise convolutions are faster channels-last all the same (EfficientNet-Lite0's step: 0.8).
+    """
+    if device.type != "cpu" or torch.backends.cpu.get_cpu_capability() != "AVX2":
+        return torch.channels_last
+    convolutions = [module for module in network.modules() if isinstance(module, nn.Conv2d)]
+    dense = [each for each in convolutions if each.groups == 1 and max(each.kernel_size) > 1]
+    mostly = sum(each.weight.numel() for each in dense) > 0.5 * sum(each.weight.numel() for each in convolutions)
+    return torch.contiguous_format if mostly else torch.channels_last
