@@ -124,7 +124,7 @@ def _sizes(first: Run, other: Run, scored: Scored) -> list[str]:
     if sizes[0] == sizes[1] or not isinstance(scored.rows[0], ViewRow):
         return []
     return [
-        f"the runs see images of other sizes, {sizes[0]} and {sizes[1]}, so these errors are not of the same pixels"
+        f"the runs see images of different sizes, {sizes[0]} and {sizes[1]}, so these errors are not of the same pixels"
     ]
 
 
