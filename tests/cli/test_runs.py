@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -233,3 +234,24 @@ def test_sigterm_ends_a_run_with_a_message_and_a_record(tmp_path: Path) -> None:
         assert f"resume with saunet resume {tmp_path}/r" in err
         assert record(tmp_path / "r")["status"] == "interrupted"
         assert ("resuming from" in heard + out) == (attempt == 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [0.0, 1.0])
+def test_sigterm_to_the_whole_group_before_the_first_step_is_an_interruption(delay: float, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "saunet", "train", *QUICK, "data.workers=2", f"output_dir={tmp_path}/r"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    said, file = tmp_path / "said", tmp_path / "r" / "run.json"
+    command += ["trainer.max_epochs=500", "trainer.limit_val_batches=0"]
+    with (
+        said.open("w") as stream,
+        subprocess.Popen(command, stdout=stream, stderr=stream, env=environment, start_new_session=True) as run,
+    ):
+        while not file.exists():  # it is written before the loader's processes start
+            assert run.poll() is None, said.read_text()
+            time.sleep(0.02)
+        time.sleep(delay)
+        os.killpg(run.pid, signal.SIGTERM)
+    assert run.returncode == 143, said.read_text()
+    assert "Traceback" not in said.read_text()
+    assert record(tmp_path / "r")["status"] == "interrupted"
