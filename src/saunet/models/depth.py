@@ -71,7 +71,7 @@ class DepthNet(nn.Module):
             )
         self.encoder = encoder
         self.decoder = decoder(features=encoder.features)
-        self.features = encoder.features
+        self.features: Any = announced
         self.size_divisor = int(encoder.size_divisor)  # type: ignore[arg-type]
         self.min_depth, self.max_depth = float(min_depth), float(max_depth)
         lay_out(self)
