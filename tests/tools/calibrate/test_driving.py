@@ -23,7 +23,7 @@ from saunet.tools.doctor.survey import survey
 SIZE = (188, 620)  # height, width
 
 
-def made(focal: float, degrees: float, seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def made(focal: float, degrees: float, seed: int = 0, k1: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Points seen from a car that turns by so many degrees a frame; 0.2 px of noise, and a tenth of them move."""
     rng = np.random.default_rng(seed)
     height, width = SIZE
@@ -37,7 +37,8 @@ def made(focal: float, degrees: float, seed: int = 0) -> tuple[NDArray[np.float6
     back[:3, :3], back[2, 3] = turn(np.radians(degrees)), 0.8  # the camera a frame earlier is behind
     for _ in range(WINDOW):
         seen = points @ T[:3, :3].T + T[:3, 3]
-        pixels.append(f * seen[:, :2] / seen[:, 2:] + center)
+        flat = seen[:, :2] / seen[:, 2:]
+        pixels.append(f * flat * (1 + k1 * (flat**2).sum(1, keepdims=True)) + center)
         T = back @ T
     found = np.stack(pixels, axis=1) + rng.normal(0, 0.2, (300, WINDOW, 2))
     found[:30] += np.arange(WINDOW)[None, :, None] * rng.normal(0, 1.5, (30, 1, 2))  # other cars
@@ -54,6 +55,16 @@ def test_turns_tell_the_focal_length_and_straights_say_that_they_do_not(focal: f
     assert 0.1 < curve.error < 0.4
     straight = solve_window(*made(focal, 0.0), SIZE)
     assert straight is None or straight.uncertainty > 0.03
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_distortion_makes_the_focal_length_wrong(seed: int) -> None:
+    """The limit that calibrate names with each result: a common k1 goes into the focal length, not the residuals."""
+    bent = solve_window(*made(0.58, 2.0, seed, k1=-0.1), SIZE)
+    assert bent is not None
+    assert bent.focal > 1.15 * 0.58
+    assert bent.uncertainty < 0.03
+    assert bent.error < 0.4
 
 
 def test_windows_are_weighted_and_a_wrong_one_is_left_out() -> None:
@@ -91,6 +102,7 @@ def test_rendered_turns(seed: int, focal: float, tmp_path: Path) -> None:
     said = calibrate(CalibrateOptions(video=str(tmp_path / "clips" / "a"), output=str(output)))
     found = read_camera(output).K[0, 0] / 480
     print(said, f"true {focal * 480:.1f}")
+    assert "no distortion" in str(said)
     assert found == pytest.approx(focal, rel=0.03)
     (tmp_path / "clips" / "camera.yaml").write_text("camera: unknown\nfps: 10\n")
     data = saunet.build(

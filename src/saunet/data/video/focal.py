@@ -34,6 +34,8 @@ WIDTH = 620
 """Pictures are made this narrow."""
 KNOWN = 0.015
 """Relative standard deviation up to which a focal length counts as known."""
+ASSUMED = "assumed: the center in the middle, and no distortion, which would make the focal length wrong"
+"""What is to be said with each estimate."""
 _START = 0.8
 """Focal length to start from, in picture widths."""
 _SYSTEMATIC = 0.003

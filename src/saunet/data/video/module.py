@@ -36,7 +36,7 @@ from saunet.data.video.clips import (
     read_clip,
     short_hash,
 )
-from saunet.data.video.focal import WINDOW, FocalEstimate, drive_windows, estimate_focal, refusal
+from saunet.data.video.focal import ASSUMED, WINDOW, FocalEstimate, drive_windows, estimate_focal, refusal
 from saunet.data.video.motion import Motion, cuts, even_steps, measure, motion_key
 from saunet.errors import ConfigError, DataError, UnreadableError, in_range, one_of, positive
 from saunet.io.alignment import align_speeds
@@ -392,8 +392,7 @@ class VideoDataModule(DepthDataModule):
             view = math.degrees(2 * math.atan(width / 2 / focal))
             rank_zero_info(
                 f"focal length of {what}: {focal:.1f} px of {width} ({view:.0f} degrees), known to "
-                f"{found.uncertainty:.2%} from {found.windows} windows of {WINDOW} frames; the center and a straight "
-                "lens are assumed"
+                f"{found.uncertainty:.2%} from {found.windows} windows of {WINDOW} frames; {ASSUMED}"
             )
             K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
             for drive in several:

@@ -156,7 +156,8 @@ def _camera(camera: CameraFacts) -> Iterator[Finding]:
             f"{told} contradicts the pictures: turns in them say a focal length of {found.focal * width:.0f}, known to "
             f"{found.uncertainty:.1%}"
         )
-        yield Finding("error", text, "calibrate with saunet calibrate, or give the K of this camera and this mode")
+        fix = "calibrate with a board (saunet calibrate), or give the K and the distortion of this camera and this mode"
+        yield Finding("error", text, fix)
     if not (0.35 < (cx + 0.5) / width < 0.65 and 0.2 < (cy + 0.5) / height < 0.8):
         text = f"{told}: the center is far from the middle of the image"
         yield Finding("warning", text, "is K that of uncropped or differently sized images?")
