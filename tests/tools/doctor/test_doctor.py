@@ -48,7 +48,7 @@ def test_a_good_clip_is_described_and_drawn(tmp_path):
     found, findings, text = look(campus(tmp_path / "r"))
     assert "error" not in text
     assert re.search(r"motion between frames 1 apart: median (4\.9|5\.\d) px", text)
-    assert "(recorded at 10.0 frames a second)" in text
+    assert "(recorded at 10.0 frames per second)" in text
     assert "camera height 1.4 m" in text
     assert "horizontal field of view 65 degrees" in text
     assert "no ground-truth depth" in text
@@ -164,7 +164,7 @@ def test_frame_rate_and_camera_height_of_kitti_are_told(tmp_path):
     mixture = datamodules.build("mixed", sources={"town": kitti(tmp_path / "raw")}, height=10, width=30, workers=0)
     for data, rate in ((kitti(tmp_path / "raw"), "9.64"), (odometry, "5.0"), (mixture, "9.64")):
         text = look(data)[2]
-        assert f"(recorded at {rate} frames a second)" in text
+        assert f"(recorded at {rate} frames per second)" in text
         assert "camera height 1.65 m: depth can be made metric" in text
 
 
@@ -258,7 +258,7 @@ def test_reading_a_cache_is_measured_by_its_files_and_offered_where_there_is_one
         found = survey(data)
         found.frames = [replace(frame, seconds=0.1) for frame in found.frames]
         text = "\n".join(map(str, diagnose(found)))
-        assert "a core reads 10 images a second" in text
+        assert "a core reads 10 images per second" in text
         assert ("make a cache of small images once" in text) == offered
 
 
@@ -318,7 +318,7 @@ def test_gaps_duplicates_and_rates_are_told_and_drawn_as_a_timeline(tmp_path):
     assert lines["even"].times == pytest.approx(np.arange(10) / 10)
     assert (lines["even"].gaps, lines["even"].duplicates, lines["unknown"].times.size) == ((), (), 0)
     assert "2 gaps in time in 1 of 3 recordings, the longest 2.10 s long, after 1.90 s of 'uneven'" in text
-    assert "rate varies in 1 of 3 recordings, such as 'uneven' (10 to 20 frames a second)" in text
+    assert "rate varies in 1 of 3 recordings, such as 'uneven' (10 to 20 frames per second)" in text
     assert "no times in 1 of 3 recordings, such as 'unknown'; give fps" in text
     sheet = draw_sheet(found, findings, "title")
     drawn = draw_sheet(replace(found, timelines=[]), findings, "title")

@@ -35,8 +35,11 @@ footer { display: none !important; }
 #hint, .or { color: var(--body-text-color-subdued) !important; }
 :focus-visible { outline: 2px solid #4c8dff !important; outline-offset: 1px; }
 #depth { container-type: inline-size; }
-#depth iframe { height: calc(50cqw * var(--ratio) + 110px) !important; }
-@container (max-width: 680px) { #depth iframe { height: calc(200cqw * var(--ratio) + 170px) !important; } }
+/* Below 680px the two pictures are one above the other. */
+#depth iframe {
+  --more: clamp(0px, (680px - 100cqw) * 99, 150cqw * var(--ratio) + 60px);
+  height: calc(50cqw * var(--ratio) + 110px + var(--more)) !important;
+}
 """
 SCRIPT = """<script>
 // Gradio leaves some of its own parts without a name that a screen reader could say.

@@ -130,7 +130,8 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
         yield Finding("note", text)
     elif survey.cameras:
         yield Finding(
-            "note", "K was not checked: no drive looked at turns enough; is this your camera's field of view?"
+            "note",
+            "K was not checked: none of the drives looked at turns enough; is this your camera's field of view?",
         )
     if cameras > looked:
         text = f"turns were looked for in the drives of {looked} of {cameras} different K"
@@ -193,7 +194,7 @@ def _parallax(survey: Survey) -> Iterator[Finding]:
         return
     low, middle, high = np.quantile(flows, [0.05, 0.5, 0.95])
     rates = sorted({round(camera.fps, 2) for camera in survey.cameras if camera.fps})
-    rate = f" (recorded at {', '.join(map(str, rates))} frames a second)" if rates else ""
+    rate = f" (recorded at {', '.join(map(str, rates))} frames per second)" if rates else ""
     yield Finding(
         "note",
         f"motion between frames {survey.step} apart: median {middle:.1f} px at 320 px width, 5 to 95 % of moving "
@@ -205,7 +206,7 @@ def _parallax(survey: Survey) -> Iterator[Finding]:
         yield Finding("warning", text, f"use data.offsets=[-{wider},{wider}] or a lower frame rate")
     elif middle > 25:
         text = f"the picture moves by {middle:.0f} px a step, so that neighbors hardly overlap"
-        yield Finding("warning", text, "use more frames a second or smaller data.offsets")
+        yield Finding("warning", text, "use more frames per second or smaller data.offsets")
 
 
 def _times(survey: Survey) -> Iterator[Finding]:
@@ -226,7 +227,7 @@ def _times(survey: Survey) -> Iterator[Finding]:
         line, (low, _, high) = uneven[0]
         text = f"the frame rate varies in {len(uneven)} of {len(lines)} recordings, such as '{line.drive}'"
         fix = "data.fps (video) takes frames at equal steps of time"
-        yield Finding("note", f"{text} ({low:.3g} to {high:.3g} frames a second)", fix)
+        yield Finding("note", f"{text} ({low:.3g} to {high:.3g} frames per second)", fix)
     unknown = [line.drive for line in lines if not line.times.size]
     if unknown and len(unknown) < len(lines):
         text = f"frames have no times in {len(unknown)} of {len(lines)} recordings, such as '{unknown[0]}'"
@@ -325,7 +326,7 @@ def _speed(survey: Survey) -> Iterator[Finding]:
     yield Finding("note", text)
     if seconds > 0.05:
         cache = "make a cache of small images once (saunet prepare cache), " if survey.cacheable else ""
-        text = f"a core reads {1 / seconds:.0f} images a second; a training step of 12 samples needs 36"
+        text = f"a core reads {1 / seconds:.0f} images per second; a training step of 12 samples needs 36"
         yield Finding("warning", text, f"{cache}use more data.workers or a faster disk")
 
 

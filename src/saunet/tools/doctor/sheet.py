@@ -137,7 +137,7 @@ def _timelines(survey: Survey) -> list[_Picture]:
         return []
     shown, rest = lines[:_TIMELINES], len(lines) - _TIMELINES
     more = f"; {rest} more recordings, with fewer of both, are not drawn" if rest > 0 else ""
-    head = f"timelines: height is the frame rate, red are gaps, orange ticks duplicates{more}"
+    head = f"timelines: bar height is the frame rate, gaps are red, duplicates are orange{more}"
     return [np.concatenate([_text(head, WIDTH, 0.45, _INK), *map(_timeline, shown)])]
 
 
@@ -148,7 +148,7 @@ def _timeline(line: Timeline) -> _Picture:
     facts = [
         name if len(name) < 34 else f"...{name[-30:]}",
         f"{line.frames} frames in {line.times[-1]:.1f} s",
-        f"{rates[1]:.3g}{recorded} a second",
+        f"{rates[1]:.3g}{recorded} per second",
         *([f"{len(line.gaps)} gaps"] if line.gaps else []),
         *([f"{len(line.duplicates)} duplicates"] if line.duplicates else []),
     ]

@@ -119,7 +119,7 @@ def doctor(options: DoctorOptions, *, advance: Callable[[int, int], None] | None
         found = survey(data, options.splits, options.frames, progress)
     findings = diagnose(found)
     manifest = manifest_of(found, findings, (folder or Path()) / "manifest.json")
-    title = f"saunet doctor: {type(data).__name__}{f' at {data.root}' if data.root else ''}"
+    title = f"saunet doctor: {data.root or type(data).__name__.removesuffix('DataModule').lower()}"
     picture = draw_sheet(found, findings, title)
     if folder is None:
         return Diagnosis(found, findings, manifest, picture)
