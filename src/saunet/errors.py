@@ -31,8 +31,12 @@ ELSEWHERE = {
     "model": "checkpoint",
     "weights": "checkpoint",
     "format": "formats",
+    "steps": "max_steps",
+    "batch": "batch_size",
+    "video": "mp4",
+    "image": "color",
 }
-"""What other tools call a setting -> what it is called here."""
+"""What other tools call a setting or an output -> what it is called here."""
 
 if TYPE_CHECKING:
     import torch

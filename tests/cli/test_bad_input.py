@@ -54,6 +54,7 @@ KITTI = (
         ("trainer.gpus=1", ("unknown key 'trainer.gpus'", "did you mean 'devices'?")),
         ("optim.learning_rate=1e-4", ("unknown key 'optim.learning_rate'", "did you mean 'lr'?")),
         ("max_epochs=3", ("unknown key 'max_epochs'", "did you mean 'trainer.max_epochs'?")),
+        ("steps=10", ("unknown key 'steps'", "did you mean 'trainer.max_steps'?")),
         ("learning_rate=1e-4", ("unknown key 'learning_rate'", "did you mean 'lr'?")),
         ("imgsz=640", ("unknown key 'imgsz'", "did you mean 'size'?")),
         ("size=192", ("size is '192'", "size=192x640")),

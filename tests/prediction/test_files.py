@@ -19,6 +19,7 @@ from saunet.prediction.pointcloud import Camera
 from saunet.prediction.predictor import Predictor
 from saunet.prediction.sinks import MANIFEST
 from saunet.prediction.sources import find_sources
+from saunet.prediction.tool import PredictOptions
 
 
 def names(folder: Path) -> list[str]:
@@ -240,6 +241,13 @@ class TestRefused:
         with pytest.raises(ConfigError, match=r"a\.png is a file"):
             run(predictor, folder, folder / "a.png")
 
+    @pytest.mark.parametrize(("name", "kind"), [("depth.mp4", "mp4"), ("depth.PNG", "color"), ("depth.npy", "npy")])
+    def test_output_that_is_named_like_a_file(self, tmp_path: Path, name: str, kind: str) -> None:
+        with pytest.raises(ConfigError, match=rf"names the folder .* output=\S+depth outputs=\[{kind}\]"):
+            PredictOptions(input="in.mp4", output=tmp_path / name)
+        (tmp_path / name).mkdir()
+        PredictOptions(input="in.mp4", output=tmp_path / name)
+
     def test_inputs(self, predictor: Predictor, tmp_path: Path) -> None:
         (tmp_path / "empty").mkdir()
         for given, message in [
@@ -260,6 +268,9 @@ class TestRefused:
     def test_outputs_and_colormap(self, predictor: Predictor, folder: Path, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="outputs is 'colour'; did you mean 'color'"):
             run(predictor, folder, tmp_path / "out", ["colour"])
+        for said, meant in (("video", "mp4"), ("image", "color"), ("png", "png16")):
+            with pytest.raises(ConfigError, match=f"outputs is '{said}'; did you mean '{meant}'"):
+                run(predictor, folder, tmp_path / "out", [said])
         with pytest.raises(ConfigError, match="outputs is empty"):
             run(predictor, folder, tmp_path / "out", [])
         with pytest.raises(ConfigError, match="colormap is 'jet'"):

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from saunet.errors import ConfigError, DataError, checked, one_of, positive, usable_device
 from saunet.io.atomic import remove_partial_files
 from saunet.io.colormaps import COLORMAPS, RunningRange
-from saunet.io.video import CODECS
+from saunet.io.images import IMAGE_SUFFIXES
+from saunet.io.video import CODECS, VIDEO_SUFFIXES
 from saunet.prediction import sinks
 from saunet.prediction.foreign import NOTHING, ForeignOptions
 from saunet.prediction.pointcloud import Camera
@@ -111,6 +112,14 @@ class PredictOptions:
                 one_of("outputs", output, known)
             if not self.outputs:
                 raise ConfigError(f"outputs is empty; allowed: {', '.join(known)}")
+        output, kinds = Path(self.output), ("npy", "ply", "html", "rrd")
+        suffix = output.suffix.lower()
+        if suffix in {*VIDEO_SUFFIXES, *IMAGE_SUFFIXES, *(f".{kind}" for kind in kinds)} and not output.exists():
+            kind = "mp4" if suffix in VIDEO_SUFFIXES else suffix[1:] if suffix[1:] in kinds else "color"
+            raise ConfigError(
+                f"output is '{output}', which ends like a file, and it names the folder of the results; "
+                f"set output={output.with_suffix('')} outputs=[{kind}]"
+            )
         one_of("colormap", self.colormap, COLORMAPS)
         one_of("layout", self.layout, LAYOUTS)
         one_of("codec", self.codec, CODECS)
