@@ -300,6 +300,23 @@ def test_completion(echo: Said, capsys: pytest.CaptureFixture[str]) -> None:
     )
 
 
+@pytest.mark.parametrize("words", [["--help"], ["components"], ["doctor", "--help"]])
+def test_a_reader_that_has_seen_enough_ends_a_tool_quietly(words: list[str]) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-m", "saunet", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
+        assert run.stdout is not None
+        run.stdout.close()  # as `| head -0`
+        _, said = run.communicate()
+    assert (run.returncode, said) == (141, "")
+
+
+def test_a_key_of_the_data_is_suggested_by_its_short_name(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        app.main(["doctor", "batch=2"])
+    assert "did you mean 'data.batch_size'?" in capsys.readouterr().err
+
+
 def test_resume_is_listed_and_has_help(capsys: pytest.CaptureFixture[str]) -> None:
     app.main(["--help"])
     assert "$ saunet resume outputs/" in capsys.readouterr().out

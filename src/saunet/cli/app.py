@@ -78,7 +78,26 @@ class Costed(Protocol):
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Entry point of ``saunet``."""
+    """Entry point of ``saunet``; ends quietly when nobody reads what it prints any more, as after ``| head``."""
+    try:
+        _main(argv)
+        if sys.stdout is not None:  # without a console there is none
+            sys.stdout.flush()
+    except BrokenPipeError:
+        _end_if_unread()
+        raise
+
+
+def _end_if_unread() -> None:
+    """End, where the reader of what is printed has gone, as a program does that SIGPIPE ends."""
+    try:
+        print(flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is buffered goes nowhere
+        raise SystemExit(128 + 13) from None
+
+
+def _main(argv: Sequence[str] | None) -> None:
     given = list(sys.argv[1:] if argv is None else argv)
     tool, *rest = given or ["--help"]
     if tool in ("-h", "--help", "help"):
@@ -120,6 +139,8 @@ def run(name: str, argv: Sequence[str]) -> None:
             raise
         code = _say(name, str(stop), int(stop.code) if isinstance(stop.code, int) else 1)
     except Exception as error:
+        if isinstance(error, BrokenPipeError):
+            _end_if_unread()
         from saunet.cli.errors import sentence
 
         # A process that DDP started inherits the variable.
