@@ -32,6 +32,13 @@ def test_decoder_refuses_scales(name):
             decoders.build(name, features=features, scales=scales)
 
 
+def test_an_encoder_with_few_maps_is_named_as_the_cause_with_the_setting_that_helps():
+    features = (FeatureSpec(8, 2), FeatureSpec(8, 4), FeatureSpec(8, 8))
+    with pytest.raises(ConfigError, match=r"encoder's 3 maps end at stride 8: set model\.decoder\.scales=\[0,1,2\]$"):
+        decoders.build("unet", features=features)
+    assert len(decoders.build("unet", features=features, scales=[0, 1, 2])(_maps(features))) == 3
+
+
 @pytest.mark.parametrize("name", saunet.available("decoder"))
 def test_decoder_refuses_strides(name):
     with pytest.raises(ConfigError, match=r"strides \[2, 6\]; a decoder needs ascending powers of two"):

@@ -43,7 +43,9 @@ class Decoder(nn.Module):
             raise ConfigError(f"the encoder's deepest stride is {strides[-1]}; this decoder needs at least {least}")
         levels = list(range(self.deepest - finest))
         if not self.scales or list(self.scales) != levels[: len(self.scales)]:
-            raise ConfigError(f"scales is {list(scales)}; allowed: {levels} or its first entries, without gaps")
+            reason = f"the encoder's {len(strides)} maps end at stride {strides[-1]}"
+            fix = f"set model.decoder.scales=[{','.join(map(str, levels))}]"
+            raise ConfigError(f"scales is {list(scales)}; allowed: {levels} or its first entries, as {reason}: {fix}")
 
 
 class SkipDecoder(Decoder):
