@@ -241,6 +241,19 @@ def test_a_resized_camera_is_that_of_the_geometry() -> None:
     assert np.allclose(Camera.from_numbers([90.0], 60, 80).K[0, 0], 40)
 
 
+def test_a_name_near_that_of_a_shipped_model_is_a_slip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CheckpointError, match="no model 'stret'; did you mean 'street'"):
+        saunet.load("stret")
+
+
+def test_a_model_and_its_points_say_what_they_are_in_one_line() -> None:
+    model = saunet.load("street")
+    assert repr(model) == f"Predictor(street: input {model.width} x {model.height}, relative, cpu)"
+    cloud = model.predict(np.zeros((32, 64, 3), np.uint8)).point_cloud(90)
+    assert repr(cloud) == f"PointCloud({len(cloud.points)} points, relative)"
+
+
 @pytest.mark.parametrize("source", [None, "", 3])
 def test_what_names_no_model_is_refused(source: Any) -> None:
     with pytest.raises(CheckpointError, match=r"saunet\.load got .*; give the path of a checkpoint"):

@@ -41,6 +41,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_run_is_read_shown_and_drawn(folder: Path) -> None:
     run = saunet.Run(folder)
     assert (run.status, run.name) == ("finished", "night")
+    assert repr(run) == f"Run({folder}: finished, 9 steps, loss 1.2)"
     assert run.table.rows[0].cells[1] == "finished"
     assert run.plot()._repr_svg_().count("<svg") == 1
     assert "<table>" in run._repr_html_()

@@ -29,6 +29,9 @@ class PointCloud:
     colors: UInt8[np.ndarray, "n 3"]
     unit: str
 
+    def __repr__(self) -> str:
+        return f"PointCloud({len(self.points)} points, {self.unit.partition(' (')[0]})"
+
     def save(self, path: str | Path) -> None:
         """Write a binary PLY file, whole or not at all; MeshLab, CloudCompare and Open3D read it."""
         if Path(path).suffix.lower() != ".ply":

@@ -164,6 +164,8 @@ class ImagePredictor(abc.ABC):
     """Applied to every image first; predictions are of the image that it returns."""
     undistorted_by: str | None = None
     """Which camera that is for; None without."""
+    source: str = ""
+    """What it was loaded from."""
 
     def __init__(
         self, height: int, width: int, scale: Scale | None = None, keep_aspect: bool = False, size_divisor: int = 1
@@ -173,6 +175,11 @@ class ImagePredictor(abc.ABC):
         divisible(height, width, size_divisor, what="network input")
         self.height, self.width, self.scale = height, width, scale
         self.keep_aspect, self.size_divisor = keep_aspect, size_divisor
+
+    def __repr__(self) -> str:
+        source = f"{self.source}: " if self.source else ""
+        facts = [f"input {self.width} x {self.height}", self.unit.partition(" (")[0], str(getattr(self, "device", ""))]
+        return f"{type(self).__name__}({source}{', '.join(filter(None, facts))})"
 
     @abc.abstractmethod
     def disparity(self, images: Float32[np.ndarray, "b 3 h w"]) -> Float32[np.ndarray, "b h w"]:
@@ -279,9 +286,14 @@ def load(
     foreign: ForeignOptions | None = None,
 ) -> ImagePredictor:
     """Load a trained model, however it is stored; see `saunet.load`. ONNX is run without even importing torch."""
+    predictor = _load(locate(source), device, flip, keep_aspect, foreign)
+    predictor.source = str(source)
+    return predictor
+
+
+def _load(path: Path, device: str, flip: bool, keep_aspect: bool, foreign: ForeignOptions | None) -> ImagePredictor:
     from saunet.prediction.foreign import NOTHING, SCRIPT_SUFFIXES, ForeignPredictor, is_foreign
 
-    path = locate(source)
     if (foreign is not None and foreign.given) or is_foreign(path):
         if path.suffix.lower() not in (".onnx", *SCRIPT_SUFFIXES):
             raise ConfigError(f"foreign.* is for ONNX and TorchScript files of other systems, and {path} is neither")

@@ -16,7 +16,7 @@ from saunet.io.images import natural_order
 from saunet.reporting.figures import draw_curves, draw_results
 from saunet.reporting.inputs import collect
 from saunet.reporting.page import Document, Figure, Missing, Picture, Section, as_html
-from saunet.reporting.tables import runs_table
+from saunet.reporting.tables import last_mean, runs_table
 from saunet.runs import folder
 from saunet.runs.folder import read_mapping
 from saunet.runs.sweep import labels
@@ -94,6 +94,11 @@ class Run(folder.Run):
     def show(self) -> None:
         """Show table and curves in the notebook; elsewhere open the page in the browser."""
         display(self, lambda: as_html(self.page()))
+
+    def __repr__(self) -> str:
+        steps = max((int(row["step"]) + 1 for row in self.history if "step" in row), default=0)
+        loss = last_mean(self, "train/loss")
+        return f"Run({self.path}: {self.status}, {steps} steps{'' if loss is None else f', loss {loss:.4g}'})"
 
     def _repr_html_(self) -> str:
         drawn = draw_curves({self.name: self}, _CURVES) if find_spec("matplotlib") else None

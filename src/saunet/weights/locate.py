@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from saunet.errors import CheckpointError, ConfigError
+from saunet.errors import CheckpointError, ConfigError, suggest
 
 BOX = Path(__file__).parent
 """Each folder in it is a model that comes with saunet."""
@@ -49,6 +49,9 @@ def locate(source: str | Path) -> Path:
         raise CheckpointError(
             f"no model '{DEFAULT}' comes with this installation of saunet; give checkpoint= a model of your own"
         )
+    hint = suggest(text, shipped()) if path.name == text and not path.exists() else ""
+    if hint and path.suffix.lower() not in _FILE_SUFFIXES:
+        raise CheckpointError(f"no model '{text}'{hint} saunet comes with: {', '.join(shipped())}")
     local = path.exists() or path.parent.is_dir() or path.suffix.lower() in _FILE_SUFFIXES
     return of_run(path) if local or not _HUB_ID.fullmatch(text) else _fetch(text)
 
