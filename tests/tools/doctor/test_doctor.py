@@ -133,6 +133,24 @@ def test_cameras_that_cannot_be_right_are_named(tmp_path):
     assert draw_sheet(found, findings, "x").shape[1] == 1312  # also with nothing readable
 
 
+@pytest.mark.parametrize(("focal", "level"), [(250, "note"), (500, "warning")])
+def test_a_field_of_view_that_was_not_checked_is_told(tmp_path, focal, level):
+    make_clip(tmp_path / "r", "a", frames(16), camera=CAMERA.replace("K: [250, 252", f"K: [{focal}, {focal}"))
+    text = look(campus(tmp_path / "r"))[2]
+    assert f"{level}: K was not checked, as no examined drive turns enough, and means a field of view of" in text
+    assert ("car cameras usually have 60 to 120" in text) == (level == "warning")
+
+
+def test_a_clip_that_stands_is_named_as_the_cause_and_no_manifest_is_advised(tmp_path):
+    make_clip(tmp_path / "r", "a", [frames(1)[0]] * 16)
+    settings = {"root": str(tmp_path / "r"), "workers": 0, "frames_cache": str(tmp_path / "cache")}
+    data = saunet.Spec.of("data", "video", **settings)
+    found = saunet.doctor(saunet.DoctorOptions(data=data, output_dir=tmp_path / "out"))
+    assert not found.usable
+    assert "show no motion (doubled or standing): give longer clips that move, or set data.static=keep" in str(found)
+    assert "train with data.manifest" not in str(found)
+
+
 def test_focal_lengths_that_are_not_positive_are_an_error(tmp_path):
     folder = tmp_path / "sequences" / "00"
     (folder / "image_2").mkdir(parents=True)

@@ -194,6 +194,13 @@ class DepthDataModule(LightningDataModule):
             advice = "check the data root and the split"
             if needed:
                 advice = f"frames need {' and '.join(needed)}: check the data root, the split and the offsets"
+            reasons = Counter[str]()
+            for drive in usage:
+                reasons.update(drive.left_out)
+            still = reasons["doubled"] + reasons["static"]
+            if still > reasons.total() / 2:
+                keep = ", or set data.static=keep" if hasattr(self, "static") else ""
+                advice = f"{still} frames show no motion (doubled or standing): give longer clips that move{keep}"
             raise DataError(f"split '{split}' has no usable frame ({found}); {advice}")
         self.usage[split] = usage
         kind = SkippingWindows if self.on_error == "skip" and split == "train" else WindowDataset

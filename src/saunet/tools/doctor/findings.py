@@ -23,6 +23,8 @@ _STILL_BAND = 0.5
 """A band that moves less than this fraction of the whole picture is part of the car."""
 _UNEVEN = 1.5
 """Highest over lowest rate of a recording from which it is worth a word."""
+_USUAL_VIEW = (60, 120)
+"""Degrees that a car camera sees, from side to side."""
 _USE_MANIFEST = "train with data.manifest=<this manifest>"
 
 
@@ -122,17 +124,20 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
     if survey.cameras:
         views = [round(camera.view) for camera in survey.cameras]
         low, high = min(views), max(views)
-        yield Finding("note", f"horizontal field of view {low}{f' to {high}' if high > low else ''} degrees")
+        view = f"{low}{f' to {high}' if high > low else ''} degrees"
+        yield Finding("note", f"horizontal field of view {view}")
     known = [camera for camera in survey.cameras if camera.estimate is not None and camera.estimate.is_known]
     looked, cameras = survey.focals
     if known:
         text = f"the focal lengths of {len(known)} of {len(survey.cameras)} drives were compared with turns in them"
         yield Finding("note", text)
     elif survey.cameras:
-        yield Finding(
-            "note",
-            "K was not checked: none of the drives looked at turns enough; is this your camera's field of view?",
-        )
+        text = f"K was not checked, as no examined drive turns enough, and means a field of view of {view}"
+        if _USUAL_VIEW[0] <= low and high <= _USUAL_VIEW[1]:
+            yield Finding("note", text, "is this your camera's?")
+        else:
+            fix = "give K in pixels of the image size it was calibrated for, or calibrate (saunet calibrate)"
+            yield Finding("warning", f"{text}; car cameras usually have {_USUAL_VIEW[0]} to {_USUAL_VIEW[1]}", fix)
     if cameras > looked:
         text = f"turns were looked for in the drives of {looked} of {cameras} different K"
         yield Finding("note", text, "for another one: saunet calibrate video=DRIVE")

@@ -84,7 +84,8 @@ class Diagnosis:
             left_out = sum(len(frames) for reasons in self.manifest.leave_out.values() for frames in reasons.values())
             judged = "all" if found.judged == found.known else f"{found.judged} of {found.known}; frames=0 judges all"
             lines.append(f"manifest: {path} names {left_out} frames to leave out (judged: {judged})")
-            lines.append(f"train with data.manifest={path}")
+            if self.usable:
+                lines.append(f"train with data.manifest={path}")
         return "\n".join(lines)
 
     def _repr_png_(self) -> bytes:
