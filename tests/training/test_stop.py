@@ -14,6 +14,7 @@ import pytest
 import tiny
 import torch
 from lightning import Callback, Trainer
+from lightning.pytorch.demos.boring_classes import BoringModel
 from lightning.pytorch.loggers import CSVLogger
 from omegaconf import OmegaConf
 
@@ -23,6 +24,7 @@ from saunet.runs.folder import Stopped
 from saunet.training.callbacks import BestCheckpoint, LastCheckpoint, PicturePanel
 from saunet.training.resume import keep_rows
 from saunet.training.stopping import GracefulStop
+from saunet.training.tool import _ended_early
 
 BATCHES = 6  # an epoch's, of two epochs
 
@@ -213,3 +215,23 @@ def test_a_kill_between_saving_a_step_and_logging_it_loses_no_row(
             train(killed, every=1)
     train(killed, resume=True, every=1)
     same(whole, killed)
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        (
+            {"limit_train_batches": 4},
+            "max_epochs=2 of trainer.limit_train_batches=4 ended it at step 8, before trainer.max",
+        ),
+        ({"max_steps": 200}, "max_epochs=2 ended it at step 128, before trainer.max_steps=200"),
+        ({"limit_train_batches": 5}, ""),
+        ({"limit_train_batches": 4, "max_steps": -1}, ""),
+    ],
+)
+def test_the_setting_that_ended_a_training_before_its_steps_is_named(limits: dict[str, int], words: str) -> None:
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "limit_val_batches": 0}
+    trainer = Trainer(accelerator="cpu", **{"max_steps": 10, "max_epochs": 2, **quiet, **limits})
+    trainer.fit(BoringModel())  # 64 batches an epoch
+    told = _ended_early(trainer)
+    assert words in told if words else not told

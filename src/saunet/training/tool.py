@@ -275,6 +275,8 @@ def train(
                 rank_zero_info(model.intrinsics.told(found))
     if resume and trainer.global_step == steps:
         print(f"nothing was left to train: it was complete after step {steps}; epochs=N goes on to a later end")
+    elif told := _ended_early(trainer):
+        rank_zero_info(told)
     if trainer.is_global_zero:
         if trainer.global_step >= DRAWN_FROM:
             _draw(folder)
@@ -283,6 +285,16 @@ def train(
     best = next((Path(each.best_model_path) for each in kept if each.best_model_path), None)
     cost = next((each.cost for each in kept if each.cost is not None), None)
     return TrainResult(folder=folder, best=best, cost=cost, data=data, model=model)
+
+
+def _ended_early(trainer: Trainer) -> str:
+    """Return which setting ended a training before its ``max_steps``; empty if none did."""
+    if trainer.global_step >= trainer.max_steps or not 0 < (trainer.max_epochs or 0) <= trainer.current_epoch:
+        return ""
+    short = trainer.limit_train_batches not in (None, 1.0)
+    few = f" of trainer.limit_train_batches={trainer.limit_train_batches}" if short else ""
+    ended = f"trainer.max_epochs={trainer.max_epochs}{few} ended it at step {trainer.global_step}"
+    return f"{ended}, before trainer.max_steps={trainer.max_steps}; set more epochs"
 
 
 def _draw(folder: Path) -> None:
