@@ -95,6 +95,14 @@ def test_a_signature_without_names_and_types_is_refused(signature: str) -> None:
         registry.register("x")(functions[signature])
 
 
+def test_what_the_caller_always_gives_needs_no_annotation() -> None:
+    registry = Registry("widget", None, "saunet.geometry", late=("clip",))
+    registry.register("x")(lambda clip: ["of", clip])
+    assert registry.build("x", clip=3) == ["of", 3]
+    with pytest.raises(TypeError, match="'dim' has no annotation"):
+        registry.register("y")(lambda clip, dim: None)
+
+
 def test_instantiate_builds_nested_registered_components() -> None:
     node = OmegaConf.to_container(OmegaConf.structured(structured(encoders.node("resnet18"))))
     assert type(instantiate(node)) is encoders.entry("resnet18").target

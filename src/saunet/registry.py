@@ -55,6 +55,7 @@ class Registry:
 
     def __init__(self, kind: str, group: str | None, home: str, late: tuple[str, ...] = ()) -> None:
         self.kind, self.group, self.home, self.late = kind, group, home, late
+        self._given = () if group else late  # what has a group is also built from its node
         self._imported = False
         self._entries: dict[str, Entry] = {}
 
@@ -72,7 +73,7 @@ class Registry:
                 # A plugin may be imported before the built-in components; its class is the one to rename all the same.
                 kept, renamed = sorted(paths, key=lambda path: not path.startswith("saunet."))
                 raise ConfigError(f"{self.kind} '{name}' is already registered by {kept}; give {renamed} another name")
-            for key in preset.keys() - schema.parameters(target).keys():
+            for key in preset.keys() - schema.parameters(target, self._given).keys():
                 raise TypeError(f"{self.kind} '{name}': preset key '{key}' is not a parameter of {target.__qualname__}")
             self._entries[name] = Entry(name, target, preset)
             return target
@@ -86,8 +87,8 @@ class Registry:
             ConfigError: for an unknown name or parameter, or one that is needed and not given.
         """
         entry = self.entry(name)
-        _check_keys(f"{self.kind} '{name}'", entry.target, kwargs)
-        parameters, given = schema.parameters(entry.target), {**entry.preset, **kwargs}
+        parameters, given = schema.parameters(entry.target, self._given), {**entry.preset, **kwargs}
+        _check_known(f"{self.kind} '{name}'", parameters, kwargs)
         check_arguments(entry.target, kwargs, {key: each.annotation for key, each in parameters.items()})
         missing = [key for key, each in parameters.items() if each.default is each.empty and key not in given]
         if missing:
@@ -267,7 +268,10 @@ def find(path: str, kinds: Iterable[str] = ()) -> Entry | None:
 
 
 def _check_keys(what: str, target: Callable[..., Any], kwargs: Mapping[str, Any]) -> None:
-    known = schema.parameters(target)
+    _check_known(what, schema.parameters(target), kwargs)
+
+
+def _check_known(what: str, known: Mapping[str, Any], kwargs: Mapping[str, Any]) -> None:
     for key in kwargs:
         if key not in known:
             hint = suggest(key, known)

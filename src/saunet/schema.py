@@ -82,11 +82,11 @@ def unpacked(keywords: Any, options: type) -> None:
     _UNPACKED[keywords] = options
 
 
-def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+def parameters(target: Callable[..., Any], given: Sequence[str] = ()) -> dict[str, inspect.Parameter]:
     """Return the named parameters of a class or function, in order, with annotations resolved.
 
     A config key has a name and a type: ``*args`` and unannotated parameters are refused, and ``**kwargs`` but for an
-    ``Unpack`` of keywords made known by `unpacked`.
+    ``Unpack`` of keywords made known by `unpacked`. Those that are always ``given`` are no keys and need no annotation.
     """
     found: dict[str, inspect.Parameter] = {}
     for parameter, options in _signature(target):
@@ -96,6 +96,8 @@ def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
         name, owner = parameter.name, target.__qualname__
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             raise TypeError(f"{owner} takes '{parameter}'; a component names every parameter, each is a config key")
+        if parameter.annotation is parameter.empty and name in given:
+            parameter = parameter.replace(annotation=Any)
         if parameter.annotation is parameter.empty:
             raise TypeError(f"{owner}: parameter '{name}' has no annotation; its type is needed for the config schema")
         found[name] = parameter
@@ -126,7 +128,7 @@ def node(
     fields = {name: each for owner in owners for name, each in getattr(owner, "__dataclass_fields__", {}).items()}
     hidden = {name for name, field in fields.items() if not field.metadata.get("cli", True)}
     keys = []
-    for name, parameter in parameters(target).items():
+    for name, parameter in parameters(target, late).items():
         if name in late or name in hidden:
             continue
         nested = _component(parameter.annotation)
