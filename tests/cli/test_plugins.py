@@ -105,7 +105,7 @@ def test_an_output_in_a_file_is_written_by_predict(tmp_path: Path) -> None:
 def test_help_and_unknown_names_know_it(tmp_path: Path) -> None:
     (tmp_path / "my_parts.py").write_text(MINE)
     said = _saunet("train", "plugins=[my_parts]", *QUICK, "--help", folder=tmp_path)
-    assert "model.encoder.width: int = 8  Channels." in said
+    assert "model.encoder.width: int = 4  Channels." in said
     assert "unknown model/encoder 'mine'" in _saunet("train", *QUICK, folder=tmp_path, code=1)
 
 
