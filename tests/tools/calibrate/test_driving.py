@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from videos import write_video
 
 import saunet
 from saunet.data.video.camera import read_camera
-from saunet.data.video.focal import WINDOW, WindowFocal, combined, solve_window
+from saunet.data.video.focal import WINDOW, FocalEstimate, WindowFocal, combined, solve_window, with_bend
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import write_image
 from saunet.synthetic.world import turn
@@ -57,14 +58,33 @@ def test_turns_tell_the_focal_length_and_straights_say_that_they_do_not(focal: f
     assert straight is None or straight.uncertainty > 0.03
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_distortion_makes_the_focal_length_wrong(seed: int) -> None:
-    """The limit that calibrate names with each result: a common k1 goes into the focal length, not the residuals."""
-    bent = solve_window(*made(0.58, 2.0, seed, k1=-0.1), SIZE)
-    assert bent is not None
-    assert bent.focal > 1.15 * 0.58
-    assert bent.uncertainty < 0.03
-    assert bent.error < 0.4
+def drive_with(k1: float) -> tuple[WindowFocal, FocalEstimate]:
+    solvers = [
+        partial(solve_window, *made(0.58, degrees, seed, k1), SIZE) for seed, degrees in enumerate((2, 2.5, -2, 3))
+    ]
+    straight = [found for solver in solvers if (found := solver())]
+    estimate = with_bend(solvers, straight)
+    assert estimate is not None
+    return straight[0], estimate
+
+
+@pytest.mark.parametrize(("k1", "longer"), [(-0.05, 1.04), (-0.1, 1.15)])
+def test_the_bend_of_a_lens_is_found_with_the_focal_length(k1: float, longer: float) -> None:
+    """Where it is not looked for, the focal length is too long, and hardly a residual says so."""
+    straight, found = drive_with(k1)
+    assert straight.focal > longer * 0.58
+    assert straight.error < 0.4
+    assert found.focal == pytest.approx(0.58, rel=0.035)
+    assert found.distortion == pytest.approx(k1, abs=0.02)
+    assert "division model, -0." in found.assumed
+    assert found.uncertainty < 0.03
+
+
+def test_a_straight_lens_stays_straight() -> None:
+    _, found = drive_with(0.0)
+    assert found.bend == 0
+    assert found.focal == pytest.approx(0.58, rel=0.01)
+    assert "no distortion found" in found.assumed
 
 
 def test_windows_are_weighted_and_a_wrong_one_is_left_out() -> None:

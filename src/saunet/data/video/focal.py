@@ -2,17 +2,21 @@
 
 Two views never tell it for a car on a steady curve, and straight motion tells it hardly: windows of several frames are
 solved with the focal length free, each says how well it knows it, and only what the windows agree on counts.
+
+A lens that bends the picture changes the focal length much more than the residuals: k1 = -0.1 makes it 22 % too long.
+So the windows are solved for several bends of the division model too, whose correction needs no focal length.
 """
 
 from __future__ import annotations
 
+import functools
 import heapq
 import itertools
 import math
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Any
 
@@ -34,8 +38,12 @@ WIDTH = 620
 """Pictures are made this narrow."""
 KNOWN = 0.015
 """Relative standard deviation up to which a focal length counts as known."""
-ASSUMED = "assumed: the center in the middle, and no distortion, which would make the focal length wrong"
-"""What is to be said with each estimate."""
+_BEND, _FINE = 0.2, 0.05
+"""Steps in the bend of a lens, coarse and fine."""
+_BENDS = 6
+"""Windows that are solved for each bend; three are needed."""
+_MODEL = 0.04
+"""Doubt about the form of the lens, as a share of what its bend changes the focal length by."""
 _START = 0.8
 """Focal length to start from, in picture widths."""
 _SYSTEMATIC = 0.003
@@ -77,18 +85,24 @@ def track(frames: Sequence[NDArray[np.uint8]]) -> tuple[F64, NDArray[np.bool_]]:
 
 
 def solve_window(
-    pixels: F64, known: NDArray[np.bool_], size: tuple[int, int], center: tuple[float, float] | None = None
+    pixels: F64,
+    known: NDArray[np.bool_],
+    size: tuple[int, int],
+    center: tuple[float, float] | None = None,
+    bend: float = 0.0,
 ) -> WindowFocal | None:
     """Bundle-adjust a window: poses, inverse depths along the rays of the first view, and one focal length.
 
-    ``center`` is the principal point in pixels, by default the picture's middle. None if too few points are tracked.
+    ``center`` is the principal point in pixels, by default the picture's middle, and ``bend`` that of
+    `FocalEstimate.bend`. None if too few points are tracked.
     """
     use = known.sum(1) >= 5
     if use.sum() < _FEWEST:
         return None
     height, width = size
     middle = np.array(center or ((width - 1) / 2, (height - 1) / 2))
-    fit = _adjust((pixels[use] - middle) / width, known[use], _START)
+    x = (pixels[use] - middle) / width
+    fit = _adjust(x / (1 + bend * (x**2).sum(-1, keepdims=True)), known[use], _START)
     return fit and WindowFocal(fit[0], fit[1], fit[2] * width)
 
 
@@ -101,6 +115,19 @@ class FocalEstimate:
     uncertainty: float
     """Relative standard deviation, larger where windows disagree."""
     windows: int
+    bend: float = 0.0
+    """Of the lens: a straight picture's points are ``x / (1 + bend * |x|^2)``, in widths; 0 where none was found."""
+
+    @property
+    def distortion(self) -> float:
+        """The bend as the parameter of the division model, whose radii are in focal lengths."""
+        return self.bend * self.focal**2
+
+    @property
+    def assumed(self) -> str:
+        """What is to be said with the estimate."""
+        bent = f"lens: division model, {self.distortion:.3f}" if self.bend else "no distortion found"
+        return f"{bent}; assumed: the center in the middle"
 
     @property
     def is_known(self) -> bool:
@@ -181,7 +208,7 @@ def estimate_focal(
     """Estimate the focal length from windows of gray frames; the ``most`` that turn most are solved.
 
     ``center`` is the principal point in picture widths. After ``seconds`` no window is begun but the three that are
-    needed. None if no window has enough points to follow.
+    needed, and the lens is not looked at. None if no window has enough points to follow.
     """
     began = time.monotonic()
     best: list[tuple[float, int, Any]] = []
@@ -192,13 +219,62 @@ def estimate_focal(
             heapq.heappop(best)
         if number >= 2 and time.monotonic() - began > seconds / 2:
             break
-    solved: list[WindowFocal | None] = []
-    for _, _, (pixels, known, size) in sorted(best, reverse=True, key=itemgetter(0)):
-        if len(solved) >= 3 and time.monotonic() - began > seconds:
+    solved: list[WindowFocal] = []
+    solvers: list[Solver] = []
+    for number, (_, _, (pixels, known, size)) in enumerate(sorted(best, reverse=True, key=itemgetter(0))):
+        if number >= 3 and time.monotonic() - began > seconds:
             break
         at = None if center is None else (center[0] * size[1], center[1] * size[1])
-        solved.append(solve_window(pixels, known, size, at))
-    return combined([each for each in solved if each])
+        solver = functools.partial(solve_window, pixels, known, size, at)
+        if found := solver():
+            solved.append(found)
+            solvers.append(solver)
+    return with_bend(solvers, solved) if time.monotonic() - began < seconds else combined(solved)
+
+
+Solver = Callable[..., WindowFocal | None]
+"""`solve_window` of one window, which takes the bend."""
+
+
+def with_bend(solvers: Sequence[Solver], straight: Sequence[WindowFocal]) -> FocalEstimate | None:
+    """Return what windows say together, with the bend of the lens where they agree on one.
+
+    ``straight`` has what each window says without. The squared residuals are a parabola in the bend.
+    """
+    together = combined(straight)
+    sharpest = sorted(range(len(straight)), key=lambda index: straight[index].uncertainty)[:_BENDS]
+    if together is None or len(sharpest) < 3:
+        return together
+
+    @functools.cache
+    def solve(bend: float) -> list[WindowFocal] | None:
+        found = [solvers[index](bend=bend) if bend else straight[index] for index in sharpest]
+        return None if None in found else [each for each in found if each]
+
+    def squares(bend: float) -> NDArray[np.float64]:
+        return np.array([each.error**2 for each in found]) if (found := solve(bend)) else np.full(len(sharpest), np.inf)
+
+    best = 0.0
+    for way in (-_BEND, _BEND):
+        while abs(best + way) < 1 and np.log(squares(best + way)).sum() < np.log(squares(best)).sum():
+            best = round(best + way, 3)
+    for step in (_BEND, _FINE):
+        left, middle, right = (squares(best + shift) for shift in (-step, 0, step))
+        curvature = left - 2 * middle + right
+        if not (np.isfinite(curvature).all() and (curvature > 0).all()):
+            return together
+        lows = best + step / 2 * (left - right) / curvature
+        best = float(np.median(lows))
+    deviation = float(lows.std(ddof=1) / math.sqrt(len(lows)))
+    if abs(best) < max(4 * deviation, 0.05):
+        return together
+    bent = combined([each for solver in solvers if (each := solver(bend=best))])
+    near, far = solve(best - _FINE), solve(best + _FINE)
+    if bent is None or near is None or far is None:
+        return together
+    slope = math.log(np.median([each.focal for each in far]) / np.median([each.focal for each in near])) / (2 * _FINE)
+    model = _MODEL * math.log(bent.focal / together.focal)
+    return replace(bent, uncertainty=math.hypot(bent.uncertainty, slope * deviation, model), bend=best)
 
 
 def _adjust(x: F64, known: NDArray[np.bool_], focal: float) -> tuple[float, float, float] | None:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from lightning.pytorch.utilities import rank_zero_info
@@ -36,7 +36,7 @@ from saunet.data.video.clips import (
     read_clip,
     short_hash,
 )
-from saunet.data.video.focal import ASSUMED, WINDOW, FocalEstimate, drive_windows, estimate_focal, refusal
+from saunet.data.video.focal import WINDOW, FocalEstimate, drive_windows, estimate_focal, refusal
 from saunet.data.video.motion import Motion, cuts, even_steps, measure, motion_key
 from saunet.errors import ConfigError, DataError, UnreadableError, in_range, one_of, positive
 from saunet.io.alignment import align_speeds
@@ -392,11 +392,12 @@ class VideoDataModule(DepthDataModule):
             view = math.degrees(2 * math.atan(width / 2 / focal))
             rank_zero_info(
                 f"focal length of {what}: {focal:.1f} px of {width} ({view:.0f} degrees), known to "
-                f"{found.uncertainty:.2%} from {found.windows} windows of {WINDOW} frames; {ASSUMED}"
+                f"{found.uncertainty:.2%} from {found.windows} windows of {WINDOW} frames; {found.assumed}"
             )
             K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+            lens: dict[str, Any] = {"model": "division", "distortion": (found.distortion,)} if found.bend else {}
             for drive in several:
-                known[drive.name] = replace(drive.clip.camera, K=K, image_size=(height, width), is_known=True)
+                known[drive.name] = replace(drive.clip.camera, K=K, image_size=(height, width), is_known=True, **lens)
         return [drive.seen_by(known[drive.name]) if drive.name in known else drive for drive in drives]
 
     def _focal(self, drives: Sequence[ClipDrive]) -> FocalEstimate | None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from saunet.data.video.calibrations import EXPORTS, SUFFIXES, export_camera, export_rig, split_name
 from saunet.data.video.camera import CameraFile, Lens, read_camera, write_camera
 from saunet.data.video.clips import frame_paths
-from saunet.data.video.focal import ASSUMED, STEP, WINDOW, estimate_focal, refusal, small_gray
+from saunet.data.video.focal import STEP, WINDOW, estimate_focal, refusal, small_gray
 from saunet.data.video.lens_models import WIDEST
 from saunet.errors import ConfigError, DataError, checked, in_range, one_of, positive
 from saunet.io.atomic import check_folder
@@ -249,4 +249,5 @@ def _from_driving(source: str) -> tuple[CameraFile, str]:
     about = (
         f"from {found.windows} windows of {WINDOW} frames of {path.name}: focal length known to {found.uncertainty:.2%}"
     )
-    return CameraFile(path, K, size[0]), f"{about}; {ASSUMED}"
+    lens = ((found.distortion,), "division") if found.bend else ()
+    return CameraFile(path, K, size[0], *lens), f"{about}; {found.assumed}"
