@@ -124,9 +124,9 @@ def answer(
     source: Path,
     model: str,
     colormap: str,
-    view: float,
+    view: float | int,
     camera: str | None,
-    height: float | None,
+    height: float | int | None,
 ) -> tuple[Any, ...]:
     """Predict one file, and return what each part of the page shows then."""
     import gradio
