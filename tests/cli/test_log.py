@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
+import warnings
 from pathlib import Path
 
-from saunet.cli.log import RunLog
+import pytest
+
+from saunet.cli.log import RunLog, quiet
 
 
 def _said(text: str) -> logging.LogRecord:
@@ -42,3 +45,11 @@ def test_a_tool_that_is_refused_adds_no_line_to_the_log_of_an_earlier_run(tmp_pa
     (tmp_path / "run.json").touch()  # the checks have passed
     log.emit(_said("epoch 1"))
     assert file.read_text().splitlines() == ["of an earlier run", "6 frames used", "epoch 1"]
+
+
+def test_a_warning_is_one_line_without_its_place_in_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)  # put back afterwards
+    quiet()
+    said = warnings.formatwarning("the frame rate is unknown", UserWarning, "/x/saunet/data/video/module.py", 419)
+    assert said == "warning: the frame rate is unknown\n"
+    assert "torch/nn.py:3" in warnings.formatwarning("soon gone", FutureWarning, "/x/torch/nn.py", 3)

@@ -48,8 +48,21 @@ def _no_advertisement(record: logging.LogRecord) -> bool:
     return not record.getMessage().startswith(("💡", "TPU available", "Loading `train_dataloader` to estimate"))
 
 
+_with_place = warnings.formatwarning
+
+
+def _one_line(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """Return a warning of ours without its place in the code, which tells the user of a command nothing."""
+    if "saunet" in filename and issubclass(category, UserWarning):
+        return f"warning: {message}\n"
+    return _with_place(message, category, filename, lineno, line)
+
+
 def quiet() -> None:
     """Let Lightning, once imported, speak through our loggers and of what concerns the user alone."""
+    warnings.formatwarning = _one_line
     if "lightning.pytorch.utilities.rank_zero" in sys.modules:
         for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
             logging.getLogger(name).handlers.clear()

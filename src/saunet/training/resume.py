@@ -198,7 +198,9 @@ def warm_start(model: SelfSupervisedDepth, source: str | Path) -> str:
                 f"model has '{next(iter(own))}'); choose the same model/encoder and model/decoder"
             )
         network.load_state_dict(fitting, strict=False)
-        nothing = f"no {name} network that fits this one, which starts from fresh weights"
+        nothing = (
+            f"no {name} network{' that fits this one, which' if given else '; this one'} starts from fresh weights"
+        )
         taken.append(_taken(name, own, given, fitting) if fitting else nothing)
     theirs, ours = checkpoint.record.to_plain()["model"], model.record.get("model", {})
     for end in ("min_depth", "max_depth"):
