@@ -112,13 +112,13 @@ class PredictOptions:
                 one_of("outputs", output, known)
             if not self.outputs:
                 raise ConfigError(f"outputs is empty; allowed: {', '.join(known)}")
-        output, kinds = Path(self.output), ("npy", "ply", "html", "rrd")
-        suffix = output.suffix.lower()
-        if suffix in {*VIDEO_SUFFIXES, *IMAGE_SUFFIXES, *(f".{kind}" for kind in kinds)} and not output.exists():
+        folder, kinds = Path(self.output), ("npy", "ply", "html", "rrd")
+        suffix = folder.suffix.lower()
+        if suffix in {*VIDEO_SUFFIXES, *IMAGE_SUFFIXES, *(f".{kind}" for kind in kinds)} and not folder.exists():
             kind = "mp4" if suffix in VIDEO_SUFFIXES else suffix[1:] if suffix[1:] in kinds else "color"
             raise ConfigError(
-                f"output is '{output}', which ends like a file, and it names the folder of the results; "
-                f"set output={output.with_suffix('')} outputs=[{kind}]"
+                f"output is '{folder}', which ends like a file, and it names the folder of the results; "
+                f"set output={folder.with_suffix('')} outputs=[{kind}]"
             )
         one_of("colormap", self.colormap, COLORMAPS)
         one_of("layout", self.layout, LAYOUTS)
