@@ -67,7 +67,7 @@ def health(
 
 
 DOUBTED = ("automask", "rotation")
-"""Figures that tell whether a loss means anything."""
+"""Measurements that show whether a loss can be trusted."""
 
 
 def doubt(figures: Mapping[str, float], automask: float = 0.05, rotation: float = 0.5) -> str | None:

@@ -55,9 +55,8 @@ def find_camera(path: Path, name: str | None) -> Any:
         return cameras[name]
     main = [each for each in cameras if each != "rect"] or names.split()
     if len(main) > 1 and any(cameras[each] != cameras[main[0]] for each in main):
-        rectified = next(
-            (each for each in main if each.startswith("rect_")), main[0]
-        )  # the pictures that are published
+        # KITTI publishes the rectified pictures
+        rectified = next((each for each in main if each.startswith("rect_")), main[0])
         raise DataError(f"{path} ({kind}) has several cameras: {names}; choose one, such as {path}:{rectified}")
     return cameras[main[0]]
 
