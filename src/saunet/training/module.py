@@ -25,7 +25,7 @@ from saunet.metrics.depth import DepthMetrics
 from saunet.runs.folder import RunRecord
 from saunet.runs.record import Intrinsics
 from saunet.training.intrinsics import FocalLengths
-from saunet.training.monitors import DOUBTED, health
+from saunet.training.monitors import DOUBTED, health, learned_from
 from saunet.training.optim import MovingAverage, Recipe
 from saunet.training.resume import continuation, owe_validation, validation_due
 from saunet.training.speed import Speed
@@ -177,7 +177,7 @@ class SelfSupervisedDepth(LightningModule):
         count = len(batch["name"])
         if batch["sources"].shape[1] > 0:
             pyramid, poses, _, terms = self.step(batch)
-            watched = health(pyramid, poses, terms, torch.inf)
+            watched = learned_from(poses, terms)
             figures = {f"val/{name}": watched[name] for name in DOUBTED if name in watched}
             self.log_dict({**terms.named("val"), **figures}, sync_dist=True, batch_size=count)
         else:

@@ -56,11 +56,16 @@ def health(
     ``automask``: fraction of pixels that teach, where the objective has such a mask.
     """
     disparity = pyramid.disparity[0].detach().float().flatten(1)
-    figures = {
+    return {
         "disparity_spread": (disparity.std(1) / disparity.mean(1).clamp(min=1e-9)).mean(),
         "holes": holes(pyramid.depth[0].detach() > FAR * max_depth),
-        **_motion(poses.detach()),
+        **learned_from(poses, terms),
     }
+
+
+def learned_from(poses: Float[Tensor, "b s 4 4"], terms: LossTerms) -> dict[str, Float[Tensor, ""]]:
+    """Return the part of `health` that concerns the motion and the pixels behind the loss, not the depth."""
+    figures = _motion(poses.detach())
     if "automask" in terms.maps:
         figures["automask"] = terms.maps["automask"].float().mean()
     return figures
