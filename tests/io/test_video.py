@@ -151,6 +151,26 @@ def test_rotation_is_applied(tmp_path: Path, turn: int, shape: tuple[int, int]) 
     assert apart(np.rot90(image, -turn // 90), numbered(0)) < 5
 
 
+@pytest.mark.parametrize("turn", [0, 90])
+def test_frames_that_shrink_show_the_same_at_the_same_place(tmp_path: Path, turn: int) -> None:
+    """As OpenCV's averaging of areas: no shift, which would move the principal point, and no aliasing."""
+    rng = np.random.default_rng(0)
+    fine = cv2.GaussianBlur(rng.integers(0, 256, (360, 480), dtype=np.uint8), (0, 0), 1.2)
+    scene = cv2.cvtColor(cv2.normalize(fine, None, 0, 255, cv2.NORM_MINMAX), cv2.COLOR_GRAY2RGB)  # type: ignore[call-overload]
+    path = write_video(tmp_path / "a.mov", [scene] * 3, rotation=turn, options={"crf": "1"})
+    whole = list(VideoReader(path))[1]
+    reader = VideoReader(path, max_width=300)
+    assert (reader.height, reader.width) == ((225, 300) if turn == 0 else (400, 300))
+    small = list(reader)[1][..., 1].astype(float)
+    wanted = cv2.resize(whole, (300, reader.height), interpolation=cv2.INTER_AREA)[..., 1].astype(float)
+    assert np.abs(small - wanted).mean() < 0.1 * wanted.std()
+    down, across = np.gradient(wanted)
+    slopes = np.stack([across.ravel(), down.ravel()])
+    shift = np.linalg.solve(slopes @ slopes.T, slopes @ (small - wanted).ravel())  # of the whole picture, in pixels
+    assert np.abs(shift).max() < 0.03
+    assert next(iter(VideoReader(path, max_width=2000))).shape == whole.shape  # never larger
+
+
 @pytest.mark.parametrize("matrix", ["ITU601", "ITU709"])
 @pytest.mark.parametrize("full", [False, True])
 def test_colors_follow_the_tags(tmp_path: Path, matrix: str, full: bool) -> None:

@@ -60,13 +60,14 @@ class VideoReader(Session):
     """Frames of a video file as RGB bytes, as a player shows them: in order, rotated, deinterlaced, in true colors.
 
     Iterating reads from the start each time; one frame is in memory at a time. ``rate`` is for a bare stream
-    (``.hevc``, ``.h264``) that does not contain its own.
+    (``.hevc``, ``.h264``) that does not contain its own. Frames wider than ``max_width`` shrink to it while their
+    colors are converted, which takes half the time of shrinking them after.
 
     Attributes:
         fps: Mean frames per second; None if nobody knows.
         declared: Number of frames as the file states it, or estimated from its duration; None if unknown.
-        height: Of the frames, after rotation.
-        width: Of the frames, after rotation.
+        height: Of the frames, after rotation and shrinking.
+        width: Of the frames, after rotation and shrinking.
         origin: Time stamp of the first frame in the file, in seconds; 0 if it has none.
         missing: After reading to the end: frames that a truncated file lacks.
         damaged: After reading to the end: frames that could be decoded in part or not at all.
@@ -74,8 +75,8 @@ class VideoReader(Session):
         count: Frames decoded since the start of the last reading.
     """
 
-    def __init__(self, source: str | Path, rate: float | int | None = None) -> None:
-        self.path, self.name = Path(source), str(source)
+    def __init__(self, source: str | Path, rate: float | int | None = None, max_width: int | None = None) -> None:
+        self.path, self.name, self._max_width = Path(source), str(source), max_width
         if not self.path.is_file():
             raise DataError(f"no video at {source}; check the path")
         if self.path.stat().st_size == 0:
@@ -88,7 +89,7 @@ class VideoReader(Session):
                 raise UnreadableError(
                     f"{self.name} holds no frame that can be decoded; it may be truncated or have an unusual codec"
                 )
-            self.height, self.width = to_rgb(first, self.name, self._converter).shape[:2]
+            self.height, self.width = self._picture(first).shape[:2]
             self._timed = container.format.name not in _RAW and first.time is not None
             self.origin = float(first.time) if self._timed else 0.0
             mean, usual = self._rates(container, stream)
@@ -109,7 +110,7 @@ class VideoReader(Session):
         if fps is not None and self._pace is not None and fps < self._pace * (1 - 1e-3):
             stamped = nearest_steps(stamped, positive("fps", fps))
         for number, seconds, frame in stamped:
-            image = to_rgb(frame, self.name, self._converter)
+            image = self._picture(frame)
             if image.shape[:2] != (self.height, self.width):
                 raise DataError(
                     f"{self.name} changes its size from {self.width}x{self.height} to {image.shape[1]}x"
@@ -121,6 +122,9 @@ class VideoReader(Session):
 
     def close(self) -> None:
         """Nothing is held open between two iterations."""
+
+    def _picture(self, frame: Any) -> Picture:
+        return to_rgb(frame, self.name, self._converter, self._max_width)
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[tuple[Any, Any]]:
@@ -347,18 +351,25 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
         yield None
 
 
-def to_rgb(frame: Any, name: str, converter: VideoReformatter) -> Picture:
+def to_rgb(frame: Any, name: str, converter: VideoReformatter, max_width: int | None = None) -> Picture:
     """Convert by the frame's own tags of matrix and range, and turn it as its display matrix says.
 
-    One converter serves all frames; a frame's own would be set up, with its threads, for each.
+    One converter serves all frames; a frame's own would be set up, with its threads, for each. Pictures wider than
+    ``max_width`` shrink to it; FFmpeg's linear filter then spans as many pixels as one pixel of the result covers.
     """
+    turns = round(frame.rotation / 90) % 4  # counter-clockwise, as NumPy's
+    height, width = frame.height, frame.width
+    across = height if turns % 2 else width
+    if max_width is not None and across > max_width:
+        height, width = (round(side * max_width / across) for side in (height, width))
     try:
-        image = converter.reformat(frame, format="rgb24").to_ndarray()
+        image = converter.reformat(
+            frame, width=width, height=height, format="rgb24", interpolation="BILINEAR"
+        ).to_ndarray()
     except (FFmpegError, ValueError) as reason:
         raise UnreadableError(
             f"{name} has pixels of format {frame.format.name}, which cannot be converted to RGB; convert it to H.264"
         ) from reason
-    turns = round(frame.rotation / 90) % 4  # counter-clockwise, as NumPy's
     return np.ascontiguousarray(np.rot90(image, turns)) if turns else image
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera, unknown_camera
 from saunet.errors import DataError
 from saunet.io.atomic import partial_name, remove_partial_files, write_json
-from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order, resize
+from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order
 from saunet.io.plain import read_json
 from saunet.io.video import BARE_SUFFIXES, VIDEO_SUFFIXES, VideoReader, nearest_steps
 
@@ -205,11 +205,9 @@ def _decode(
     try:
         remove_partial_files(folder.parent, ".*.partial*")
         partial.mkdir(parents=True, exist_ok=True)
-        reader = VideoReader(video, rate)
+        reader = VideoReader(video, rate, max_width)
         for frame in reader.frames(fps):
-            width = min(max_width, frame.image.shape[1])
-            small = resize(frame.image, round(frame.image.shape[0] * width / frame.image.shape[1]), width)
-            (partial / f"{frame.number:06d}.jpg").write_bytes(encode_jpeg(small, QUALITY))
+            (partial / f"{frame.number:06d}.jpg").write_bytes(encode_jpeg(frame.image, QUALITY))
             numbers.append(frame.number)
             times.append(frame.time)
             advance(reader.count, reader.declared)
