@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from saunet.data.video.camera import CameraFile, write_camera
 from saunet.exporting.box import pack
+from saunet.io.images import write_image
+from saunet.synthetic import SyntheticDrive
 from saunet.weights import locate
 
 Tool = Callable[..., Any]
@@ -63,3 +68,32 @@ def test_listing_needs_no_network_code() -> None:
     program = "import saunet; print(saunet.available('weights')); import sys; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == [str(locate.shipped()), "False"]
+
+
+def test_own_clips_and_paths_without_a_pose_network(tool: Tool, tmp_path: Path) -> None:
+    """The motion is that of tracked points, and runs are compared with what `street` gives."""
+    drive = SyntheticDrive(seed=8, frames=8, height=120, width=400)
+    (tmp_path / "clips" / "a").mkdir(parents=True)
+    for index in drive.indices:
+        write_image(tmp_path / "clips" / "a" / f"{index}.png", drive.image(index))
+    write_camera(tmp_path / "clips" / "camera.yaml", CameraFile(Path(), drive.intrinsics(0), (120, 400), fps=10.0))
+    common = ("data=video", "data.root=clips", "data.test_clips=[a]", "data.workers=0", "data.frames_cache=cache")
+    outcome = tool("evaluate", "street", *common, "data.val_clips=[]", "output_dir=before")
+    assert outcome.code == 0, outcome.err
+    assert "motion: from tracked points (the model has no pose network)" in outcome.out
+    results = json.loads((tmp_path / "before" / "metrics.json").read_text())
+    (view,) = results["views"]
+    assert view["images"] == 6
+    assert view["warped"] < 0.5 * view["unwarped"]
+    assert view["explained"] > 0.8
+    assert results["settings"]["motion"] == "tracked"
+    outcome = tool("odometry", "street", *common, "output_dir=path", "figure=false")
+    assert outcome.code == 0, outcome.err
+    assert "motion: from tracked points" in outcome.out
+    outcome = tool("predict", "clips/a", "output=out", "outputs=[trajectory]", "camera=clips/camera.yaml", "fps=10")
+    assert outcome.code == 0, outcome.err
+    assert "trajectory: from tracked points" in outcome.out
+    paths = [np.loadtxt(next(tmp_path.glob(each))) for each in ("path/*/predicted_kitti.txt", "out/*_trajectory.txt")]
+    np.testing.assert_allclose(*paths, atol=1e-3)
+    true = np.linalg.inv(drive.pose(0)) @ drive.pose(7)
+    assert np.linalg.norm(paths[0][-1, 3::4] - true[:3, 3]) < 0.3 * np.linalg.norm(true[:3, 3])

@@ -14,12 +14,14 @@ import torch
 
 from saunet.errors import ConfigError, DataError
 from saunet.evaluation import EvaluateOptions, evaluate, write_results
+from saunet.evaluation.result import read_rows
 from saunet.evaluation.scoring import score_views
 from saunet.evaluation.statistics import with_statistics
-from saunet.evaluation.tool import evaluate_network, passes
+from saunet.evaluation.tool import evaluate_network, passes, tracked
 from saunet.metrics.baselines import ConstantDepth
 from saunet.metrics.protocols import protocol
 from saunet.registry import Spec
+from saunet.synthetic import SyntheticDrive
 
 
 class Data:
@@ -72,7 +74,7 @@ def constant(batch):
     return torch.full((1, 1, 8, 16), 0.05)
 
 
-def standing(batch):
+def standing(batch, depth):
     return torch.eye(4).expand(1, 1, 4, 4)
 
 
@@ -176,6 +178,45 @@ def test_without_truth_and_without_motion(options):
         evaluate(options(protocols=("campus",)))
 
 
+def test_the_motion_of_tracked_points_is_the_true_one_and_where_there_are_none_an_image_is_left_out(tmp_path):
+    drive = SyntheticDrive(seed=5, frames=4, height=160, width=512)
+
+    def sample(frame, near, image=drive.image):
+        pictures = torch.from_numpy(np.stack([image(each) for each in (frame, *near)])).permute(0, 3, 1, 2) / 255
+        K = torch.from_numpy(drive.intrinsics(frame)).float()[None]
+        return {"target": pictures[:1], "sources": pictures[None, 1:], "K": K, "name": [f"clip {frame:010d}"]}
+
+    truth = {each: torch.from_numpy(drive.depth(each))[None, None] for each in (1, 2)}
+    frame_of = lambda batch: int(batch["name"][0].split()[1])
+    depth = lambda batch: 1 / truth[frame_of(batch)].where(truth[frame_of(batch)] > 0, 1000.0)
+
+    def true(batch, _):
+        center = frame_of(batch)
+        poses = [np.linalg.inv(drive.pose(near)) @ drive.pose(center) for near in (center - 1, center + 1)]
+        return torch.from_numpy(np.stack(poses)).float()[None]
+
+    batches = [sample(1, (0, 2)), sample(2, (1, 3)), sample(2, (1, 3), lambda _: np.full((160, 512, 3), 99, np.uint8))]
+    batches[2]["name"] = ["fog 0000000002"]
+    pairs = {"tracked": (depth, tracked), "true": (depth, true)}
+    rules = {"protocol": protocol("campus"), "group_of": lambda name: name.split()[0], "progress": False}
+    result = score_views(pairs, batches, **rules)
+    found = {(row.predictor, row.name): row for row in result.views}
+    for name in ("clip 0000000001", "clip 0000000002"):
+        ours, theirs = found["tracked", name], found["true", name]
+        assert ours.unwarped > 2 * theirs.warped
+        assert ours.warped == pytest.approx(theirs.warped, rel=0.05)
+        assert ours.explained == pytest.approx(theirs.explained, abs=0.02)
+    assert np.isnan(found["tracked", "fog 0000000002"].warped)
+    views = {(view.predictor, view.condition): view.images for view in result.view_summaries()}
+    assert views["tracked", "all"] == 2
+    assert ("tracked", "fog") not in views
+    assert views["true", "all"] == 3
+    (kept,) = [row for row in read_rows(write_results(result, tmp_path)["views.csv"].parent) if np.isnan(row.warped)]
+    assert kept.compared == {}  # it does not take part in a comparison
+    with pytest.raises(DataError, match="motion is known for none of the 1 images: too few points"):
+        score_views({"m": (depth, tracked)}, batches[2:], **rules)
+
+
 def test_views_refuse_protocols_that_compare_depth():
     with pytest.raises(ConfigError, match=r"'metric' compares with 'camera_z'.*such as campus"):
         score_views({}, [], protocol("metric"), group_of=str, progress=False)
@@ -215,6 +256,7 @@ def test_statistics_and_the_earlier_run(options, tmp_path):
         ({"intervals": 95.0}, "intervals is 95"),
         ({"split": "train"}, "split is 'train'"),
         ({"match": "nam"}, "match is 'nam'"),
+        ({"motion": "points"}, "motion is 'points'.*auto, tracked"),
         ({"predicted": "depths"}, "predicted is 'depths'"),
         ({"distances": (5.0,)}, "at least two limits"),
     ],

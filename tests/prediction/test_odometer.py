@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from saunet.errors import CheckpointError, ConfigError, DataError
-from saunet.prediction.odometer import Odometer, follow
+from saunet.prediction.odometer import Odometer, TrackedPose, follow
 from saunet.runs.record import Scale
+from saunet.synthetic import SyntheticDrive
+from saunet.types import DepthPyramid
 
 
 class NumberedDrive(NumberDrive):
@@ -100,6 +102,51 @@ def test_scale_is_applied_to_distances_only():
     expected = path.copy()
     expected[:, :3, 3] *= 2.5
     np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+class TrueDepth(nn.Module):
+    """Knows the depth of the frame that it sees; the sky is far away."""
+
+    def __init__(self, drive):
+        super().__init__()
+        self.known = {drive.image(index).tobytes(): drive.depth(index) for index in drive.indices}
+
+    def forward(self, image):
+        pictures = (image * 255).round().byte().permute(0, 2, 3, 1).numpy()
+        depth = torch.from_numpy(np.stack([self.known[each.tobytes()] for each in pictures]))[:, None]
+        depth = depth.where(depth > 0, 1000.0)
+        return DepthPyramid((depth,), (1 / depth,), (depth,))
+
+
+@pytest.mark.parametrize("batch_size", [1, 4])
+def test_tracked_points_and_depth_give_the_path_without_a_pose_network(batch_size):
+    drive = SyntheticDrive(seed=8, frames=9, height=160, width=512)
+    odometer = Odometer(TrackedPose(TrueDepth(drive)), 160, 512, batch_size=batch_size)
+    assert odometer.tracks
+    found = follow(odometer, drive, progress=False)
+    true = np.stack([np.linalg.inv(drive.pose(0)) @ drive.pose(index) for index in drive.indices])
+    assert np.linalg.norm(true[-1, :3, 3]) > 5
+    np.testing.assert_allclose(found[:, :3, 3], true[:, :3, 3], atol=0.2)
+    np.testing.assert_allclose(found[:, :3, :3], true[:, :3, :3], atol=0.005)
+
+
+def test_a_step_without_points_goes_on_as_the_one_before():
+    drive = SyntheticDrive(seed=8, frames=5, height=160, width=512)
+    known = TrueDepth(drive)
+    fog = np.full((160, 512, 3), 99, np.uint8)
+    known.known[fog.tobytes()] = drive.depth(0)
+    odometer = Odometer(TrackedPose(known), 160, 512)
+    for index in drive.indices:
+        odometer.add(fog if index == 3 else drive.image(index), drive.intrinsics(index))
+    with pytest.warns(UserWarning, match="in 2 of 4 steps of the path"):
+        path = odometer.trajectory()
+    steps = np.linalg.inv(path[:-1]) @ path[1:]
+    np.testing.assert_allclose(steps[2:], np.stack([steps[1]] * 2), atol=1e-9)
+    blind = Odometer(TrackedPose(known), 160, 512)
+    for _ in range(3):
+        blind.add(fog, drive.intrinsics(0))
+    with pytest.raises(DataError, match="known between none of 3 frames"):
+        blind.trajectory()
 
 
 def test_what_makes_no_path(tmp_path: Path):

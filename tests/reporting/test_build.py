@@ -223,13 +223,13 @@ def _two(tmp_path: Path) -> list[Path]:
     return [make_run(tmp_path / name, beta=beta, status="finished") for name, beta in (("a", 0.1), ("b", 0.2))]
 
 
-def _explained(folder: Path, warped: float, images: int = 6) -> Path:
+def _explained(folder: Path, warped: float, images: int = 6, **more: str) -> Path:
     """Write an evaluation of clips without ground truth."""
     rows = tuple(
         ViewRow("model", "campus", f"seq {index:06d}", "seq", warped + 0.01 * index, 0.3, 0.8, 0.9)
         for index in range(images)
     )
-    settings = {"data": "video"}
+    settings: dict[str, object] = {"data": "video", **more}
     write_results(EvaluationResult((protocol("campus"),), ("model",), (), views=rows, settings=settings), folder)
     return folder
 
@@ -246,6 +246,22 @@ def test_runs_on_clips_without_ground_truth_are_compared_frame_by_frame(tmp_path
     assert "status" not in text  # both are finished
     assert re.search(r"beta = 0\.1\s+3\s+1\.2000", text)  # the loss of the last of nine steps, in epoch 3
     assert "these losses do not compare" in " ".join(text.split())  # their objectives have other weights
+
+
+def test_a_model_without_a_pose_network_is_compared_and_the_motion_of_both_is_said(tmp_path: Path) -> None:
+    """As `street` with a run that was adapted from it: by tracked motion for both, if both have it."""
+    before = _explained(tmp_path / "before", 0.2, motion="tracked")
+    after = make_run(tmp_path / "after", status="finished")
+    _explained(after / "network", 0.12)
+    text = " ".join(_compared(after, before).split())
+    assert "the first with the pose network's motion, the second with motion=tracked" in text
+    assert re.search(r"warped ↓ 0\.1450 0\.2250 \+0\.0800", text)
+    assert "video, test split, motion=tracked" in text  # the heading of its row among the conditions
+    _explained(after / "tracked", 0.1, motion="tracked")
+    text = " ".join(_compared(after, before).split())
+    assert text.count("6 images, paired") == 1
+    assert re.search(r"warped ↓ 0\.1250 0\.2250 \+0\.1000", text)
+    assert "compares depth alone" not in text
 
 
 def test_what_is_not_compared_names_the_commands_after_which_it_is(

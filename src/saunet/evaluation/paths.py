@@ -36,7 +36,7 @@ from saunet.weights.locate import locate
 
 PUBLISHED_SNIPPET = 5
 """Frames in a snippet of the published numbers."""
-MODEL = "pose network"
+MODEL, TRACKED = "pose network", "tracked points"
 STRAIGHT = "constant motion straight ahead"
 
 
@@ -46,7 +46,7 @@ class PathErrors:
 
     sequence: str
     predictor: str
-    """`MODEL`, or `STRAIGHT`, which looks at no image."""
+    """`MODEL`, `TRACKED`, or `STRAIGHT`, which looks at no image."""
     frames: int
     meters: float
     """Length of the true path."""
@@ -113,12 +113,13 @@ class Path3d:
         return self.alignment.poses(self.predicted)
 
 
-def path_of(drive: Drive, predicted: Float64[ndarray, "n 4 4"]) -> Path3d:
+def path_of(drive: Drive, predicted: Float64[ndarray, "n 4 4"], predictor: str = MODEL) -> Path3d:
     """Return a predicted path beside what its recording knows of all frames: when they were taken, and true poses."""
     times = drive.timestamps
     poses = [pose for number in drive.indices if (pose := drive.pose(number)) is not None]
     times = None if times is None or np.isnan(times).any() else times
-    return Path3d(drive.name, predicted, times, np.stack(poses) if len(poses) == len(predicted) else None)
+    true = np.stack(poses) if len(poses) == len(predicted) else None
+    return Path3d(drive.name, predicted, times, true, predictor)
 
 
 def straight_ahead(path: Path3d) -> Path3d:
@@ -160,6 +161,7 @@ def path_table(errors: Sequence[PathErrors]) -> Table:
         numbers = (one.ate, one.scale, one.turn, one.t_rel, one.r_rel)
         told = f"{one.snippet_ate:.4f} ± {one.snippet_std:.4f}"
         rows.append(Row((*about, told, *numbers), "dim" if trivial else "plain"))
+    tracked = any(one.predictor == TRACKED for one in errors)
     published = "as published" if snippet == PUBLISHED_SNIPPET else f"published numbers use {PUBLISHED_SNIPPET} frames"
     notes = [f"{snippet}-frame ATE: own scale per snippet, {published}; the rest after 7-DoF alignment"]
     lengths = {f"{row.lengths[0]:g} to {row.lengths[-1]:g} m" for row in errors if row.segments}
@@ -170,7 +172,7 @@ def path_table(errors: Sequence[PathErrors]) -> Table:
         f"no segment of {min(row.lengths):g} m or more fits into the {row.meters:.1f} m of {name}"
         for name, row in bare.items()
     ]
-    title = "odometry: the path of the camera from the pose network"
+    title = f"odometry: the path of the camera from {'tracked points' if tracked else 'the pose network'}"
     return Table("odometry", title, headings, tuple(rows), tuple(notes))
 
 
@@ -239,7 +241,7 @@ class OdometryOptions:
     """Which path `odometry` predicts, and how it is compared.
 
     Args:
-        checkpoint: A trained model with a pose network.
+        checkpoint: A trained model. Without a pose network, motion comes from tracked points, its length from depth.
         data: The data module, whose test split is followed; the size of its images follows the checkpoint.
         snippet: Frames in a snippet; published numbers use 5.
         lengths: Segment lengths in meters for t_rel and r_rel; by default KITTI's 100 to 800 m, or 20 to 80 % of a path
@@ -313,7 +315,7 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
         The paths and their errors; `OdometryResult.show` prints them.
 
     Raises:
-        ConfigError: if the model has no pose network, or it was not trained on neighboring frames.
+        ConfigError: if the pose network was not trained on neighboring frames.
         CheckpointError: if the checkpoint cannot be read.
         DataError: if the data cannot be read, or a file cannot be written.
 
@@ -326,13 +328,16 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
     record = read_model(source).record
     odometer = Odometer.from_model(source, device=str(device), batch_size=options.batch_size)
     data = options.data.build(height=record.height, width=record.width, offsets=list(record.offsets))
-    data.guess_camera = True  # paths need no intrinsics
+    data.guess_camera = not odometer.tracks  # pose networks need no intrinsics
     data.setup("test")
     drawn = options.figure and find_spec("matplotlib") is not None
-    paths, errors, notes = [], [], []
+    paths, errors, notes = [], [], list[str]()
+    predictor = TRACKED if odometer.tracks else MODEL
+    if odometer.tracks:
+        notes.append("motion: from tracked points (the model has no pose network), its length from the predicted depth")
     for drive in data.datasets["test"].drives:
         progress(drive.name)
-        path = path_of(drive, follow(odometer, drive))
+        path = path_of(drive, follow(odometer, drive), predictor)
         mine = []
         if path.true is not None:
             mine = [path_errors(each, options.snippet, options.lengths) for each in (path, straight_ahead(path))]
@@ -351,5 +356,6 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
         notes.append("paths are not drawn, which needs matplotlib: run `pip install 'saunet[plot]'`")
     scale = None if record.scale is None else {"factor": record.scale.factor, "source": record.scale.source}
     if folder is not None:
-        write_errors(errors, folder, {"checkpoint": str(options.checkpoint), "scale": scale})
+        motion = {"motion": "tracked"} if odometer.tracks else {}
+        write_errors(errors, folder, {"checkpoint": str(options.checkpoint), "scale": scale, **motion})
     return OdometryResult(tuple(paths), tuple(errors), tuple(notes), folder)

@@ -26,8 +26,9 @@ from saunet.types import DepthPyramid, EvalBatch
 
 Predictor: TypeAlias = Callable[[EvalBatch], Tensor]
 """Gives the disparity (1/meter up to scale) of a batch, b x 1 x any height x any width."""
-Motion: TypeAlias = Callable[[EvalBatch], Tensor]
-"""Gives ``T_src_tgt`` of a batch's sources, b x s x 4 x 4, at the scale of the predicted depth."""
+Motion: TypeAlias = Callable[[EvalBatch, Tensor], Tensor]
+"""Gives ``T_src_tgt`` of a batch's sources, b x s x 4 x 4, in the unit of its predicted depth, b x 1 x h x w; NaN where
+unknown."""
 SUFFIXES: tuple[str, ...] = (".npy", ".png")
 """Files of a folder that are read: arrays, and 16-bit PNG with values x 256 (KITTI's format)."""
 

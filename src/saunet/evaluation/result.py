@@ -83,7 +83,10 @@ class ShapeRow:
 
 @dataclass(frozen=True, slots=True)
 class ViewRow:
-    """How well a prediction explains the neighboring frames of one image, where no depth is known."""
+    """How well a prediction explains the neighboring frames of one image, where no depth is known.
+
+    NaN, and visible nowhere, where the motion of the camera is unknown.
+    """
 
     predictor: str
     protocol: str
@@ -293,6 +296,7 @@ class EvaluationResult:
         found = []
         for protocol, predictor in dict.fromkeys((row.protocol, row.predictor) for row in self.views):
             mine = [row for row in self.views if (row.protocol, row.predictor) == (protocol, predictor)]
+            mine = [row for row in mine if not math.isnan(row.warped)]
             conditions = list(dict.fromkeys(row.condition for row in mine))
             for condition in [*(conditions if len(conditions) > 1 else []), "all"]:
                 rows = [row for row in mine if condition in ("all", row.condition)]

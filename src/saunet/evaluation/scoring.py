@@ -19,7 +19,7 @@ from saunet.evaluation.predictors import Motion, Predictor, truths_of
 from saunet.evaluation.result import BucketRow, EvaluationResult, ImageRow, ShapeRow, ViewRow
 from saunet.evaluation.team import ALONE, Team
 from saunet.geometry.camera import scale_intrinsics
-from saunet.geometry.depth import disparity_to_depth
+from saunet.geometry.depth import disparity_to_depth, enlarge
 from saunet.geometry.warp import synthesize
 from saunet.io.progress import bar
 from saunet.losses.functional import automask, combine_sources, photometric_error
@@ -330,7 +330,8 @@ def score_views(
 
     A small error does not prove good depth (a flat wall is explained by any), but a model that does not beat the
     neighbors as they are has learned nothing, and conditions that are worse than others show. ``group_of`` gives the
-    condition or the recording of an image by its name.
+    condition or the recording of an image by its name. An image to no neighbor of which the motion is known gets
+    NaN.
     """
     if protocol.ground_truth != "none":
         raise ConfigError(
@@ -343,8 +344,10 @@ def score_views(
         for batch in batches:
             if batch["sources"].shape[1] == 0:
                 raise DataError(f"image '{batch['name'][0]}' comes without neighboring frames to compare with")
-            for name, (depth, motion) in predictors.items():
-                columns = _explain(depth(batch), motion(batch), batch)
+            for name, (predict, motion) in predictors.items():
+                disparity = enlarge(predict(batch).float(), *batch["target"].shape[-2:])
+                depth = disparity_to_depth(disparity.clamp(min=1e-6))
+                columns = _explain(depth, motion(batch, depth), batch)
                 rows += [
                     ViewRow(name, protocol.name, image, group_of(image), *values)
                     for image, *values in zip(batch["name"], *columns, strict=True)
@@ -353,21 +356,26 @@ def score_views(
     rows = taken_in_turn(team, rows)
     if not rows:
         raise DataError(_NO_IMAGE)
+    if all(math.isnan(row.warped) for row in rows):
+        raise DataError(
+            f"the camera's motion is known for none of the {len(rows)} images: too few points can be followed (give "
+            "brighter or sharper frames, closer in time), or the pose network's weights are damaged"
+        )
     return EvaluationResult((protocol,), tuple(predictors), (), views=tuple(rows))
 
 
 def _explain(
-    disparity: Float[Tensor, "b 1 h w"], T_src_tgt: Float[Tensor, "b s 4 4"], batch: EvalBatch
+    depth: Float[Tensor, "b 1 h w"], T_src_tgt: Float[Tensor, "b s 4 4"], batch: EvalBatch
 ) -> list[list[float]]:
     """Return what `ViewRow` holds of each image: warped, unwarped, explained, visible."""
-    depth = disparity_to_depth(disparity.float().clamp(min=1e-6))
     view = synthesize(batch["sources"], depth, batch["K"], T_src_tgt)
     target = batch["target"][:, None]
     warped, seen = combine_sources(photometric_error(view.image, target), view.valid)
     # Compared over the same pixels, or leaving out the hard ones would look like progress.
     unwarped, _ = combine_sources(photometric_error(batch["sources"], target))
     explained = automask(warped, unwarped) & seen
-    pixels = seen.flatten(1).sum(1).clamp(min=1)
+    known = T_src_tgt.isfinite().flatten(2).all(2).any(1)
+    pixels = torch.where(known, seen.flatten(1).sum(1).clamp(min=1), math.nan)
     return [
         (torch.where(seen, warped, 0.0).flatten(1).sum(1) / pixels).tolist(),
         (torch.where(seen, unwarped, 0.0).flatten(1).sum(1) / pixels).tolist(),

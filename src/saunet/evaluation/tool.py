@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -11,16 +12,17 @@ from types import MappingProxyType
 from typing import Any, Protocol, get_args, runtime_checkable
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from saunet.data.drive import Drive
 from saunet.data.loading.module import surroundings
 from saunet.data.loading.stored import cache_truths
-from saunet.data.loading.windows import measured_distance, recording_of
+from saunet.data.loading.windows import measured_distance, recording_of, tracked_poses
 from saunet.errors import ConfigError, DataError, checked, one_of, usable_device
 from saunet.evaluation.predictors import (
     ExportingPredictor,
     FilePredictor,
+    Motion,
     NetworkPredictor,
     Predictor,
     PredictorNetwork,
@@ -95,6 +97,8 @@ class EvaluateOptions:
         protocols: Names of protocols, side by side, each on the ground truth that it needs; the data set's own by
             default.
         split: ``test`` or ``val``.
+        motion: Where the camera's motion comes from on data without ground truth: from points ``tracked`` between
+            frames, its length from the predicted depth; ``auto`` takes the pose network if the model has one.
         flip: Blend with the prediction of the mirrored image (Monodepth's post-processing).
         baselines: Also score predictors that look at no image.
         scale: How depth becomes meters.
@@ -126,6 +130,7 @@ class EvaluateOptions:
     match: str = "order"
     protocols: tuple[str, ...] | None = None
     split: str = "test"
+    motion: str = "auto"
     flip: bool = False
     baselines: bool = True
     scale: ScaleOptions = field(default_factory=ScaleOptions)
@@ -150,6 +155,7 @@ class EvaluateOptions:
         if self.intervals and not 0 < self.intervals < 1:
             raise ConfigError(f"intervals is {self.intervals:g}; it must lie between 0 and 1, such as intervals=0.95")
         one_of("split", self.split, STAGES)
+        one_of("motion", self.motion, ("auto", "tracked"))
         one_of("match", self.match, ("order", "name"))
         if self.predicted is not None:
             one_of("predicted", self.predicted, ("disparity", "depth"))
@@ -197,14 +203,14 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         loaded = load(options.checkpoint, device=str(device), flip=options.flip, foreign=options.foreign)
         size = {"height": loaded.height, "width": loaded.width}
         shifted = isinstance(loaded, ForeignPredictor) and loaded.shifted
-        passes = _passes(options, options.data.changed(**size), motion=False, shifted=shifted)
+        passes = _passes(options, options.data.changed(**size), motion=not shifted, shifted=shifted)
         model = NetworkPredictor(PredictorNetwork(loaded))
         about = {key: value for key, value in asdict(options.foreign).items() if value is not None}
         settings |= {"checkpoint": str(options.checkpoint), **({"foreign": about} if options.foreign.given else {})}
     elif options.checkpoint is not None:
         checkpoint = read_model(options.checkpoint)
         networks, found = checkpoint.networks(), checkpoint.record.intrinsics
-        passes = _passes(options, _resized(options.data, checkpoint.record), motion=networks[1] is not None)
+        passes = _passes(options, _resized(options.data, checkpoint.record), motion=True)
         for data, _ in passes:
             data.guess_camera = found is not None
         _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth is of the same images
@@ -298,8 +304,8 @@ def _passes(
             )
         if kind == "none" and not motion:
             raise ConfigError(
-                f"protocol '{each[0].name}' needs the motion of the camera, which only a model with a pose network "
-                "predicts; evaluate such a checkpoint, or choose a protocol with ground truth"
+                f"protocol '{each[0].name}' needs the motion of the camera, whose length comes from a model's depth "
+                "(without an unknown shift); evaluate such a model, or choose a protocol with ground truth"
             )
         truth = {} if kind in (own, "none") else {"depth": kind}
         data = spare.pop() if spare and not truth else spec.build(**truth)
@@ -328,6 +334,7 @@ def _score_passes(
 ) -> tuple[EvaluationResult, tuple[str, ...]]:
     """Go through the images once for each ground truth; return the result, and what was exported."""
     split, name, exporter = options.split, "model" if model else "predictions", None
+    motion = tracked if pose is None or options.motion == "tracked" else predicted_by(pose)
     buckets = Buckets(tuple(options.distances)) if options.buckets else None
     shapes = Shapes(options.boundaries, options.cloud) if options.boundaries or options.cloud else None
     results: list[EvaluationResult] = []
@@ -343,8 +350,7 @@ def _score_passes(
         share = {} if team.place is None else {"place": team.place}
         batches, total = data.batches(split, device, **share), len(data.datasets[split])
         if rules[0].ground_truth == "none":
-            assert pose is not None
-            pair = {name: (predictor, lambda batch: pose(batch["target"], batch["sources"]))}
+            pair = {name: (predictor, motion)}
             group_of = _conditions(data, split)
             batches = _refined(batches, found)
             results += [score_views(pair, batches, rule, group_of=group_of, total=total, team=team) for rule in rules]
@@ -359,7 +365,28 @@ def _score_passes(
             sum(team.everyones(count)) for count in (exporter.written, exporter.left_out)
         )
     asked = [protocol(name) for name in options.protocols or [rule.name for _, rules in passes for rule in rules]]
-    return replace(whole, protocols=tuple(asked)), (str(exporter),) if exporter else ()
+    notes = [str(exporter)] if exporter else []
+    if whole.views and motion is tracked:
+        whole = replace(whole, settings={**whole.settings, "motion": "tracked"})
+        notes.append(_told(whole, asked_for=pose is not None))
+    return replace(whole, protocols=tuple(asked)), tuple(notes)
+
+
+def tracked(batch: EvalBatch, depth: Tensor) -> Tensor:
+    """Return the motion of tracked points; see `Motion`."""
+    return tracked_poses(batch["target"], batch["sources"], batch["K"], depth)
+
+
+def predicted_by(pose: nn.Module) -> Motion:
+    return lambda batch, depth: pose(batch["target"], batch["sources"])
+
+
+def _told(result: EvaluationResult, asked_for: bool) -> str:
+    """Say where the motion came from, and how many images have none."""
+    unknown = sum(math.isnan(row.warped) for row in result.views)
+    rest = f"; left out: {unknown} of {len(result.views)} images, too few points to follow" if unknown else ""
+    why = "asked for with motion=tracked" if asked_for else "the model has no pose network"
+    return f"motion: from tracked points ({why}), with the length that the predicted depth gives it{rest}"
 
 
 def _conditions(data: EvaluationData, split: str) -> Callable[[str], str]:

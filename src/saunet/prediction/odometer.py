@@ -1,29 +1,47 @@
-"""The path of a camera: motions between neighboring frames from a pose network, chained, and drawn from above."""
+"""The path of a camera: motions between neighbors from a pose network or tracked points, chained, and drawn."""
 
 from __future__ import annotations
 
 import itertools
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float, Float64, UInt8
 from torch import Tensor, nn
 
+from saunet.data.loading.windows import tracked_poses
 from saunet.errors import CheckpointError, ConfigError, DataError, positive
 from saunet.io.images import network_input, write_image
 from saunet.io.progress import bar
 from saunet.io.trajectories import write_kitti
 from saunet.metrics.odometry import chain_motions
+from saunet.prediction.pointcloud import Camera
 from saunet.runs.record import Scale
 from saunet.weights.files import read_model
 
 _PAPER, _GRID, _INK, _TRACK, _START, _END = (
     (250, 250, 250), (222, 222, 222), (60, 60, 60), (31, 90, 180), (40, 140, 60), (200, 60, 40),
 )  # fmt: skip
+
+
+class TrackedPose(nn.Module):
+    """Motion from tracked points to the next frame, in the place of a pose network: its length is that of depth."""
+
+    offsets = (1,)
+
+    def __init__(self, depth: nn.Module) -> None:
+        super().__init__()
+        self.depth = depth
+
+    def forward(
+        self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b 1 3 h w"], K: Float[Tensor, "b 3 3"]
+    ) -> Float[Tensor, "b 1 4 4"]:
+        return tracked_poses(target, sources, K, self.depth(target).depth[0])
 
 
 class Odometer:
@@ -56,6 +74,7 @@ class Odometer:
         self._next = 1 if -1 in self._offsets else 0  # the first frame that has a neighbor on the side we look at
         self._count = 0
         self._images: dict[int, Tensor] = {}
+        self._cameras: dict[int, Tensor] = {}
         self._waiting: list[int] = []
         self._motions: dict[int, Float64[np.ndarray, "4 4"]] = {}  # frame i -> T_next_cam
 
@@ -63,25 +82,33 @@ class Odometer:
     def from_model(
         cls, path: str | Path, scale: Scale | None = None, device: str = "cpu", batch_size: int = 1
     ) -> Odometer:
-        """Load the pose network of a checkpoint or exported folder; nothing in it is run."""
+        """Load the pose network of a checkpoint or exported folder, or its depth network to track points with.
+
+        Nothing in it is run.
+        """
         if Path(path).suffix.lower() == ".onnx":
             raise ConfigError(f"{path} has no pose network, which a path needs; give the checkpoint")
         model = read_model(path)
-        pose = model.networks()[1]
-        if pose is None:
-            raise ConfigError(
-                f"{path} has no pose network (it was trained on stereo pairs), which a path needs; give a model "
-                "trained on video, or ask for no trajectory"
-            )
-        return cls(pose, model.record.height, model.record.width, scale or model.record.scale, device, batch_size)
+        depth, pose = model.networks()
+        size = model.record.height, model.record.width
+        motion = TrackedPose(depth) if pose is None else pose
+        return cls(motion, *size, scale or model.record.scale, device, batch_size)
 
     def restart(self) -> Odometer:
         """Return an odometer with the same network that stands before the first frame of another clip."""
         return Odometer(self._pose, *self._size, self.scale, self._device, self._batch_size)
 
-    def add(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Take the next frame."""
+    @property
+    def tracks(self) -> bool:
+        """Whether there is no pose network, so that points are tracked, which takes the camera's intrinsics."""
+        return isinstance(self._pose, TrackedPose)
+
+    def add(self, image: UInt8[np.ndarray, "h w 3"], K: Float[np.ndarray, "3 3"] | None = None) -> None:
+        """Take the next frame, with its intrinsics in pixels if `tracks`."""
         self._images[self._count] = torch.from_numpy(network_input(image, *self._size)).to(self._device)
+        if self.tracks:
+            assert K is not None, "tracking points takes the camera"
+            self._cameras[self._count] = torch.from_numpy(Camera(K, *image.shape[:2]).resized(*self._size).K)
         self._count += 1
         while self._next + self._reach < self._count:
             self._ask_at(self._next)
@@ -99,6 +126,7 @@ class Odometer:
             self._ask_at(last - 1)
             self._answer()
         motions = np.stack([self._motions[index] for index in range(last)])
+        motions = _filled(motions) if self.tracks else motions
         if not np.isfinite(motions).all():
             raise CheckpointError("the pose network's output is not finite; the weights are damaged")
         motions[:, :3, 3] *= self.scale.factor if self.scale else 1.0
@@ -118,8 +146,9 @@ class Odometer:
         near = [[min(max(center + offset, 0), last) for offset in self._offsets] for center in self._waiting]
         target = torch.stack([self._images[center] for center in self._waiting])
         sources = torch.stack([torch.stack([self._images[index] for index in row]) for row in near])
+        cameras = (torch.stack([self._cameras[center] for center in self._waiting]),) if self.tracks else ()
         # as Python numbers: an array of torch's would hold on to its memory for the whole clip
-        answers = np.array(self._pose(target, sources).tolist(), dtype=np.float64)
+        answers = np.array(self._pose(target, sources, *cameras).tolist(), dtype=np.float64)
         for center, row in zip(self._waiting, answers, strict=True):
             for offset, T_src_tgt in zip(self._offsets, row, strict=True):
                 if offset == 1 and center < last:
@@ -128,7 +157,28 @@ class Odometer:
                     self._motions[center - 1] = np.linalg.inv(T_src_tgt)
         self._waiting.clear()
         oldest = self._count - 2 - 2 * self._reach
-        self._images = {index: image for index, image in self._images.items() if index > oldest}
+        for kept in (self._images, self._cameras):
+            for index in [index for index in kept if index <= oldest]:
+                del kept[index]
+
+
+def _filled(motions: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "n 4 4"]:
+    """Put the motion before, or the first known one, in the place of those that are unknown."""
+    known = np.isfinite(motions).all((1, 2))
+    if not known.any():
+        raise DataError(
+            f"the camera's motion is known between none of {len(motions) + 1} frames: too few points can be followed; "
+            "give brighter or sharper frames, closer in time"
+        )
+    lost = int((~known).sum())
+    if lost:
+        warnings.warn(
+            f"too few points could be followed in {lost} of {len(motions)} steps of the path; there the camera moves "
+            "on as in the step before",
+            stacklevel=2,
+        )
+    before = np.maximum.accumulate(np.where(known, np.arange(len(motions)), -1))
+    return motions[np.where(before < 0, known.argmax(), before)]
 
 
 def follow(odometer: Odometer, drive: Any, progress: bool = True) -> Float64[np.ndarray, "n 4 4"]:
@@ -141,7 +191,7 @@ def follow(odometer: Odometer, drive: Any, progress: bool = True) -> Float64[np.
     with bar(progress, "images", taken=True) as shown:
         task = shown.add_task(drive.name, total=len(numbers))
         for number in numbers:
-            odometer.add(drive.image(number))
+            odometer.add(drive.image(number), drive.intrinsics(number) if odometer.tracks else None)
             shown.advance(task)
     return odometer.trajectory()
 

@@ -265,12 +265,13 @@ class ViewerSink(Sink):
 class TrajectorySink(Sink):
     """The camera's path: drawn from above, as KITTI poses (``.txt``), and where times are known in TUM's format."""
 
-    def __init__(self, path: Path, odometer: Odometer, timed: bool) -> None:
-        self._odometer, self._times = odometer, list[float]()
+    def __init__(self, path: Path, odometer: Odometer, timed: bool, camera: Camera | None = None) -> None:
+        self._odometer, self._times, self._camera = odometer, list[float](), camera
         self.paths = (path, path.with_suffix(".txt"), *((path.with_suffix(".tum"),) if timed else ()))
 
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
-        self._odometer.add(result.image)
+        camera = self._camera and self._camera.resized(*result.image.shape[:2])
+        self._odometer.add(result.image, None if camera is None else camera.K)
         if frame.time is not None:
             self._times.append(frame.time)
 
@@ -306,7 +307,7 @@ def _viewer(clip: ClipInfo) -> Sink | None:
 def _trajectory(clip: ClipInfo) -> Sink:
     """The camera's path."""
     assert clip.odometer is not None  # it is asked for
-    return TrajectorySink(Path(f"{clip.stem}trajectory.png"), clip.odometer, clip.timed)
+    return TrajectorySink(Path(f"{clip.stem}trajectory.png"), clip.odometer, clip.timed, clip.style.camera)
 
 
 @clip_outputs.register("rrd")

@@ -240,6 +240,13 @@ def predict(
 
             path, device = locate(options.checkpoint), str(usable_device(options.device))
             odometer = Odometer.from_model(path, predictor.scale, device, options.batch_size)
+            if odometer.tracks and camera is None:
+                raise ConfigError(
+                    "outputs has 'trajectory', and the model has no pose network; tracked points tell the path too, "
+                    "with the camera: set camera=camera.yaml or camera=[fx,fy,cx,cy], or use a model trained on video"
+                )
+            if odometer.tracks:
+                print("trajectory: from tracked points (the model has no pose network), its length from depth")
         style = Style(options.colormap, None, camera, options.max_depth)
         clips = _clip_sinks(options, outputs, recording, style, odometer)
         files = tuple(output for output in outputs if output in OUTPUTS)

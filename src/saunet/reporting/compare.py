@@ -79,11 +79,12 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
         for protocol in both:
             ours, theirs = found[names[0]][protocol], found[other][protocol]
             pairs = [(one, two) for one, two in itertools.product(ours, theirs) if one.pairs(two)]
+            alike = [(one, two) for one, two in pairs if one.of.motion == two.of.motion]
             try:
-                for one, two in pairs:
+                for one, two in alike or pairs:
                     comparison = paired(one.rows, two.rows, names=(names[0], other))
-                    notes = [_told(one.of, two.of), *_sizes(runs[names[0]], runs[other], one)]
-                    tables.append(comparison.table(*notes))
+                    sizes = _sizes(runs[names[0]], runs[other], one)
+                    tables.append(comparison.table(_told(one.of, two.of), *_motions(one.of, two.of), *sizes))
                 if not pairs:
                     why = f"{_apart(ours, theirs)}; {_remedy(runs[names[0]], runs[other])}"
                     left_out.append(f"{names[0]} and {other} under {protocol}: {why}")
@@ -94,7 +95,7 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
 
 def _scored(run: Run) -> dict[str, list[Scored]]:
     """Return a run's evaluations by protocol; of several with the same images and settings, the last."""
-    found: dict[str, dict[tuple[frozenset[str], str], Scored]] = {}
+    found: dict[str, dict[tuple[frozenset[str], str, str], Scored]] = {}
     for folder in run.evaluations:
         if not (folder / "per_image.csv").is_file():
             continue
@@ -105,16 +106,24 @@ def _scored(run: Run) -> dict[str, list[Scored]]:
                 table.setdefault(row.protocol, []).append(row)
         for protocol, rows in table.items():
             scored = Scored(tuple(rows), evaluation)
-            found.setdefault(protocol, {})[scored.images, evaluation.how] = scored
+            found.setdefault(protocol, {})[scored.images, evaluation.how, evaluation.motion] = scored
     return {protocol: list(members.values()) for protocol, members in found.items()}
 
 
 def _told(one: Evaluation, two: Evaluation) -> str:
     """Say what two paired evaluations are of: the settings once where they are equal."""
     if one.how == two.how:
-        return ", ".join(filter(None, (one.data, one.how)))
+        return ", ".join(filter(None, (one.data, one.how, one.motion if one.motion == two.motion else "")))
     first, second = (each.how or ("as predicted elsewhere" if each.foreign else "plain") for each in (one, two))
     return f"{one.data}; the first {first}, the second {second}"
+
+
+def _motions(one: Evaluation, two: Evaluation) -> list[str]:
+    """Say that the camera's motion was found in different ways, which photometric errors depend on too."""
+    if one.motion == two.motion:
+        return []
+    ways = [each.motion or "the pose network's motion" for each in (one, two)]
+    return [f"the first with {ways[0]}, the second with {ways[1]}; motion=tracked for both compares depth alone"]
 
 
 def _sizes(first: Run, other: Run, scored: Scored) -> list[str]:

@@ -192,6 +192,8 @@ class Evaluation:
     """What was scored, such as ``kitti, test split``."""
     how: str
     """Settings that change the numbers, as the command line says them; empty for none."""
+    motion: str
+    """``motion=tracked`` where the camera's motion came from tracked points; empty elsewhere."""
     scores: tuple[Score, ...]
     explained: tuple[Explained, ...]
     details: tuple[Detail, ...]
@@ -221,11 +223,12 @@ def read_evaluation(folder: Path) -> Evaluation:
     data = (runtime.get("choices") or {}).get("data") or settings.get("data") or "unknown data"
     place = f"{data}, {config.get('split') or settings.get('split') or 'test'} split"
     how, images = _how(settings), content.get("images") or {}
+    motion = "motion=tracked" if settings.get("motion") == "tracked" else ""
     rows = [row for row in content.get("results", []) if all(isinstance(row.get(k), int | float) for k in ERROR_NAMES)]
 
-    def common(row: Mapping[str, Any]) -> dict[str, Any]:
+    def common(row: Mapping[str, Any], told: str = how) -> dict[str, Any]:
         protocol = row["protocol"]
-        return {"protocol": protocol, "data": place, "how": how, "fingerprint": images.get(protocol, "")}
+        return {"protocol": protocol, "data": place, "how": told, "fingerprint": images.get(protocol, "")}
 
     scores = tuple(
         Score(row["predictor"], images=row.get("images") or 0, errors=tuple(row[k] for k in ERROR_NAMES), **common(row))
@@ -233,7 +236,7 @@ def read_evaluation(folder: Path) -> Evaluation:
     )
     keys = ("condition", "images", "warped", "unwarped", "explained")
     explained = tuple(
-        Explained(**{key: row[key] for key in keys}, **common(row))
+        Explained(**{key: row[key] for key in keys}, **common(row, ", ".join(filter(None, (how, motion)))))
         for row in content.get("views", [])
         if row.get("predictor") == "model" and all(row.get(key) is not None for key in keys)
     )
@@ -244,7 +247,7 @@ def read_evaluation(folder: Path) -> Evaluation:
         if row.get("predictor") in ("model", "predictions") and row.get("group", "edges") in ("distance", "edges")
     )
     named = str(predictions) if predictions else None
-    return Evaluation(folder, checkpoint, named, place, how, scores, explained, details)
+    return Evaluation(folder, checkpoint, named, place, how, motion, scores, explained, details)
 
 
 def _cell(value: Any) -> str | float | int | None:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
@@ -28,6 +29,7 @@ from saunet.data.loading.stored import DepthMaps
 from saunet.errors import DataError
 from saunet.fingerprint import fingerprint
 from saunet.geometry.camera import scale_intrinsics
+from saunet.geometry.pose import scaled_motion
 from saunet.geometry.tracks import tracked_motion
 from saunet.io.images import resize
 from saunet.types import FrameBatch
@@ -241,6 +243,19 @@ def tracked_motions(frames: NDArray[np.uint8], K: NDArray[np.float64]) -> tuple[
             chosen = np.linspace(0, len(found.points) - 1, count).round().astype(int)
             points[place, :count] = np.c_[found.points, found.depth][chosen]
     return torch.from_numpy(motions), torch.from_numpy(points)
+
+
+def tracked_poses(
+    target: Float[torch.Tensor, "b 3 h w"],
+    sources: Float[torch.Tensor, "b s 3 h w"],
+    K: Float[torch.Tensor, "b 3 3"],
+    depth: Float[torch.Tensor, "b 1 h w"],
+) -> Float[torch.Tensor, "b s 4 4"]:
+    """Return what a pose network would, T_src_tgt in the unit of ``depth``, from tracked points; NaN where unknown."""
+    frames = (torch.cat([target[:, None], sources], 1) * 255).round().byte().permute(0, 1, 3, 4, 2).cpu().numpy()
+    found = [tracked_motions(*each) for each in zip(frames, K.double().cpu().numpy(), strict=True)]
+    motions, points = (torch.stack(each).to(depth.device) for each in zip(*found, strict=True))
+    return scaled_motion(motions, points, depth.float())
 
 
 class SkippingWindows(WindowDataset):
