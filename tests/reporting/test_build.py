@@ -76,7 +76,7 @@ def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path:
     files = write(document, tmp_path / "report")
     page = files["report.html"].read_text()
     assert [section.title for section in document.sections] == [
-        "Accuracy", "Networks", "Runs", "Training", "Depth side by side", "Accuracy and time",
+        "Accuracy", "Runs", "Training", "Depth side by side", "Networks", "Accuracy and time",
     ]  # fmt: skip
     for words in (
         "Fig. 4",
@@ -97,7 +97,7 @@ def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path:
         "figures/sweep_alpha_beta_ratio.svg",
     } <= files.keys()
     rows = list(csv.DictReader(io.StringIO(files["tables/figure10.csv"].read_text())))
-    assert [(row["Method"], row["ms per image"]) for row in rows] == [("Mono R18", "2.8"), ("run", "10.0")]
+    assert [(row["Method"], row["ms per image"]) for row in rows] == [("run", "10.0"), ("Mono R18", "2.8")]
     methods = [row["Method"] for row in csv.DictReader(io.StringIO(files["tables/table1.csv"].read_text()))]
     assert not any(method.startswith("α/β") for method in methods)
     missing = {one.what: one.why for one in document.missing}
@@ -139,6 +139,22 @@ def test_losses_side_by_side_are_figure_7(sweep: Path, picture: Path) -> None:
     missing = {one.what: one.why for one in document.missing}
     assert missing["Figs. 4, 5 and 10"] == "figures=false"
     assert "Fig. 7" not in missing
+
+
+def test_one_run_of_ones_own_comes_first_and_by_its_folders_name(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "town", abs_rel=(), status="finished")
+    for place in (folder / ".hydra" / "config.yaml", folder / "run.json"):
+        place.write_text(place.read_text().replace("name: town", "name: quick").replace('"town"', '"quick"'))
+    add_checkpoint(folder)
+    _explained(folder / "test", 0.1)
+    document = build(collect([folder]), ReportOptions(figures=False))
+    assert [section.title for section in document.sections] == ["Accuracy", "Runs", "Networks"]
+    names = [table.rows[0].cells[0] for table in document.tables]
+    assert names == ["town", "town", "stratified_nano + aunet"]
+    assert all(row.kind == "measured" for table in document.tables[:2] for row in table.rows)
+    dated = folder.rename(tmp_path / "2026-01-31_12-00-00")
+    (run,) = collect([dated]).runs
+    assert (run.name, run.called) == ("quick", "quick")
 
 
 def test_what_has_no_data_is_listed(tmp_path: Path) -> None:
@@ -253,6 +269,9 @@ def test_a_model_without_a_pose_network_is_compared_and_the_motion_of_both_is_sa
     before = _explained(tmp_path / "before", 0.2, motion="tracked")
     after = make_run(tmp_path / "after", status="finished")
     _explained(after / "network", 0.12)
+    text = " ".join(_compared(before, after).split())
+    assert "campus: second 'after' against first 'before'" in text  # as they are named
+    assert not {"unknown", "None"} & set(text.split())
     text = " ".join(_compared(after, before).split())
     assert "the first with the pose network's motion, the second with motion=tracked" in text
     assert re.search(r"warped ↓ 0\.1450 0\.2250 \+0\.0800", text)
@@ -336,7 +355,7 @@ def test_figure_10_has_a_point_where_a_run_was_timed_at_its_own_size(everything:
         ("run", accuracy, 0.01, "cpu, fp32, compiled"),
     ]
     assert table is not None
-    assert [(row.cells[0], row.cells[2], row.cells[3]) for row in table.rows[1:]] == [
+    assert [(row.cells[0], row.cells[2], row.cells[3]) for row in table.rows[:-1]] == [
         *[("run", "32x64", accuracy)] * 4,
         ("mine", "64x128", None),
     ]

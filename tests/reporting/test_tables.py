@@ -18,15 +18,27 @@ from saunet.runs.sweep import labels
 def test_measured_rows_stand_apart_from_published_ones(tmp_path: Path) -> None:
     runs = {name: make_run(tmp_path / name) for name in ("a", "b")}
     for name, folder in runs.items():
-        make_evaluation(folder / "test", "x", abs_rel=0.25 if name == "a" else 0.3)
+        make_evaluation(folder / "test", "x", abs_rel=0.25 if name == "a" else 0.3, protocol="eigen_lidar_x")
     table, missing = table1(dict(zip("ab", collect(list(runs.values())).runs, strict=True)))
+    assert table is not None
+    kinds = [row.kind for row in table.rows]
+    assert kinds == sorted(kinds)  # ours first
     ours = [row for row in table.rows if row.kind == "measured"]
     assert [row.cells[0] for row in ours] == ["a", "b", "constant depth"]  # that one once, and last
-    assert {row.group for row in ours} == {"Measured: synthetic, test split, protocol synthetic, 6 images"}
+    assert {row.group for row in ours} == {"Measured: synthetic, test split, protocol eigen_lidar_x, 6 images"}
     assert [table.best(row, 2) for row in ours] == [True, False, False]
     best = [row.cells[0] for row in table.rows if row.kind == "published" and table.best(row, 2)]
     assert best == ["DORN"]
     assert missing == []
+
+
+def test_published_rows_stand_only_beside_scores_on_the_same_split(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "mine")
+    make_evaluation(folder / "test", "x")
+    table, missing = table1({"mine": collect([folder]).runs[0]})
+    assert table is not None
+    assert {row.kind for row in table.rows} == {"measured"}
+    assert [one.what for one in missing] == ["Published rows of Table 1"]
 
 
 def test_validation_fills_in_and_says_so(tmp_path: Path) -> None:
@@ -38,7 +50,7 @@ def test_a_run_without_a_score_is_listed_with_its_reason(tmp_path: Path) -> None
     broken = make_run(tmp_path / "a", abs_rel=(), status="failed", error="the disk is full")
     (run,) = collect([broken]).runs
     table, missing = table1({"a": run})
-    assert all(row.kind == "published" for row in table.rows)
+    assert table is None
     assert [(one.what, one.why) for one in missing] == [("Table 1, row of a", "failed: the disk is full")]
 
 
@@ -51,23 +63,32 @@ def test_supervision_shows_in_the_pattern(tmp_path: Path) -> None:
 
 def test_sizes_are_in_millions() -> None:
     table, missing = table2({"mine": (2_200_000, 0)})
-    assert table.rows[-1].cells == ("mine", 2.2, None, 2.2)
+    assert table is not None
+    assert table.rows[0].cells == ("mine", 2.2, None, 2.2)
+    assert {row.kind for row in table.rows[1:]} == {"published"}
     assert not missing
+    assert table2({})[0] is None
     assert table2({})[1]
 
 
 def test_the_ablation_needs_two_networks(tmp_path: Path) -> None:
     one = {"a": collect([make_run(tmp_path / "a")]).runs[0]}
     table, missing = table3(one)
-    assert len(table.rows) == 3
+    assert table is None
     assert "no two scored runs" in missing[0].why
     two = one | {"b": collect([make_run(tmp_path / "b", encoder="resnet18", decoder="unet")]).runs[0]}
     table, missing = table3(two)
-    assert [row.cells[:3] for row in table.rows[3:]] == [
+    assert table is not None
+    assert [row.cells[:3] for row in table.rows] == [
         ("stratified_nano + aunet", "✓", "✓"),
         ("resnet18 + unet", "", ""),
     ]
     assert not missing
+    for run in two.values():
+        make_evaluation(run.path / "test", "x", protocol="eigen_camera_z")
+    table, _ = table3(dict(zip("ab", collect([run.path for run in two.values()]).runs, strict=True)))
+    assert table is not None
+    assert [row.kind for row in table.rows] == ["measured"] * 2 + ["published"] * 3
 
 
 def test_a_failed_job_is_a_row_with_its_sentence_and_the_others_are_whole(sweep: Path) -> None:
@@ -133,7 +154,7 @@ def test_another_systems_row_bears_its_name(tmp_path: Path) -> None:
     table, missing = table1(dict(zip(names, runs, strict=True)))
     assert {"theirs", "lite/disps.npy"} < {row.cells[0] for row in table.rows}
     assert "predictions" not in {row.cells[0] for row in table.rows}
-    assert not missing
+    assert not [one for one in missing if "row of" in one.what]
 
 
 def scored_jobs(sweep: Path) -> dict[str, Run]:

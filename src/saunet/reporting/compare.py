@@ -26,12 +26,12 @@ def settings_table(runs: Mapping[str, Run]) -> Table:
     members = list(runs.values())
     keys = differing(members)
     rows = [Row(cells) for cells in zip(keys, *(values(run, keys) for run in members), strict=True)]
+    trained = [bool(run.config or run.record) for run in members]  # not an evaluation or a checkpoint alone
     ended = [f"{run.status}{f': {run.error}' if run.error else ''}" for run in members]
-    if len(set(ended)) > 1:
-        rows.append(Row(("status", *ended)))
-    commits = [(run.record.get("git") or {}).get("commit") for run in members]
-    if len(set(commits)) > 1:
-        rows.append(Row(("code", *(str(commit or "unknown")[:12] for commit in commits))))
+    commits = [str((run.record.get("git") or {}).get("commit") or "unknown")[:12] for run in members]
+    for key, cells in (("status", ended), ("code", commits)):
+        if len(set(itertools.compress(cells, trained))) > 1:
+            rows.append(Row((key, *(cell if known else "" for cell, known in zip(cells, trained, strict=True)))))
     notes = () if rows else ("no setting differs",)
     return Table("settings", "Settings that differ", (Column("key"), *map(Column, runs)), tuple(rows), notes)
 
@@ -129,8 +129,8 @@ def _motions(one: Evaluation, two: Evaluation) -> list[str]:
 def _sizes(first: Run, other: Run, scored: Scored) -> list[str]:
     """Say that two runs see images of different sizes, which photometric errors depend on."""
     data = [run.config.get("data") or {} for run in (first, other)]
-    sizes = [f"{each.get('height')}x{each.get('width')}" for each in data]
-    if sizes[0] == sizes[1] or not isinstance(scored.rows[0], ViewRow):
+    sizes = [f"{each['height']}x{each['width']}" for each in data if each.get("height") and each.get("width")]
+    if len(set(sizes)) < 2 or not isinstance(scored.rows[0], ViewRow):
         return []
     return [
         f"the runs see images of different sizes, {sizes[0]} and {sizes[1]}, so these errors are not of the same pixels"

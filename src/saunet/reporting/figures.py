@@ -32,7 +32,7 @@ def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, o
 
 def draw_results(run: Run, groups: Sequence[Sequence[tuple[str, str]]], picture: Path | None) -> Any:
     """Draw each group of columns of a run's log as a row of curves, above a picture; None if nothing was logged."""
-    named = {run.name: run}
+    named = {run.called: run}
     drawn = [found for group in groups if (found := logged(named, group))]
     if not drawn:
         return None
@@ -44,7 +44,7 @@ def draw_results(run: Run, groups: Sequence[Sequence[tuple[str, str]]], picture:
     if image is not None:
         rows[-1][0].imshow(image)
         rows[-1][0].set_axis_off()
-    figure.suptitle(run.name, x=0.01, ha="left")
+    figure.suptitle(run.called, x=0.01, ha="left")
     return figure
 
 
@@ -184,5 +184,5 @@ def speed(
     notes = ("Times on different devices cannot be compared; the paper's were taken on an AGX Orin.",)
     printed = [(one.method, one.device, "", one.a1, one.seconds * 1e3) for one in published().figure10]
     ours = [row for members in rows.values() for row in members]
-    table = (*(Row(cells, "published", "Published") for cells in printed), *ours, *alone)
+    table = (*ours, *alone, *(Row(cells, "published", "Published") for cells in printed))
     return list(points.values()), Table("figure10", "Accuracy and time", headings, table, notes), missing

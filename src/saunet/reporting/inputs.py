@@ -69,10 +69,13 @@ def collect(paths: Sequence[str | Path], checkpoint: str = "best", *, strangers:
     sweeps: dict[Path, Sweep] = {}
     evaluations: dict[Path, Evaluation] = {}
     benchmarks: dict[Path, None] = {}
+    order: dict[Path, int] = {}
     for path in map(Path, paths):
         found = [(kind, place.resolve()) for kind, place in _find(path)]
         if not found:
             raise DataError(f"no run, sweep, checkpoint, evaluation or benchmark in {path}; check the path")
+        for _, place in found:
+            order.setdefault(place, len(order))
         runs |= {place: read_run(place, checkpoint) for kind, place in found if kind == "run"}
         runs |= {place: _read_checkpoint(place) for kind, place in found if kind == "checkpoint"}
         sweeps |= {place: _read_sweep(place, checkpoint) for kind, place in found if kind == "sweep"}
@@ -90,6 +93,7 @@ def collect(paths: Sequence[str | Path], checkpoint: str = "best", *, strangers:
             if origin is not None and origin.is_file() and not evaluation.foreign:
                 orphan = _read_checkpoint(origin)
             runs[orphan.path] = orphan
+            order.setdefault(orphan.path, order.get(evaluation.folder, len(order)))
             known.append(orphan)
 
     def scored(run: Run) -> Run:
@@ -103,7 +107,7 @@ def collect(paths: Sequence[str | Path], checkpoint: str = "best", *, strangers:
         )
 
     return Inputs(
-        tuple(scored(run) for run in runs.values()),
+        tuple(scored(runs[place]) for place in sorted(runs, key=lambda place: order[place])),
         tuple(dataclasses.replace(sweep, runs=tuple(map(scored, sweep.runs))) for sweep in sweeps.values()),
         tuple(benchmarks),
     )

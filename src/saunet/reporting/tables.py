@@ -71,23 +71,37 @@ def _words(one: Score | Explained | Detail) -> str:
     return f"{kind}: {where}, {one.images} image{'' if one.images == 1 else 's'}"
 
 
-def table1(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
-    """Return the paper's Table 1 with every score of the runs, and which runs have none."""
-    rows = [Row((row.method, row.pattern, *row.errors), "published", PRINTED) for row in published().table1]
-    ours = _scored(runs)
+def table1(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
+    """Return every score of the runs, with the paper's Table 1 where it compares, and which runs have none."""
+    rows, ours = list[Row](), _scored(runs)
     group = Groups(score for _, score in ours)
     for name, score in ours:
         who = score.predictor if score.trivial else name
         rows.append(Row((who, _pattern(runs[name], score), *score.errors), "measured", group(score)))
-    notes = (
+    missing = [
+        Missing(f"Table 1, row of {name}", _no_score(run))
+        for name, run in runs.items()
+        if not (run.scores or run.explained)
+    ]
+    notes = [
         "Numbers of different groups cannot be compared: the images, the ground truth or the training differ. "
         "Bold is the best of its group.",
         "Pattern: D = depth as supervision, M = monocular video, S = stereo pairs.",
-        "Eigen's last two numbers are equal in the paper; Klodt's RMSE log is a dash there.",
-    )
+    ]
+    if _compares(score for _, score in ours):
+        rows += [Row((row.method, row.pattern, *row.errors), "published", PRINTED) for row in published().table1]
+        notes.append("Eigen's last two numbers are equal in the paper; Klodt's RMSE log is a dash there.")
+    elif ours:
+        why = "they are of KITTI's Eigen split, and no run was scored on it"
+        missing.append(Missing("Published rows of Table 1", why))
     headings = (*columns("Method", "Pattern"), *ERROR_COLUMNS)
-    missing = [Missing(f"Table 1, row of {name}", _no_score(run)) for name, run in runs.items() if not run.scores]
-    return Table("table1", "Table 1. Errors and accuracy", headings, tuple(rows), notes), missing
+    table = Table("table1", "Table 1. Errors and accuracy", headings, tuple(rows), tuple(notes))
+    return table if rows else None, missing
+
+
+def _compares(scores: Iterable[Score]) -> bool:
+    """Return whether any score is under a protocol of KITTI's Eigen split, as the paper's are."""
+    return any(score.protocol.startswith("eigen") for score in scores)
 
 
 def explained_table(runs: Mapping[str, Run]) -> Table | None:
@@ -141,39 +155,39 @@ def detail_tables(runs: Mapping[str, Run]) -> list[Table]:
     return found
 
 
-def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table, list[Missing]]:
-    """Return the paper's Table 2 with the parameters of our networks."""
-    rows = [Row((row.method, None, None, row.megaparameters), "published", "Published") for row in published().table2]
-    rows += [
+def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table | None, list[Missing]]:
+    """Return the parameters of our networks, with the paper's Table 2; None without any."""
+    if not sizes:
+        return None, [Missing("Table 2", "no run has a checkpoint")]
+    rows = [
         Row((name, depth / 1e6, pose / 1e6 if pose else None, (depth + pose) / 1e6), "measured", "Counted here")
         for name, (depth, pose) in sizes.items()
     ]
+    rows += [Row((row.method, None, None, row.megaparameters), "published", "Published") for row in published().table2]
     headings = columns("Method", "Depth network|.1f", "Pose network|.1f", "Together|.1f")
     notes = ("Millions of parameters; the paper's unit is “Mb”.",)
-    missing = [] if sizes else [Missing("Table 2, our rows", "no run has a checkpoint")]
-    return Table("table2", "Table 2. Parameters", headings, tuple(rows), notes), missing
+    return Table("table2", "Table 2. Parameters", headings, tuple(rows), notes), []
 
 
-def table3(runs: Mapping[str, Run]) -> tuple[Table, list[Missing]]:
-    """Return the paper's Table 3 with our runs of different encoders and decoders."""
-    rows = [
-        Row((row.method, _tick(row.stratified), _tick(row.attention), *row.errors), "published", PRINTED)
-        for row in published().table3
-    ]
+def table3(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
+    """Return our runs of different encoders and decoders, with the paper's Table 3 where it compares; None without."""
     ours = _scored({name: run for name, run in runs.items() if run.component("model/encoder")})
     models = [(runs[name], score) for name, score in ours if not score.trivial]
     group = Groups(score for _, score in models)
     headings = (*columns("Method", "STF-T", "Attention"), *ERROR_COLUMNS)
-    notes = ["The paper's first two rows are digit for digit Mono R18 and Mono R50 of its Table 1."]
-    missing = []
-    if len({networks(run) for run, _ in models}) > 1:
-        rows += [Row((networks(run), *_ticks(run), *score.errors), "measured", group(score)) for run, score in models]
-        rest = [key for key in differing([run for run, _ in models]) if not key.startswith("model.")]
-        if rest:
-            notes.append(f"Our rows also differ in {', '.join(rest)}; the table of runs says how.")
-    else:
-        missing.append(Missing("Table 3, our rows", "no two scored runs differ in encoder or decoder"))
-    return Table("table3", "Table 3. Ablation of the networks", headings, tuple(rows), tuple(notes)), missing
+    if len({networks(run) for run, _ in models}) < 2:
+        return None, [Missing("Table 3", "no two scored runs differ in encoder or decoder")]
+    rows = [Row((networks(run), *_ticks(run), *score.errors), "measured", group(score)) for run, score in models]
+    rest, notes = [key for key in differing([run for run, _ in models]) if not key.startswith("model.")], []
+    if rest:
+        notes.append(f"Our rows also differ in {', '.join(rest)}; the table of runs says how.")
+    if _compares(score for _, score in models):
+        notes.append("The paper's first two rows are digit for digit Mono R18 and Mono R50 of its Table 1.")
+        rows += [
+            Row((row.method, _tick(row.stratified), _tick(row.attention), *row.errors), "published", PRINTED)
+            for row in published().table3
+        ]
+    return Table("table3", "Table 3. Ablation of the networks", headings, tuple(rows), tuple(notes)), []
 
 
 def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -> Table:
@@ -235,7 +249,8 @@ def losses_table(runs: Mapping[str, Run]) -> Table | None:
     for name, run in runs.items():
         validated = [row["val/loss"] for row in run.history if "val/loss" in row]
         cells = (*_progress(run), min(validated, default=None), last_mean(run, "health/automask"))
-        rows.append(Row((name, *cells), "measured"))
+        if any(cell is not None for cell in cells):
+            rows.append(Row((name, *cells), "measured"))
     notes = [
         "Loss: mean over the last tenth of the logged steps; of those pixels alone that teach, where there is an "
         "auto-mask: with few of them left, it says little."

@@ -178,12 +178,11 @@ def build(
     table2, no_sizes = tables.table2(_by_networks(everyone, sizes))
     table3, no_ablation = tables.table3({name: run for group in groups for name, run in _varied(group).items()})
     explained = tables.explained_table(everyone)
-    intro = "The paper’s numbers as published, and ours as measured by this installation."
-    sections = [
-        Section("Accuracy", (table1, *((explained,) if explained else ()), *tables.detail_tables(everyone)), intro),
-        Section("Networks", (table2, table3)),
-        Section("Runs", [*_runs(groups, draw, missing), *tables.health_tables(everyone)]),
-    ]
+    intro = "As measured by this installation; published rows, if any, are the paper’s, as printed."
+    accuracy = [table for table in (table1, explained, *tables.detail_tables(everyone)) if table]
+    networks = [table for table in (table2, table3) if table]
+    sections = [Section("Accuracy", accuracy, intro)] if accuracy else []
+    sections.append(Section("Runs", [*_runs(groups, draw, missing), *tables.health_tables(everyone)]))
     if draw:
         curves = [figure for group in groups for figure in _curves(group, missing)]
         sections += [Section("Training", curves, "Each point is a mean over neighboring steps.")] if curves else []
@@ -193,6 +192,8 @@ def build(
     galleries = [gallery for group in groups for gallery in _galleries(group, views, seen, options.zooms)]
     if galleries:
         sections.append(Section("Depth side by side", galleries, _READING))
+    if networks:
+        sections.append(Section("Networks", networks))
     points, table10, no_speed = figures.speed(inputs.benchmarks, shown, seen)
     if table10:
         sections.append(Section("Accuracy and time", [*(_speed(points) if points and draw else ()), table10]))

@@ -326,6 +326,12 @@ class Run:
     """Its number in a sweep."""
 
     @property
+    def called(self) -> str:
+        """What a person calls it: its folder's name, unless that is a date or a job's number; else its experiment's."""
+        unnamed = self.job is not None or re.match(r"\d{4}-\d\d-\d\d_", self.path.name)
+        return self.path.name if self.config and not unnamed else self.name
+
+    @property
     def seconds(self) -> float | None:
         """How long it took, by its own record."""
         try:

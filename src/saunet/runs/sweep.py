@@ -105,7 +105,7 @@ def _labels(runs: Sequence[Run]) -> list[str]:
     named = [_label(run, keys) for run in runs]
     single = any(run.job is None for run in runs)
     if single and max(map(len, named), default=0) > _LONGEST_LABEL:
-        return [run.path.name if run.config else run.name for run in runs]
+        return [run.called for run in runs]
     return named
 
 
@@ -121,7 +121,7 @@ def _label(run: Run, keys: Sequence[str]) -> str:
         if value:
             named = key in ("loss", "objective", "data", "experiment", "model")
             parts.append(value if named else f"{key.replace('/', '.').rpartition('.')[2]} = {value}")
-    return ", ".join(parts) or run.name
+    return ", ".join(parts) or run.called
 
 
 def _flatten(prefix: str, node: Any, found: dict[str, str]) -> None:
