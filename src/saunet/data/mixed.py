@@ -106,6 +106,10 @@ class MixedDataModule(DepthDataModule):
                 selections.append(selection._replace(drive=_Named(f"{name}/{selection.drive.name}", selection.drive)))
         return selections
 
+    def overlap(self) -> str | None:
+        found = ((name, self.sources[name].overlap()) for name in self._names["train"])
+        return "; ".join(f"{name}: {said}" for name, said in found if said) or None
+
     def _check_manifests(self, names: Set[str]) -> None:
         super()._check_manifests(names)
         for name in self._names["train"]:

@@ -235,6 +235,8 @@ def train(
     trainer = _trainer(options, loggers)
     data.setup("fit")
     data.train_dataloader()  # knows whether there are enough samples
+    if shared := data.overlap():
+        rank_zero_info(shared)
     model.intrinsics = focal_lengths(options.model.intrinsics, data)
     steps = check_resume(model, checkpoint, data) if checkpoint else 0
     done = {"global_step": steps, "saunet_training": checkpoint.rest.get("saunet_training", {})} if checkpoint else {}

@@ -126,6 +126,13 @@ class DepthDataModule(LightningDataModule):
         """
         raise NotImplementedError(f"{type(self).__name__} does not say which frames belong to '{split}'")
 
+    def overlap(self) -> str | None:
+        """Say in one sentence which splits share recordings, and what keeps them apart; None if that is in order.
+
+        A data set without published splits overrides it.
+        """
+        return None
+
     def setup(self, stage: str | None = None) -> None:
         """Find the windows of the splits that a stage needs, and report what is used and what is left out."""
         fresh = "train" not in self.datasets

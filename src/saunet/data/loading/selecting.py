@@ -119,6 +119,7 @@ class Division(NamedTuple):
     val: list[Frame]
     test: list[Frame]  # those of ``val`` where no recordings are named for it
     unused: int  # between training and validation
+    settings: tuple[str, str]  # which name recordings for validation and test
 
     def of(self, split: str) -> dict[str, list[int]]:
         """Return recording -> frame numbers of ``train``, ``val``, ``test`` or ``predict``."""
@@ -126,6 +127,24 @@ class Division(NamedTuple):
         for frame in {"train": self.train, "val": self.val}.get(split, self.test):
             numbers.setdefault(frame.drive, []).append(frame.number)
         return numbers
+
+    def overlap(self) -> str | None:
+        """Say in one sentence what splits share, and how to keep them apart; None if they share nothing."""
+        val, test = (f"data.{setting}" for setting in self.settings)
+        held = {frame.drive for frame in self.val}
+        shared = sorted({frame.drive for frame in self.train} & held)
+        told, fix = list[str](), list[str]()
+        if shared:
+            names = ", ".join(shared[:5]) + (", ..." if len(shared) > 5 else "")
+            told.append(f"training and validation share {names} (validation has the end of each)")
+            fix.append(f"{val}=[NAME]")
+        if self.val and {*self.val} == {*self.test}:
+            told.append(f"validation and test are the same {len(self.val)} frames, on which best.ckpt is chosen")
+            fix.append(f"{test}=[NAME]")
+        if not told:
+            return None
+        whole = f"hold out whole recordings with {' and '.join(fix)}"
+        return f"{'; '.join(told)}: for scores that hold on other roads, {whole}"
 
 
 def divide(
@@ -142,14 +161,21 @@ def divide(
     """
     (val_setting, val_names), (test_setting, test_names) = held.items()
     test = matching(test_names, list(frames), test_setting)
-    named = matching(val_names, [name for name in frames if name not in test], val_setting)
+    for pattern in val_names:
+        if set(both := matching([pattern], list(frames), val_setting)) <= set(test):
+            raise ConfigError(
+                f"{val_setting} and {test_setting} both name {', '.join(both)}; name each in one of them, or leave "
+                f"{test_setting} out, to test on what validates"
+            )
+    named = [name for name in matching(val_names, list(frames), val_setting) if name not in test]
 
     def listed(names: Iterable[str]) -> list[Frame]:
         return [Frame(name, number, "l") for name in names for number in frames[name]]
 
     rest = listed(name for name in frames if name not in test and name not in named)
     train, val = (rest, listed(named)) if named else hold_out(rest, share, gap, seed)
-    return Division(train, val, listed(test) if test else val, 0 if named else len(rest) - len(train) - len(val))
+    unused = 0 if named else len(rest) - len(train) - len(val)
+    return Division(train, val, listed(test) if test else val, unused, (val_setting, test_setting))
 
 
 def matching(patterns: Sequence[str], names: Sequence[str], setting: str) -> list[str]:

@@ -92,6 +92,9 @@ class RecordingsDataModule(FilesDataModule):
         settings = {"val_drives": self.val_drives, "test_drives": self.test_drives}
         return divide(frames, settings, self.val_share, reach(self.offsets), self.seed)
 
+    def overlap(self) -> str | None:
+        return self._division.overlap()
+
     def drives(self, split: str) -> Sequence[Drive]:
         return [self.recordings[name] for name in self._division.of(split)]
 

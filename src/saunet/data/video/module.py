@@ -24,7 +24,7 @@ from saunet.data.checks import common_size
 from saunet.data.drive import GAP, Drive
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
-from saunet.data.loading.selecting import divide
+from saunet.data.loading.selecting import Division, divide
 from saunet.data.loading.windows import Selection, measured_distance, reach
 from saunet.data.video.camera import FILE_NAME, CameraFile, Lens, check_crop
 from saunet.data.video.clips import (
@@ -351,14 +351,24 @@ class VideoDataModule(DepthDataModule):
         heights = {drive.camera_height for drive in self.drives()}
         return heights.pop() if len(heights) == 1 else None
 
+    def overlap(self) -> str | None:
+        return self._division().overlap()
+
+    def _division(self) -> Division:
+        frames = {drive.name: drive.indices for drive in self.drives()}
+        held = {"val_clips": self.val_clips, "test_clips": self.test_clips}
+        return divide(frames, held, self.val_share, reach(self.offsets), self.seed)
+
     def select(self, split: str) -> Sequence[Selection]:
         drives = {drive.name: drive for drive in self.drives()}
         if not any(drive.indices for drive in drives.values()):
             example = next(iter(drives), None) or self._broken[0]
             raise DataError(f"the clips below {self.root} hold no usable frame, such as {example}")
-        frames = {name: drive.indices for name, drive in drives.items()}
-        held = {"val_clips": self.val_clips, "test_clips": self.test_clips}
-        division = divide(frames, held, self.val_share, reach(self.offsets), self.seed)
+        division = self._division()
+        if split == "train" and not division.train and not division.unused:
+            raise ConfigError(
+                f"val_clips and test_clips hold out all clips ({', '.join(drives)}); leave one to train on"
+            )
         selections = []
         for place, (name, wanted) in enumerate(division.of(split).items()):
             drive = drives[name]

@@ -189,6 +189,8 @@ def _leak(survey: Survey) -> Iterator[Finding]:
         text = f"{survey.shared_frames} frames are read by training and by validation samples"
         fix = "hold out whole drives or clips (data.val_drives, data.val_clips) for an honest validation"
         yield Finding("warning", text, fix)
+    elif survey.overlap:
+        yield Finding("note", survey.overlap)
 
 
 def _parallax(survey: Survey) -> Iterator[Finding]:

@@ -136,6 +136,8 @@ class Survey:
     test_only: frozenset[str] = frozenset()
     """Recordings that neither training nor validation read."""
     fingerprints: dict[str, str] = field(default_factory=dict)
+    overlap: str | None = None
+    """Which splits share recordings, in a sentence."""
     shared_frames: int = 0
     """Frames that training and validation windows both read."""
     known: int = 0
@@ -186,6 +188,7 @@ def survey(
     datasets = dict(_set_up(data, splits, found))
     if "train" in datasets and "val" in datasets:
         found.shared_frames = len(_read_by(datasets["train"]) & _read_by(datasets["val"]))
+        found.overlap = data.overlap()
     drives: dict[str, Drive] = {}
     timed: dict[str, Drive] = {}
     wanted: dict[str, set[int]] = {}
