@@ -78,14 +78,9 @@ class Costed(Protocol):
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Entry point of ``saunet``; ends quietly when nobody reads what it prints any more, as after ``| head``."""
-    try:
-        _main(argv)
-        if sys.stdout is not None:  # without a console there is none
-            sys.stdout.flush()
-    except BrokenPipeError:
-        _end_if_unread()
-        raise
+    """Entry point of ``saunet``."""
+    tool, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    run(tool, rest)
 
 
 def _end_if_unread() -> None:
@@ -95,20 +90,6 @@ def _end_if_unread() -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is buffered goes nowhere
         raise SystemExit(128 + 13) from None
-
-
-def _main(argv: Sequence[str] | None) -> None:
-    given = list(sys.argv[1:] if argv is None else argv)
-    tool, *rest = given or ["--help"]
-    if tool in ("-h", "--help", "help"):
-        print(overview())
-    elif tool in ("-V", "--version", "version"):
-        print(f"saunet {__version__}")
-    elif tool in (*TOOLS, "resume", "--completion", "--complete"):
-        run(tool, rest)
-    else:
-        hint = suggest(tool, TOOLS) or f"; the tools are {', '.join(TOOLS)}"
-        sys.exit(f"saunet: the first word is a tool, not '{tool}'{hint}")
 
 
 def overview() -> str:
@@ -126,12 +107,14 @@ def run(name: str, argv: Sequence[str]) -> None:
     """Run a tool with the words of a command line; ends in `SystemExit` with the code, unless all went well.
 
     What a user can mend is said in one sentence; only a defect of the program shows a traceback.
-    ``HYDRA_FULL_ERROR=1`` shows it always.
+    ``HYDRA_FULL_ERROR=1`` shows it always. It ends quietly when nobody reads what it prints, as after ``| head``.
     """
     wait_briefly()
     try:
         with _ended_by_signals():
             code = _run(name, argv)
+            if sys.stdout is not None:  # without a console there is none
+                sys.stdout.flush()
     except KeyboardInterrupt:
         code = _say(name, "interrupted", 130)
     except SystemExit as stop:  # a run that was asked to stop says how to resume
@@ -184,11 +167,17 @@ def _say(name: str, message: str, code: int) -> int:
 
 
 def _run(name: str, argv: Sequence[str]) -> int:
-    from saunet.cli import help as help_
-
-    if {"-V", "--version"} & set(argv):
+    if name in ("-h", "--help", "help"):
+        print(overview())
+        return 0
+    if name in ("-V", "--version", "version") or {"-V", "--version"} & set(argv):
         print(f"saunet {__version__}")
         return 0
+    if name not in (*TOOLS, "resume", "--completion", "--complete"):
+        hint = suggest(name, TOOLS) or f"; the tools are {', '.join(TOOLS)}"
+        sys.exit(f"saunet: the first word is a tool, not '{name}'{hint}")
+    from saunet.cli import help as help_
+
     if name.startswith("--"):
         print("\n".join((help_.complete if name == "--complete" else help_.completion)(argv[0] if argv else "")))
         return 0
