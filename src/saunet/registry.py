@@ -221,6 +221,11 @@ class Spec:
         """Return the same component with other parameters."""
         return Spec({**self.node, **changes}, self.name)
 
+    def fitted(self, **changes: Any) -> Spec:
+        """Return the same component with other parameters, as far as it takes them."""
+        known = self.parameters
+        return self.changed(**{key: value for key, value in changes.items() if key in known})
+
     def build(self, **changes: Any) -> Any:
         """Build the component, with some parameters changed.
 

@@ -363,8 +363,7 @@ def test_an_unknown_camera_that_nothing_tells_is_refused_or_guessed(tmp_path):
     data = module(tmp_path, camera="unknown")
     with pytest.raises(DataError, match=r"cannot be known .*film a minute with turns.*model\.intrinsics=learned"):
         data.setup("fit")
-    data = module(tmp_path, camera="unknown")
-    data.guess_camera = True
+    data = module(tmp_path, camera="unknown", guess_camera=True)
     data.setup("fit")
     assert data.datasets["train"].drives[0].intrinsics(0)[0, 0] == pytest.approx(160 / np.tan(np.radians(30)))
 

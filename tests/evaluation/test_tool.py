@@ -30,7 +30,6 @@ class Data:
     protocols = ("eigen_camera_z",)
     protocol = "eigen_camera_z"
     neighbors = ("train",)
-    guess_camera = False
 
     def __init__(self, kind="camera_z"):
         self.ground_truth, self.datasets, self.stages = kind, {}, []

@@ -18,7 +18,7 @@ from saunet.errors import ConfigError, one_of
 from saunet.registry import datamodules
 
 SHARED: tuple[str, ...] = ("height", "width", "offsets", "batch_size", "workers", "crop_margin", "seed")
-SHARED += ("target_depth", "with_pose", "stereo", "on_error")
+SHARED += ("target_depth", "with_pose", "stereo", "on_error", "guess_camera")
 """Settings that belong to the mixture; its sources take them over."""
 
 
@@ -90,7 +90,6 @@ class MixedDataModule(DepthDataModule):
 
     def prepare_data(self) -> None:
         for source in self.sources.values():
-            source.guess_camera = self.guess_camera
             source.prepare_data()
 
     def select(self, split: str) -> Sequence[Selection]:
@@ -98,7 +97,6 @@ class MixedDataModule(DepthDataModule):
         selections = []
         for name in self._names["train" if split in ("train", "val") else "test"]:
             source = self.sources[name]
-            source.guess_camera = self.guess_camera
             for each in source.select(split):
                 selection = Selection(*each)
                 if source.manifest is not None and split in ("train", "val"):

@@ -327,8 +327,8 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
     device, source = usable_device(options.device), locate(options.checkpoint)
     record = read_model(source).record
     odometer = Odometer.from_model(source, device=str(device), batch_size=options.batch_size)
-    data = options.data.build(height=record.height, width=record.width, offsets=list(record.offsets))
-    data.guess_camera = not odometer.tracks  # pose networks need no intrinsics
+    about = {} if odometer.tracks else {"guess_camera": True}  # pose networks need no intrinsics
+    data = options.data.fitted(**about).build(height=record.height, width=record.width, offsets=list(record.offsets))
     data.setup("test")
     drawn = options.figure and find_spec("matplotlib") is not None
     paths, errors, notes = [], [], list[str]()

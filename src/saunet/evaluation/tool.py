@@ -59,7 +59,6 @@ class EvaluationData(Protocol):
 
     ground_truth: str
     neighbors: Sequence[str]
-    guess_camera: bool
 
     @property
     def datasets(self) -> Mapping[str, Any]:
@@ -211,8 +210,6 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         checkpoint = read_model(options.checkpoint)
         networks, found = checkpoint.networks(), checkpoint.record.intrinsics
         passes = _passes(options, _resized(options.data, checkpoint.record), motion=True)
-        for data, _ in passes:
-            data.guess_camera = found is not None
         _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth is of the same images
         depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device, first=team.rank == 0)
         model = NetworkPredictor(depth, options.flip)
@@ -262,11 +259,13 @@ def evaluate_network(
 
 
 def _resized(data: Spec, record: ModelRecord) -> Spec:
-    """Return the data at the size of a model, and with the neighbors that its pose network looks at."""
+    """Return the data at the size of a model, with the neighbors that its pose network looks at, and its camera."""
     wanted: dict[str, object] = {"height": record.height, "width": record.width}
     if record.pose:
         wanted["offsets"] = list(record.offsets)
-    return data.changed(**{key: value for key, value in wanted.items() if key in data.parameters})
+    if record.intrinsics:
+        wanted["guess_camera"] = True
+    return data.fitted(**wanted)
 
 
 def _set_up(data: EvaluationData, split: str) -> None:

@@ -228,8 +228,8 @@ def train(
     resume = resume_path(options.resume, folder, options.init_from)
     checkpoint = read_checkpoint(resume) if resume else None  # before the data are set up, which takes its time
     seed_everything(options.seed, workers=True, verbose=False)
-    data = options.data.build()
-    data.guess_camera = options.model.intrinsics == "learned"
+    learned = options.model.intrinsics == "learned"
+    data = (options.data.fitted(guess_camera=True) if learned else options.data).build()
     model = assemble(options, data, pretrained=resume is None and options.init_from is None)
     loggers = _loggers(options)
     trainer = _trainer(options, loggers)

@@ -77,8 +77,8 @@ class DepthDataModule(LightningDataModule):
     """Whether ``saunet prepare cache`` can make copies for it."""
     root: str | None = None
     """Where its files are; None if it reads none."""
-    guess_camera: bool = False
-    """Whether a camera that is unknown, and that its frames do not tell, is guessed: intrinsics are learned."""
+    static: str | None = None
+    """What becomes of frames without motion, where a parameter of this name decides it; None without one."""
     recognizable: bool = True
     """Whether its files are arranged as those of no other data set, so that it can be found among others."""
 
@@ -102,7 +102,7 @@ class DepthDataModule(LightningDataModule):
         self.offsets, self.seed = tuple(options.offsets), options.seed
         self.batch_size, self.workers = options.batch_size, options.workers
         self.crop_margin, self.on_error = options.crop_margin, options.on_error
-        self.track_motion = options.track_motion
+        self.track_motion, self.guess_camera = options.track_motion, options.guess_camera
         self.target_depth, self.with_pose, self.stereo = target_depth, with_pose, stereo
         self.manifest = read_manifest(options.manifest) if options.manifest else None
         self.flip_prob, self.color_jitter_prob = options.flip_prob, options.color_jitter_prob
@@ -206,7 +206,7 @@ class DepthDataModule(LightningDataModule):
                 reasons.update(drive.left_out)
             still = reasons["doubled"] + reasons["static"]
             if still > reasons.total() / 2:
-                keep = ", or set data.static=keep" if hasattr(self, "static") else ""
+                keep = ", or set data.static=keep" if self.static not in (None, "keep") else ""
                 advice = f"{still} frames show no motion (doubled or standing): give longer clips that move{keep}"
             raise DataError(f"split '{split}' has no usable frame ({found}); {advice}")
         self.usage[split] = usage

@@ -27,6 +27,8 @@ class LoadOptions:
         color_jitter_prob: Probability of color jitter in training.
         track_motion: Take the camera's motion from tracked points instead of the pose network, which then learns it
             through ``objective.extra.tracked_motion``; see `saunet.geometry.tracks.tracked_motion`.
+        guess_camera: Start from 60 degrees of view where the camera is unknown and its frames do not tell it; else such
+            data are refused. ``model.intrinsics=learned`` sets it.
         seed: Decides order, augmentation, and what is held out at random.
         manifest: File of frames to leave out of training and validation, as the doctor writes it.
         on_error: A file that cannot be read: ``raise`` stops and names it; ``skip`` names and counts it and carries
@@ -45,6 +47,7 @@ class LoadOptions:
     flip_prob: float = 0.5
     color_jitter_prob: float = 0.5
     track_motion: bool = False
+    guess_camera: bool = False
     seed: int = 0
     manifest: str | None = None
     on_error: Literal["raise", "skip"] = "raise"
@@ -72,6 +75,7 @@ class Loading(TypedDict, total=False):
     flip_prob: float
     color_jitter_prob: float
     track_motion: bool
+    guess_camera: bool
     seed: int
     manifest: str | None
     on_error: Literal["raise", "skip"]
