@@ -10,7 +10,7 @@ import pytest
 
 from saunet.errors import DataError
 from saunet.evaluation.result import EvaluationResult, ImageRow, ViewRow, read_rows, write_results
-from saunet.evaluation.statistics import bootstrap_mean, compare, drive_of, spreads, with_statistics
+from saunet.evaluation.statistics import bootstrap_mean, compare, spreads, with_statistics
 from saunet.metrics.protocols import protocol
 
 
@@ -173,11 +173,6 @@ def test_spreads_resample_drives_where_there_are_enough_and_say_what_they_did():
 def test_no_spread_where_no_image_has_truth():
     blank = tuple(rows(np.full((3, 7), math.nan), blank=range(3)))
     assert spreads(EvaluationResult((protocol("metric"),), ("m",), blank)) == ()
-
-
-def test_drive_of():
-    assert drive_of("synthetic 7 0000000005") == "synthetic 7"
-    assert drive_of("2011_09_26/2011_09_26_drive_0001_sync 0000000005 l") == "2011_09_26/2011_09_26_drive_0001_sync"
 
 
 def test_an_earlier_evaluation_without_ground_truth_is_compared_too(tmp_path):

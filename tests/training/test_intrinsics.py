@@ -54,6 +54,7 @@ def test_zoom_goes_along_with_resize_crop_and_flip() -> None:
 @pytest.mark.parametrize("drive", ["x", "2011_09_26/drive_0001_sync l", "a 0000000003"])
 def test_the_recording_is_known_by_the_name_of_the_sample(drive: str) -> None:
     assert recording_of(sample_name(drive, 17)) == drive
+    assert recording_of(sample_name(drive, 17), with_side=False) == drive.removesuffix(" l")
 
 
 @pytest.mark.parametrize(("mode", "factors"), [("refined", (1, 1, 1)), ("learned", (GUESS / 0.6, GUESS / 0.3, GUESS))])

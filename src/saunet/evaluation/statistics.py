@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,6 +12,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 from scipy import stats
 
+from saunet.data.loading.windows import recording_of
 from saunet.errors import ConfigError, DataError
 from saunet.evaluation.result import COMPARED, Comparison, Difference, EvaluationResult, ImageRow, Spread, ViewRow
 
@@ -21,14 +21,9 @@ FEWEST_DRIVES = 5
 RESAMPLES = 2000
 
 
-def drive_of(name: str) -> str:
-    """Return the drive in an image's name: all before the frame's number, such as ``2011_09_26/..._sync``."""
-    return re.sub(r" \d+( [lr])?$", "", name)
-
-
 def groups_of(names: Sequence[str]) -> tuple[str, int, list[str]]:
     """Choose what to resample: drives where there are `FEWEST_DRIVES`, else images."""
-    drives = [drive_of(name) for name in names]
+    drives = [recording_of(name, with_side=False) for name in names]
     count = len(set(drives))
     return ("drive", count, drives) if count >= FEWEST_DRIVES else ("image", len(names), list(names))
 

@@ -30,7 +30,7 @@ from saunet.evaluation.predictors import (
 )
 from saunet.evaluation.result import EvaluationResult, read_rows, write_results
 from saunet.evaluation.scoring import Buckets, Shapes, score, score_views
-from saunet.evaluation.statistics import drive_of, with_statistics
+from saunet.evaluation.statistics import with_statistics
 from saunet.evaluation.team import Team, joined
 from saunet.geometry.camera import zoom_intrinsics
 from saunet.io.atomic import check_folder
@@ -394,7 +394,7 @@ def _conditions(data: EvaluationData, split: str) -> Callable[[str], str]:
     conditions = {
         dataset.name(place): dataset.drives[position].condition for place, (position, _) in enumerate(dataset.windows)
     }
-    return lambda image: conditions.get(image) or drive_of(image)
+    return lambda image: conditions.get(image) or recording_of(image, with_side=False)
 
 
 def trivial(data: EvaluationData, truth_cache: str | None = None) -> dict[str, Predictor]:

@@ -380,6 +380,6 @@ def sample_name(drive: str, frame: int) -> str:
     return f"{folder} {frame:010d} {side}" if folder and side in ("l", "r") else f"{drive} {frame:010d}"
 
 
-def recording_of(name: str) -> str:
-    """Return the drive in a `sample_name`."""
-    return re.sub(r" \d{10,}( [lr])?$", r"\1", name)
+def recording_of(name: str, *, with_side: bool = True) -> str:
+    """Return the drive in a `sample_name`; without its camera side, both cameras of a pair are one."""
+    return re.sub(r" \d+( [lr])?$", r"\1" if with_side else "", name)
