@@ -11,6 +11,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -344,14 +345,23 @@ def fill(
 ) -> int:
     """Predict every frame into every sink, with a few pictures in memory; return how many.
 
-    A picture that cannot be read becomes one sentence in ``failures`` if that is given, and is an error else; ``check``
+    A thread writes one batch while the network has the next one; a ``live`` camera's depth is written at once. A picture that cannot be read becomes one sentence in ``failures`` if that is given, and is an error else; ``check``
     has the last word before sinks are completed. Ctrl-C completes what a ``live`` camera has given so far.
     """
     count, left, limits = 0, iter(frames), RunningRange(range_smoothing)
+
+    def write(batch: Sequence[Frame], results: Sequence[Prediction]) -> None:
+        for frame, result in zip(batch, results, strict=True):
+            now = limits.update(result.disparity)
+            for sink in sinks:
+                sink.add(frame, result, now)
+
     with contextlib.ExitStack() as stack:
         stopped = stack.enter_context(_interrupt_noted(live))
         for sink in sinks:
             stack.enter_context(sink)
+        writer = stack.enter_context(ThreadPoolExecutor(1))  # ends before the sinks do
+        writing: Future[None] | None = None
         shown = stack.enter_context(bar())
         task = shown.add_task("predicting", total=total)
         try:
@@ -365,19 +375,24 @@ def fill(
                         if failures is None:
                             raise
                         failures.append(str(error))
-                for frame, result in zip(kept, predictor.predict_batch(pictures), strict=True):
-                    now = limits.update(result.disparity)
-                    for sink in sinks:
-                        sink.add(frame, result, now)
-                    count += 1
-                    if live is not None and frame.arrived is not None:
-                        shown.update(task, description=f"predicting, {live.answered(frame.arrived)}")
+                results = predictor.predict_batch(pictures)
+                if writing is not None:
+                    writing.result()
+                if live is None:
+                    writing = writer.submit(write, kept, results)
+                else:
+                    write(kept, results)
+                    for at in (frame.arrived for frame in kept if frame.arrived is not None):
+                        shown.update(task, description=f"predicting, {live.answered(at)}")
+                count += len(kept)
                 shown.advance(task, len(batch))
             if stopped() and count == 0:
                 raise KeyboardInterrupt
         except KeyboardInterrupt:
             if live is None or stopped() or count == 0:
                 raise
+        if writing is not None:
+            writing.result()
         check()
     return count
 
