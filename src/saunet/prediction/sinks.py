@@ -345,8 +345,9 @@ def fill(
 ) -> int:
     """Predict every frame into every sink, with a few pictures in memory; return how many.
 
-    A thread writes one batch while the network has the next one; a ``live`` camera's depth is written at once. A picture that cannot be read becomes one sentence in ``failures`` if that is given, and is an error else; ``check``
-    has the last word before sinks are completed. Ctrl-C completes what a ``live`` camera has given so far.
+    A thread writes one batch while the network has the next one; what a ``live`` camera shows is written at once. A
+    picture that cannot be read becomes one sentence in ``failures`` if that is given, and is an error else; ``check``
+    has the last word before sinks are completed. Ctrl-C completes what a live camera has given so far.
     """
     count, left, limits = 0, iter(frames), RunningRange(range_smoothing)
 

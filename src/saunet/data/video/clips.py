@@ -129,7 +129,7 @@ def _is_image(name: str) -> bool:
 
 
 def _suffix(name: str) -> str:
-    return os.path.splitext(name)[1].lower()
+    return name[dot:].lower() if (dot := name.rfind(".")) > 0 else ""
 
 
 def every(recorded: float | None, wanted: float | None) -> Iterator[int]:
