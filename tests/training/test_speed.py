@@ -20,7 +20,7 @@ import saunet
 from saunet.models.depth import DepthNet
 from saunet.models.layers.conv import training_format
 from saunet.training.optim import Recipe
-from saunet.training.speed import Speed, blocks
+from saunet.training.speed import Speed, recomputable
 
 STEPS = 50
 
@@ -79,7 +79,8 @@ def test_recomputed_activations_give_the_same_gradients_and_statistics(network: 
     twin = copy.deepcopy(network)
     applied(Speed(), network)
     applied(Speed(checkpoint_activations=True), twin)
-    assert len(blocks(twin.encoder)) == 8  # the residual blocks
+    assert [method for _, method in recomputable(twin.encoder)] == ["begin", *["forward"] * 8]  # the residual blocks
+    assert recomputable(twin.decoder) == [(twin.decoder, "level")]
     image = torch.rand(2, 3, 64, 96)
     for each in (network, twin):
         each.train()

@@ -58,15 +58,20 @@ class SkipDecoder(Decoder):
     def enlarge(self, x: Tensor) -> Tensor:
         return upsample(x)
 
+    def level(self, place: int, x: Tensor, skip: Tensor | None) -> Tensor:
+        """Return the map of the next finer level; training may compute it again for the gradient."""
+        x = self.enlarge(self.before[place](x))
+        joined: Tensor = self.after[place](x if skip is None else torch.cat([x, skip], 1))
+        return joined
+
     def forward(self, features: Sequence[Tensor]) -> tuple[Tensor, ...]:
         skips = dict(zip(self.skips, features, strict=True))
         level = self.deepest
         x = skips[level]
         maps = []
-        for before, after in zip(self.before, self.after, strict=True):
+        for place in range(len(self.before)):
             level -= 1
-            x = self.enlarge(before(x))
-            x = after(torch.cat([x, skips[level]], 1) if level in skips else x)
+            x = self.level(place, x, skips.get(level))
             if level - self.finest < len(self.heads):
                 maps.append(self.heads[level - self.finest](x))
         return tuple(reversed(maps))

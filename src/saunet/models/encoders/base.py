@@ -1,0 +1,17 @@
+"""What encoders share."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class StemEncoder(nn.Module, abc.ABC):
+    """An encoder whose first layers can be computed again for the gradient: their maps are the largest of all."""
+
+    @abc.abstractmethod
+    def begin(self, image: Float[Tensor, "b c h w"]) -> Any:
+        """Return what the first block takes, and the finest feature where there is one before it."""
