@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from videos import write_video
 
 import saunet
 from saunet.data.video.camera import read_camera
-from saunet.data.video.focal import WINDOW, FocalEstimate, WindowFocal, combined, solve_window, with_bend
+from saunet.data.video.focal import WINDOW, FocalEstimate, WindowFocal, combined, solve_window, with_lens
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import write_image
 from saunet.synthetic.world import turn
@@ -24,14 +26,16 @@ from saunet.tools.doctor.survey import survey
 SIZE = (188, 620)  # height, width
 
 
-def made(focal: float, degrees: float, seed: int = 0, k1: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def made(
+    focal: float, degrees: float, seed: int = 0, k1: float = 0.0, right: float = 0.0
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Points seen from a car that turns by so many degrees a frame; 0.2 px of noise, and a tenth of them move."""
     rng = np.random.default_rng(seed)
     height, width = SIZE
     ends = np.stack([rng.uniform(0, width, 300), rng.uniform(0, height, 300)], axis=1)
     depth = 1 / rng.uniform(1 / 50, 1 / 5, 300)
     f = focal * width
-    center = np.array([(width - 1) / 2, (height - 1) / 2])
+    center = np.array([(width - 1) / 2 + right * width, (height - 1) / 2])
     points = np.concatenate([(ends - center) / f, np.ones((300, 1))], axis=1) * depth[:, None]
     pixels, T = [], np.eye(4)
     back = np.eye(4)
@@ -58,12 +62,11 @@ def test_turns_tell_the_focal_length_and_straights_say_that_they_do_not(focal: f
     assert straight is None or straight.uncertainty > 0.03
 
 
-def drive_with(k1: float) -> tuple[WindowFocal, FocalEstimate]:
-    solvers = [
-        partial(solve_window, *made(0.58, degrees, seed, k1), SIZE) for seed, degrees in enumerate((2, 2.5, -2, 3))
-    ]
+def drive_with(k1: float, right: float = 0.0) -> tuple[WindowFocal, FocalEstimate]:
+    turns = (2, 2.5, -2, 3)
+    solvers = [partial(solve_window, *made(0.58, turn, seed, k1, right), SIZE) for seed, turn in enumerate(turns)]
     straight = [found for solver in solvers if (found := solver())]
-    estimate = with_bend(solvers, straight)
+    estimate = with_lens(solvers, straight)
     assert estimate is not None
     return straight[0], estimate
 
@@ -78,6 +81,47 @@ def test_the_bend_of_a_lens_is_found_with_the_focal_length(k1: float, longer: fl
     assert found.distortion == pytest.approx(k1, abs=0.02)
     assert "division model, -0." in found.assumed
     assert found.uncertainty < 0.03
+
+
+def test_a_center_aside_is_found_and_not_taken_for_a_bend() -> None:
+    straight, found = drive_with(0.0, right=0.04)
+    assert abs(straight.focal / 0.58 - 1) > 0.015
+    assert found.focal == pytest.approx(0.58, rel=0.01)
+    assert found.right == pytest.approx(0.04, abs=0.003)
+    assert (found.bend, found.down) == (0, 0)
+    K = found.intrinsics(*SIZE, SIZE[1])
+    assert K[0, 2] == pytest.approx((0.5 + 0.04) * SIZE[1] - 0.5, abs=2)
+    assert "of the width to the right" in found.assumed
+
+
+def lens(*curvatures: float) -> FocalEstimate:
+    """Windows of a lens whose bend is -0.16, each with the curvature of its squared residuals in the bend."""
+
+    def solver(curvature: float, bend: float = 0.0, right: float = 0.0, down: float = 0.0) -> WindowFocal:
+        squares = 0.09 * (1 + curvature * (bend + 0.16) ** 2 + 9 * (right**2 + down**2))
+        return WindowFocal(0.8 * math.exp(1.3 * (bend + 0.16)), 0.002, math.sqrt(squares))
+
+    solvers = [partial(solver, curvature) for curvature in curvatures]
+    estimate = with_lens(solvers, [solver() for solver in solvers])
+    assert estimate is not None
+    return estimate
+
+
+def test_a_window_that_says_nothing_of_the_bend_does_not_silence_the_others() -> None:
+    found = lens(5, 6, 4, -0.5, 5, 0.2)
+    assert found.bend == pytest.approx(-0.16, abs=0.01)
+    assert found.focal == pytest.approx(0.8, rel=0.01)
+    assert found.is_known
+
+
+@pytest.mark.parametrize("curvatures", [(-0.5, -0.2, -0.4, -0.1), (0.4, -0.4, 0.1, -0.05)])
+def test_a_focal_length_is_not_known_where_the_bend_is_not(curvatures: tuple[float, ...]) -> None:
+    """It is 23 % too long without the bend, however sure the windows are."""
+    assert not lens(*curvatures).is_known
+
+
+def test_what_time_did_not_allow_to_look_for_is_said() -> None:
+    assert "not looked for" in replace(lens(5, 5, 5), bend=None).assumed
 
 
 def test_a_straight_lens_stays_straight() -> None:

@@ -4,7 +4,8 @@ Two views never tell it for a car on a steady curve, and straight motion tells i
 solved with the focal length free, each says how well it knows it, and only what the windows agree on counts.
 
 A lens that bends the picture changes the focal length much more than the residuals: k1 = -0.1 makes it 22 % too long.
-So the windows are solved for several bends of the division model too, whose correction needs no focal length.
+So the windows are solved for several bends of the division model too, whose correction needs no focal length, and for
+several centers.
 """
 
 from __future__ import annotations
@@ -38,10 +39,16 @@ WIDTH = 620
 """Pictures are made this narrow."""
 KNOWN = 0.015
 """Relative standard deviation up to which a focal length counts as known."""
-_BEND, _FINE = 0.2, 0.05
-"""Steps in the bend of a lens, coarse and fine."""
-_BENDS = 6
-"""Windows that are solved for each bend; three are needed."""
+_AXES = ("bend", "right", "down")
+"""How a lens may differ from a straight one with its center in the middle."""
+_COARSE = (0.2, 0.03, 0.03)
+"""Steps in these while they are searched."""
+_FINE = (0.05, 0.01, 0.01)
+"""Steps around the best ones: two to each side, whose residuals a parabola averages."""
+_LEAST = (0.05, 0.005, 0.005)
+"""What is smaller counts as nothing."""
+_SHARPEST = 6
+"""Windows that are solved for each lens; three are needed."""
 _MODEL = 0.04
 """Doubt about the form of the lens, as a share of what its bend changes the focal length by."""
 _START = 0.8
@@ -90,18 +97,20 @@ def solve_window(
     size: tuple[int, int],
     center: tuple[float, float] | None = None,
     bend: float = 0.0,
+    right: float = 0.0,
+    down: float = 0.0,
 ) -> WindowFocal | None:
     """Bundle-adjust a window: poses, inverse depths along the rays of the first view, and one focal length.
 
-    ``center`` is the principal point in pixels, by default the picture's middle, and ``bend`` that of
-    `FocalEstimate.bend`. None if too few points are tracked.
+    ``center`` is where the principal point is expected, in pixels, by default in the picture's middle; ``bend``,
+    ``right`` and ``down`` are those of `FocalEstimate`. None if too few points are tracked.
     """
     use = known.sum(1) >= 5
     if use.sum() < _FEWEST:
         return None
     height, width = size
     middle = np.array(center or ((width - 1) / 2, (height - 1) / 2))
-    x = (pixels[use] - middle) / width
+    x = (pixels[use] - middle) / width - np.array([right, down])
     fit = _adjust(x / (1 + bend * (x**2).sum(-1, keepdims=True)), known[use], _START)
     return fit and WindowFocal(fit[0], fit[1], fit[2] * width)
 
@@ -115,19 +124,31 @@ class FocalEstimate:
     uncertainty: float
     """Relative standard deviation, larger where windows disagree."""
     windows: int
-    bend: float = 0.0
-    """Of the lens: a straight picture's points are ``x / (1 + bend * |x|^2)``, in widths; 0 where none was found."""
+    bend: float | None = 0.0
+    """Of the lens: a straight picture's points are ``x / (1 + bend * |x|^2)``, in widths; 0 where none was found, None
+    where time did not allow to look for it."""
+    right: float = 0.0
+    """How far the principal point is from where it was expected, in widths."""
+    down: float = 0.0
 
     @property
     def distortion(self) -> float:
         """The bend as the parameter of the division model, whose radii are in focal lengths."""
-        return self.bend * self.focal**2
+        return (self.bend or 0.0) * self.focal**2
+
+    def intrinsics(self, height: int, width: int, unit: int) -> F64:
+        """Return K for a picture of this size, whose middle was the expected center; ``unit`` pixels are a width."""
+        x, y = (width - 1) / 2 + self.right * unit, (height - 1) / 2 + self.down * unit
+        return np.array([[self.focal * unit, 0, x], [0, self.focal * unit, y], [0, 0, 1]])
 
     @property
     def assumed(self) -> str:
         """What is to be said with the estimate."""
         bent = f"lens: division model, {self.distortion:.3f}" if self.bend else "no distortion found"
-        return f"{bent}; assumed: the center in the middle"
+        if self.bend is None:
+            bent = "distortion not looked for, which would make it too long"
+        elsewhere = f"center {self.right:+.1%} of the width to the right and {self.down:+.1%} down of the middle"
+        return f"{bent}; {elsewhere if self.right or self.down else 'center in the middle'}"
 
     @property
     def is_known(self) -> bool:
@@ -158,7 +179,8 @@ def combined(found: Sequence[WindowFocal]) -> FocalEstimate | None:
 
 def refusal(found: FocalEstimate | None, source: str) -> str:
     """Say why a focal length cannot be known, and what to film."""
-    known = "nothing says it" if found is None else f"it is known to {found.uncertainty:.1%} only"
+    vague = found is None or not math.isfinite(found.uncertainty)
+    known = "nothing says it" if found is None or vague else f"it is known to {found.uncertainty:.1%} only"
     film = "film a minute with turns at 15 to 30 km/h: corners, a roundabout, a winding road"
     return f"the focal length cannot be known from {source}: {known}, {KNOWN:.1%} is required; {film}"
 
@@ -204,77 +226,113 @@ def estimate_focal(
     most: int = 16,
     center: tuple[float, float] | None = None,
     seconds: float = math.inf,
+    free_center: bool = True,
 ) -> FocalEstimate | None:
     """Estimate the focal length from windows of gray frames; the ``most`` that turn most are solved.
 
-    ``center`` is the principal point in picture widths. After ``seconds`` no window is begun but the three that are
-    needed, and the lens is not looked at. None if no window has enough points to follow.
+    ``center`` is the principal point in picture widths, or where to look for it if it is ``free_center``. After
+    ``seconds`` of processor time no window is begun but the three that are needed, and the lens is not looked at. None
+    if no window has enough points to follow.
     """
-    began = time.monotonic()
+    began = time.process_time()
     best: list[tuple[float, int, Any]] = []
     for number, frames in enumerate(windows):
         pixels, known = track(frames)
         heapq.heappush(best, (turning(pixels, known), number, (pixels, known, frames[0].shape[:2])))
         if len(best) > most:
             heapq.heappop(best)
-        if number >= 2 and time.monotonic() - began > seconds / 2:
+        if number >= 2 and time.process_time() - began > seconds / 2:
             break
     solved: list[WindowFocal] = []
     solvers: list[Solver] = []
     for number, (_, _, (pixels, known, size)) in enumerate(sorted(best, reverse=True, key=itemgetter(0))):
-        if number >= 3 and time.monotonic() - began > seconds:
+        if number >= 3 and time.process_time() - began > seconds:
             break
         at = None if center is None else (center[0] * size[1], center[1] * size[1])
         solver = functools.partial(solve_window, pixels, known, size, at)
         if found := solver():
             solved.append(found)
             solvers.append(solver)
-    return with_bend(solvers, solved) if time.monotonic() - began < seconds else combined(solved)
+    if time.process_time() - began < seconds:
+        return with_lens(solvers, solved, free_center)
+    found = combined(solved)
+    return found and replace(found, bend=None)
 
 
 Solver = Callable[..., WindowFocal | None]
-"""`solve_window` of one window, which takes the bend."""
+"""`solve_window` of one window, which takes the bend and where the center is."""
 
 
-def with_bend(solvers: Sequence[Solver], straight: Sequence[WindowFocal]) -> FocalEstimate | None:
-    """Return what windows say together, with the bend of the lens where they agree on one.
+def with_lens(
+    solvers: Sequence[Solver], straight: Sequence[WindowFocal], free_center: bool = True
+) -> FocalEstimate | None:
+    """Return what windows say together, with the bend of the lens and its center where they agree on them.
 
-    ``straight`` has what each window says without. The squared residuals are a parabola in the bend.
+    ``straight`` has what each window says without. One after the other, each goes where the windows' squared residuals
+    together are lowest: to the best coarse step, then to the lowest point of a parabola.
     """
     together = combined(straight)
-    sharpest = sorted(range(len(straight)), key=lambda index: straight[index].uncertainty)[:_BENDS]
+    sharpest = sorted(range(len(straight)), key=lambda index: straight[index].uncertainty)[:_SHARPEST]
     if together is None or len(sharpest) < 3:
         return together
+    unknown = replace(together, uncertainty=math.inf)
 
     @functools.cache
-    def solve(bend: float) -> list[WindowFocal] | None:
-        found = [solvers[index](bend=bend) if bend else straight[index] for index in sharpest]
+    def solve(lens: tuple[float, ...]) -> list[WindowFocal] | None:
+        about = dict(zip(_AXES, lens, strict=True))
+        found = [solvers[index](**about) if any(lens) else straight[index] for index in sharpest]
         return None if None in found else [each for each in found if each]
 
-    def squares(bend: float) -> NDArray[np.float64]:
-        return np.array([each.error**2 for each in found]) if (found := solve(bend)) else np.full(len(sharpest), np.inf)
+    def costs(lens: tuple[float, ...]) -> F64:
+        """Return minus twice the logarithm of each window's likelihood, up to a factor and a constant."""
+        return np.log([each.error**2 for each in found]) if (found := solve(lens)) else np.full(len(sharpest), np.inf)
 
-    best = 0.0
-    for way in (-_BEND, _BEND):
-        while abs(best + way) < 1 and np.log(squares(best + way)).sum() < np.log(squares(best)).sum():
-            best = round(best + way, 3)
-    for step in (_BEND, _FINE):
-        left, middle, right = (squares(best + shift) for shift in (-step, 0, step))
-        curvature = left - 2 * middle + right
-        if not (np.isfinite(curvature).all() and (curvature > 0).all()):
-            return together
-        lows = best + step / 2 * (left - right) / curvature
-        best = float(np.median(lows))
-    deviation = float(lows.std(ddof=1) / math.sqrt(len(lows)))
-    if abs(best) < max(4 * deviation, 0.05):
-        return together
-    bent = combined([each for solver in solvers if (each := solver(bend=best))])
-    near, far = solve(best - _FINE), solve(best + _FINE)
-    if bent is None or near is None or far is None:
-        return together
-    slope = math.log(np.median([each.focal for each in far]) / np.median([each.focal for each in near])) / (2 * _FINE)
-    model = _MODEL * math.log(bent.focal / together.focal)
-    return replace(bent, uncertainty=math.hypot(bent.uncertainty, slope * deviation, model), bend=best)
+    best, axes = (0.0, 0.0, 0.0), range(3 if free_center else 1)
+
+    def moved(axis: int, by: float) -> tuple[float, ...]:
+        return tuple(round(value + by * (axis == place), 4) for place, value in enumerate(best))
+
+    def table(axis: int, steps: Sequence[float]) -> F64:
+        return np.array([costs(moved(axis, step)) for step in steps])
+
+    for axis in (*axes, *axes):  # twice: a center aside looks like a bend as long as it is not found
+        for way in (-_COARSE[axis], _COARSE[axis]):
+            while abs(moved(axis, way)[axis]) < 1 and costs(moved(axis, way)).sum() < costs(best).sum():
+                best = moved(axis, way)
+        steps = (-_COARSE[axis], 0.0, _COARSE[axis])
+        best = moved(axis, _lowest(steps, table(axis, steps).sum(1)) or 0.0)
+    doubts = []
+    for axis in axes:
+        steps = tuple(_FINE[axis] * place for place in (-2, -1, 0, 1, 2))
+        measured = table(axis, steps)
+        low = _lowest(steps, measured.sum(1))
+        without = [_lowest(steps, np.delete(measured, window, 1).sum(1)) for window in range(len(sharpest))]
+        near, far = solve(moved(axis, steps[0])), solve(moved(axis, steps[-1]))
+        if low is None or None in without or near is None or far is None:
+            return unknown
+        lows = np.array(without, np.float64)
+        deviation = math.sqrt((len(lows) - 1) * float(lows.var()))  # the jackknife
+        slope = math.log(np.median([each.focal for each in far]) / np.median([each.focal for each in near]))
+        doubts.append(slope / (steps[-1] - steps[0]) * deviation)
+        best = moved(axis, low)
+        if abs(best[axis]) < max(4 * deviation, _LEAST[axis]):
+            best = moved(axis, -best[axis])
+    if not any(best):
+        return replace(together, uncertainty=math.hypot(together.uncertainty, *doubts))
+    about = dict(zip(_AXES, best, strict=True))
+    bent = combined([each for solver in solvers if (each := solver(**about))])
+    if bent is None:
+        return unknown
+    model = _MODEL * math.log(bent.focal / together.focal) if best[0] else 0.0
+    return replace(bent, uncertainty=math.hypot(bent.uncertainty, *doubts, model), **about)
+
+
+def _lowest(places: Sequence[float], costs: F64) -> float | None:
+    """Return where the parabola through costs is lowest, not beyond the places; None if it opens downwards."""
+    if not np.isfinite(costs).all():
+        return None
+    square, line, _ = np.polyfit(places, costs, 2)
+    return float(np.clip(-line / (2 * square), places[0], places[-1])) if square > 0 else None
 
 
 def _adjust(x: F64, known: NDArray[np.bool_], focal: float) -> tuple[float, float, float] | None:

@@ -404,7 +404,7 @@ class VideoDataModule(DepthDataModule):
                 f"focal length of {what}: {focal:.1f} px of {width} ({view:.0f} degrees), known to "
                 f"{found.uncertainty:.2%} from {found.windows} windows of {WINDOW} frames; {found.assumed}"
             )
-            K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+            K = found.intrinsics(height, width, several[0].frame_size[1])
             lens: dict[str, Any] = {"model": "division", "distortion": (found.distortion,)} if found.bend else {}
             for drive in several:
                 known[drive.name] = replace(drive.clip.camera, K=K, image_size=(height, width), is_known=True, **lens)
@@ -413,7 +413,8 @@ class VideoDataModule(DepthDataModule):
     def _focal(self, drives: Sequence[ClipDrive]) -> FocalEstimate | None:
         """Return what turns say about the focal length of one camera, in widths of its drives' frames; kept on disk."""
         keys = [motion_key(drive.recording.paths, self.crop or drive.clip.camera.crop) for drive in drives]
-        file = self.frames_cache / f"focal-{short_hash(repr((keys, self.fps, self.parallax, self.static)))}.json"
+        key = short_hash(repr((keys, self.fps, self.parallax, self.static, "with center")))
+        file = self.frames_cache / f"focal-{key}.json"
         with suppress(OSError, UnreadableError, TypeError):
             kept = read_json(file)
             return None if kept is None else FocalEstimate(**kept)

@@ -244,8 +244,7 @@ def _from_driving(source: str) -> tuple[CameraFile, str]:
     if found is None or not found.is_known:
         raise DataError(refusal(found, source))
     height, width = size[0]
-    focal = found.focal * width
-    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    K = found.intrinsics(height, width, width)
     about = (
         f"from {found.windows} windows of {WINDOW} frames of {path.name}: focal length known to {found.uncertainty:.2%}"
     )

@@ -35,7 +35,7 @@ _PICTURES = 8
 _FOCALS = 3
 """Cameras whose focal length is estimated."""
 FOCAL_SECONDS = 20.0
-"""Time for that, all of them together; three windows of each are looked at all the same."""
+"""Processor time for that, all of them together; three windows of each are looked at all the same."""
 
 
 @dataclass(frozen=True)
@@ -358,13 +358,13 @@ def _estimate_focal(found: Survey, drives: Mapping[str, Drive], frames: int) -> 
     groups: dict[bytes, list[int]] = {}
     for place, camera in enumerate(found.cameras):
         groups.setdefault(camera.K.tobytes(), []).append(place)
-    chosen, began = list(groups.values())[:_FOCALS], time.monotonic()
+    chosen, began = list(groups.values())[:_FOCALS], time.process_time()
     for number, places in enumerate(chosen):
         camera, several = found.cameras[places[0]], [drives[found.cameras[place].drive] for place in places]
         center = (camera.K[0, 2] + 0.5) / camera.size[1], (camera.K[1, 2] + 0.5) / camera.size[1]
-        left = (FOCAL_SECONDS - (time.monotonic() - began)) / (len(chosen) - number)
+        left = (FOCAL_SECONDS - (time.process_time() - began)) / (len(chosen) - number)
         windows = drive_windows(several, min(20, frames // WINDOW))
-        estimate = estimate_focal(windows, most=6, center=center, seconds=left)
+        estimate = estimate_focal(windows, most=6, center=center, seconds=left, free_center=False)
         for place in places:
             found.cameras[place] = replace(found.cameras[place], estimate=estimate)
     found.focals = len(chosen), len(groups)
