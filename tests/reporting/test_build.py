@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from browsing import barriers
 from made_runs import ERRORS, add_checkpoint, make_evaluation, make_run
 from rich.console import Console
@@ -296,6 +297,10 @@ def test_what_is_not_compared_names_the_commands_after_which_it_is(
     text = _compared(one, two)
     assert "6 of video, test split against 5 of video, test split" in text
     assert " and ".join(commands) in text
+    file = one / ".hydra" / "config.yaml"
+    config = yaml.safe_load(file.read_text())
+    file.write_text(yaml.safe_dump({**config, "data": {**config["data"], "track_motion": True}}))
+    assert _compared(one, two).count("motion=tracked") == 2  # the motion that the training had
     for folder, warped in ((one, 0.1), (two, 0.2)):
         _explained(folder / "compared", warped, images=8)
     text = _compared(one, two)

@@ -102,10 +102,11 @@ def test_an_evaluation_without_its_run_stands_alone(tmp_path: Path) -> None:
 
 def test_a_comparison_of_named_runs_takes_no_others(tmp_path: Path) -> None:
     runs = [make_run(tmp_path / name) for name in "ab"]
-    foreign = make_evaluation(tmp_path / "e", "/gone/best.ckpt")
-    assert len(collect([*runs, foreign], strangers=False).runs) == 2
-    assert len(collect([*runs, foreign]).runs) == 3
-    assert len(collect([runs[0], foreign], strangers=False).runs) == 2
+    foreign = make_evaluation(tmp_path / "of_others" / "e", "/gone/best.ckpt")
+    assert len(collect([*runs, foreign.parent], strangers=False).runs) == 2
+    assert len(collect([*runs, foreign.parent]).runs) == 3
+    assert len(collect([runs[0], foreign.parent], strangers=False).runs) == 2
+    assert len(collect([*runs, foreign], strangers=False).runs) == 3  # named itself: street's, for example
 
 
 def test_a_folder_of_runs_is_looked_through(tmp_path: Path, sweep: Path) -> None:

@@ -184,9 +184,6 @@ def test_where_a_run_resumes_from(tmp_path: Path) -> None:
     last.parent.mkdir()
     last.touch()
     assert resume_path("auto", tmp_path) == str(last)
-    assert resume_path("auto", tmp_path, "other.ckpt") == str(last)  # a requeued job that began warm
-    with pytest.raises(ConfigError, match=r"resume= and init_from= are both set"):
-        resume_path("a.ckpt", tmp_path, "b.ckpt")
 
 
 def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Path, config: Any, walls: Any) -> None:

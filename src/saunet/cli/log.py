@@ -71,3 +71,4 @@ def quiet() -> None:
             logging.getLogger(name).addFilter(_no_advertisement)
     warnings.filterwarnings("ignore", message=r".*LeafSpec.*")
     warnings.filterwarnings("ignore", message=r".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message=r"Checkpoint directory .* exists and is not empty")  # we look ourselves

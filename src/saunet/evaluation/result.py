@@ -323,9 +323,11 @@ class EvaluationResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """One sentence for each predictor whose depth and motion explain the neighbors no better than doing nothing."""
+        tracked = self.settings.get("motion") == "tracked"
+        young = "" if tracked else ", or only the motion is not learned yet: motion=tracked tells"
         return tuple(
             f"'{view.predictor}' under {view.protocol}: warped ({view.warped:.4f}) is not below unwarped "
-            f"({view.unwarped:.4f}), so nothing was learned"
+            f"({view.unwarped:.4f}), so nothing was learned{young}"
             for view in self.view_summaries()
             if view.condition == "all" and not view.warped < view.unwarped
         )

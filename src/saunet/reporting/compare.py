@@ -155,6 +155,8 @@ def _remedy(first: Run, other: Run) -> str:
     given = {f"data.{key}": str(data[key]) for key in ("root",) if data.get(key)}
     given |= {key: value for key, value in first.overrides.items() if key.startswith(("data.", "plugins"))}
     words = [f"{key}={value}" for key, value in given.items() if key.removeprefix("data.") not in _OF_TRAINING]
+    if any((run.config.get("data") or {}).get("track_motion") for run in (first, other)):
+        words.append("motion=tracked")  # which the training had: a young pose network would hide the depth
     places = [
         str(run.path.relative_to(Path.cwd()) if run.path.is_relative_to(Path.cwd()) else run.path)
         for run in (first, other)

@@ -85,10 +85,11 @@ def collect(paths: Sequence[str | Path], checkpoint: str = "best", *, strangers:
     for run in known:  # evaluations written into the run's own folder
         for file in sorted(run.path.rglob("metrics.json")) if run.path.is_dir() else ():
             evaluations.setdefault(file.parent, read_evaluation(file.parent))
-    take = strangers or len(known) < 2
+    take, named = strangers or len(known) < 2, {Path(path).resolve() for path in paths}
     for evaluation in evaluations.values():
         # Foreign predictions are of no run at all, so they were named for their own sake.
-        if (take or evaluation.foreign) and not any(belongs(evaluation, run) for run in known):
+        alone = take or evaluation.foreign or evaluation.folder.resolve() in named
+        if alone and not any(belongs(evaluation, run) for run in known):
             orphan, origin = Run(evaluation.folder, name=evaluation.name), evaluation.checkpoint
             if origin is not None and origin.is_file() and not evaluation.foreign:
                 orphan = _read_checkpoint(origin)

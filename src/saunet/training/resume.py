@@ -25,20 +25,11 @@ BOUND = {"seed": "seed", "batch_size": "data.batch_size", "train_split": "traini
 """What decides the order of the data, with its name in a message."""
 
 
-def resume_path(resume: str | None, output_dir: str | Path, init_from: str | None = None) -> str | None:
-    """Return the checkpoint to resume from, or None.
-
-    ``auto`` is the ``last.ckpt`` of the run's own folder, if there is one. Only a path contradicts ``init_from``: a job
-    that began warm may be queued again.
-    """
+def resume_path(resume: str | None, output_dir: str | Path) -> str | None:
+    """Return the checkpoint to resume from, or None; ``auto`` is the ``last.ckpt`` of the run's own folder, if any."""
     if resume == "auto":
         last = Path(output_dir) / "checkpoints" / "last.ckpt"
         return str(last.resolve()) if last.is_file() else None
-    if resume and init_from:
-        raise ConfigError(
-            "resume= and init_from= are both set; resume= continues a training, init_from= starts a new one from "
-            "its weights: leave one out"
-        )
     if resume in ("true", "True"):
         raise ConfigError("resume is 'true'; set resume=auto for the run's own last.ckpt, or name a checkpoint")
     return str(Path(resume).expanduser().resolve()) if resume else None

@@ -225,7 +225,9 @@ def train(
     folder = Path(options.output_dir)
     if not (options.resume or options.overwrite):
         check_unused(folder)
-    resume = resume_path(options.resume, folder, options.init_from)
+    resume = resume_path(options.resume, folder)
+    if resume and options.init_from:  # of an experiment, perhaps
+        rank_zero_info(f"init_from={options.init_from} is not used: a training that continues has its own weights")
     checkpoint = read_checkpoint(resume) if resume else None  # before the data are set up, which takes its time
     seed_everything(options.seed, workers=True, verbose=False)
     learned = options.model.intrinsics == "learned"
@@ -276,7 +278,8 @@ def train(
                 record.write(intrinsics=found.to_plain())
                 rank_zero_info(model.intrinsics.told(found))
     if resume and trainer.global_step == steps:
-        print(f"nothing was left to train: it was complete after step {steps}; epochs=N goes on to a later end")
+        more = "trainer.max_steps=N" if 0 <= trainer.max_steps <= steps else "epochs=N"
+        print(f"nothing was left to train: it was complete after step {steps}; {more} goes on to a later end")
     elif told := _ended_early(trainer):
         rank_zero_info(told)
     if trainer.is_global_zero:

@@ -66,7 +66,7 @@ def drive_with(k1: float, right: float = 0.0) -> tuple[WindowFocal, FocalEstimat
     turns = (2, 2.5, -2, 3)
     solvers = [partial(solve_window, *made(0.58, turn, seed, k1, right), SIZE) for seed, turn in enumerate(turns)]
     straight = [found for solver in solvers if (found := solver())]
-    estimate = with_lens(solvers, straight)
+    estimate = with_lens(solvers, straight, free_center=right != 0)  # which takes most of the time
     assert estimate is not None
     return straight[0], estimate
 
@@ -77,7 +77,7 @@ def test_the_bend_of_a_lens_is_found_with_the_focal_length(k1: float, longer: fl
     straight, found = drive_with(k1)
     assert straight.focal > longer * 0.58
     assert straight.error < 0.4
-    assert found.focal == pytest.approx(0.58, rel=0.035)
+    assert found.focal == pytest.approx(0.58, rel=0.04)
     assert found.distortion == pytest.approx(k1, abs=0.02)
     assert "division model, -0." in found.assumed
     assert found.uncertainty < 0.03

@@ -39,6 +39,8 @@ WIDTH = 620
 """Pictures are made this narrow."""
 KNOWN = 0.015
 """Relative standard deviation up to which a focal length counts as known."""
+_VAGUE = 2 * KNOWN
+"""A straight road: no lens makes up for turns."""
 _AXES = ("bend", "right", "down")
 """How a lens may differ from a straight one with its center in the middle."""
 _COARSE = (0.2, 0.03, 0.03)
@@ -49,8 +51,9 @@ _LEAST = (0.05, 0.005, 0.005)
 """What is smaller counts as nothing."""
 _SHARPEST = 6
 """Windows that are solved for each lens; three are needed."""
-_MODEL = 0.04
-"""Doubt about the form of the lens, as a share of what its bend changes the focal length by."""
+_MODEL = 0.2
+"""Doubt about the form of the lens, as a share of what its bend changes the focal length by, where half a picture is as
+wide as a focal length; it falls with the fourth power."""
 _START = 0.8
 """Focal length to start from, in picture widths."""
 _SYSTEMATIC = 0.003
@@ -273,7 +276,7 @@ def with_lens(
     """
     together = combined(straight)
     sharpest = sorted(range(len(straight)), key=lambda index: straight[index].uncertainty)[:_SHARPEST]
-    if together is None or len(sharpest) < 3:
+    if together is None or len(sharpest) < 3 or together.uncertainty > _VAGUE:
         return together
     unknown = replace(together, uncertainty=math.inf)
 
@@ -323,7 +326,8 @@ def with_lens(
     bent = combined([each for solver in solvers if (each := solver(**about))])
     if bent is None:
         return unknown
-    model = _MODEL * math.log(bent.focal / together.focal) if best[0] else 0.0
+    wide = (0.5 / bent.focal) ** 4
+    model = _MODEL * wide * math.log(bent.focal / together.focal) if best[0] else 0.0
     return replace(bent, uncertainty=math.hypot(bent.uncertainty, *doubts, model), **about)
 
 
