@@ -60,7 +60,7 @@ def recomputable(network: nn.Module) -> list[tuple[nn.Module, str]]:
     """
     if isinstance(network, SkipDecoder):
         return [(network, "level")]
-    found = [(network, "begin")] if isinstance(network, StemEncoder) else []
+    found: list[tuple[nn.Module, str]] = [(network, "begin")] if isinstance(network, StemEncoder) else []
     for child in network.children():
         inner = recomputable(child)
         if inner:

@@ -258,8 +258,8 @@ def estimate_focal(
             solvers.append(solver)
     if time.process_time() - began < seconds:
         return with_lens(solvers, solved, free_center)
-    found = combined(solved)
-    return found and replace(found, bend=None)
+    together = combined(solved)
+    return together and replace(together, bend=None)
 
 
 Solver = Callable[..., WindowFocal | None]
@@ -290,7 +290,7 @@ def with_lens(
         """Return minus twice the logarithm of each window's likelihood, up to a factor and a constant."""
         return np.log([each.error**2 for each in found]) if (found := solve(lens)) else np.full(len(sharpest), np.inf)
 
-    best, axes = (0.0, 0.0, 0.0), range(3 if free_center else 1)
+    best, axes = tuple(0.0 for _ in _AXES), range(3 if free_center else 1)
 
     def moved(axis: int, by: float) -> tuple[float, ...]:
         return tuple(round(value + by * (axis == place), 4) for place, value in enumerate(best))
@@ -306,29 +306,30 @@ def with_lens(
         best = moved(axis, _lowest(steps, table(axis, steps).sum(1)) or 0.0)
     doubts = []
     for axis in axes:
-        steps = tuple(_FINE[axis] * place for place in (-2, -1, 0, 1, 2))
-        measured = table(axis, steps)
-        low = _lowest(steps, measured.sum(1))
-        without = [_lowest(steps, np.delete(measured, window, 1).sum(1)) for window in range(len(sharpest))]
-        near, far = solve(moved(axis, steps[0])), solve(moved(axis, steps[-1]))
+        fine = tuple(_FINE[axis] * place for place in (-2, -1, 0, 1, 2))
+        measured = table(axis, fine)
+        low = _lowest(fine, measured.sum(1))
+        without = [_lowest(fine, np.delete(measured, window, 1).sum(1)) for window in range(len(sharpest))]
+        near, far = solve(moved(axis, fine[0])), solve(moved(axis, fine[-1]))
         if low is None or None in without or near is None or far is None:
             return unknown
         lows = np.array(without, np.float64)
         deviation = math.sqrt((len(lows) - 1) * float(lows.var()))  # the jackknife
         slope = math.log(np.median([each.focal for each in far]) / np.median([each.focal for each in near]))
-        doubts.append(slope / (steps[-1] - steps[0]) * deviation)
+        doubts.append(slope / (fine[-1] - fine[0]) * deviation)
         best = moved(axis, low)
         if abs(best[axis]) < max(4 * deviation, _LEAST[axis]):
             best = moved(axis, -best[axis])
     if not any(best):
         return replace(together, uncertainty=math.hypot(together.uncertainty, *doubts))
-    about = dict(zip(_AXES, best, strict=True))
-    bent = combined([each for solver in solvers if (each := solver(**about))])
+    bend, right, down = best
+    bent = combined([each for solver in solvers if (each := solver(bend=bend, right=right, down=down))])
     if bent is None:
         return unknown
     wide = (0.5 / bent.focal) ** 4
-    model = _MODEL * wide * math.log(bent.focal / together.focal) if best[0] else 0.0
-    return replace(bent, uncertainty=math.hypot(bent.uncertainty, *doubts, model), **about)
+    model = _MODEL * wide * math.log(bent.focal / together.focal) if bend else 0.0
+    doubt = math.hypot(bent.uncertainty, *doubts, model)
+    return replace(bent, uncertainty=doubt, bend=bend, right=right, down=down)
 
 
 def _lowest(places: Sequence[float], costs: F64) -> float | None:
