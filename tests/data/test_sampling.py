@@ -96,8 +96,9 @@ def test_loader_goes_on_where_it_was_saved(workers):
     assert np.shape(whole) == (4, 2)
 
 
-def test_a_loader_process_ends_without_an_alarm_when_it_is_asked_to():
+def test_a_loader_process_that_is_asked_to_end_gives_what_is_under_way_and_no_alarm(monkeypatch):
     """With the whole process group: torch's alarm would end the first process before it has saved."""
+    monkeypatch.setattr("saunet.data.loading.sampling.GRACE", 2)
     data = WindowDataset([NumberDrive()], [(0, i) for i in range(8)], offsets=(), height=20, width=30)
     loader = Loader(data, batch_size=None, **processes(1))
     batches = DataLoader.__iter__(loader)
@@ -106,6 +107,7 @@ def test_a_loader_process_ends_without_an_alarm_when_it_is_asked_to():
     other = multiprocessing.get_context("fork").Process(target=os.kill, args=(worker.pid, signal.SIGTERM))
     other.start()  # not from here: torch's processes end well when their own parent asks them
     other.join(30)
+    assert len(list(batches)) == 7
     worker.join(30)
     assert worker.exitcode == 0
 

@@ -100,6 +100,10 @@ def share(batch_size: int, world_size: int) -> int:
     return batch_size // world_size
 
 
+GRACE = 30
+"""Seconds that a loader's process still works after it was told to end; the one that needs it ends it before."""
+
+
 def processes(wanted: int) -> dict[str, Any]:
     """Return the settings of a `torch.utils.data.DataLoader` for so many processes, but at most one a core."""
     workers = min(wanted, available_cores())
@@ -113,12 +117,22 @@ def processes(wanted: int) -> dict[str, Any]:
 
 
 def _prepare(worker: int) -> None:
-    """Compute with one thread, and end without an alarm if the process group is told to: the first process saves."""
+    """Compute with one thread, and go on for a while if the process group is told to end: the first process saves.
+
+    It may be in the middle of an epoch or of a validation, and needs what is under way.
+    """
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
     for name in ("SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
-            signal.signal(getattr(signal, name), lambda *_: os._exit(0))
+            signal.signal(getattr(signal, name), _end_later)
+
+
+def _end_later(number: int, frame: object) -> None:
+    if not hasattr(signal, "alarm"):  # Windows
+        os._exit(0)
+    signal.signal(signal.SIGALRM, lambda *_: os._exit(0))  # without the alarm that torch gives for its processes
+    signal.alarm(GRACE)
 
 
 class Loader(DataLoader[Any]):
