@@ -102,3 +102,10 @@ def test_a_drawing_has_a_point_for_each_measurement(tmp_path: Path) -> None:
     assert svg(draw_speed(points, "Abs Rel")) == svg(draw_speed(points, "Abs Rel"))
     save(figure, tmp_path / "deep" / "speed.png")
     assert cv2.imread(str(tmp_path / "deep" / "speed.png")).shape[1] > 900
+
+
+def test_a_printed_table_is_readable() -> None:
+    table = Table("scores", "Scores", columns("model", "Abs Rel ↓|.3f"), (Row(("ours", 0.1)), Row(("theirs", 0.25))))
+    lines = str(table).splitlines()
+    assert lines[0] == "Scores"
+    assert lines[-2:] == ["ours    0.100", "theirs  0.250"]

@@ -126,9 +126,10 @@ def test_last_is_the_last_and_best_is_the_best(
         def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
             pl_module.log("score", {0: 0.5, 1: 0.1, 2: 0.3}.get(trainer.current_epoch, 0.2))
 
-    def fit(folder: Path, epochs: int, resume: Path | None = None) -> None:
+    def fit(folder: Path, epochs: int, resume: Path | None = None, validated: int = 1) -> None:
         callbacks = [Worsening(), LastCheckpoint(str(folder)), BestCheckpoint(str(folder), "score")]
-        trainer = make_trainer(max_epochs=epochs, limit_train_batches=1, limit_val_batches=1, callbacks=callbacks)
+        batches = {"limit_train_batches": 1, "limit_val_batches": validated}
+        trainer = make_trainer(max_epochs=epochs, **batches, callbacks=callbacks)
         trainer.fit(assemble(train_options(config), walls), copy.deepcopy(walls), ckpt_path=resume, weights_only=True)
 
     make_trainer = partial(make_trainer, enable_checkpointing=True)
@@ -138,6 +139,8 @@ def test_last_is_the_last_and_best_is_the_best(
     fit(tmp_path / "b", 4, resume=tmp_path / "a" / "last.ckpt")  # scores 0.2: not better than the 0.1 of before
     assert read_checkpoint(tmp_path / "b" / "last.ckpt").epoch == 3
     assert read_checkpoint(tmp_path / "b" / "best.ckpt").epoch == 1
+    fit(tmp_path / "c", 4, resume=tmp_path / "a" / "last.ckpt", validated=0)  # the loss of training decides less
+    assert read_checkpoint(tmp_path / "c" / "best.ckpt").epoch == 1
 
 
 def test_best_falls_back_to_the_loss_where_nothing_has_ground_truth(

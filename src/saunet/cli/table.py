@@ -105,6 +105,7 @@ TOOLS = {
 """Every tool by name, in the order of ``saunet --help``."""
 _SHORT = {"epochs": "trainer.max_epochs", "lr": "optim.lr", "batch": "data.batch_size"}
 TOOLS["train"] = replace(TOOLS["train"], aliases=_SHORT)
+TOOLS["doctor"] = replace(TOOLS["doctor"], aliases={"batch": "data.batch_size"})
 TOOLS["evaluate"] = replace(TOOLS["evaluate"], function="saunet.evaluation.present:run")
 TOOLS["report"] = replace(TOOLS["report"], words={"compare": "compare=true"})
 TOOLS["components"] = replace(TOOLS["components"], function="saunet.cli.help:components", options=None)

@@ -138,7 +138,10 @@ def _find(path: Path, depth: int = 3) -> list[tuple[str, Path]]:
         kind = kinds.get(path.suffix, "")
         return [(kind, path.parent if path.suffix == ".json" else path)] if kind else []
     if not path.is_dir():
-        raise DataError(f"there is nothing at {path}; check the path")
+        raise DataError(
+            f"there is nothing at {path}; check the path (a shipped model's scores are in the folder that saunet "
+            "evaluate wrote)"
+        )
     if (path / "multirun.yaml").is_file():
         return [("sweep", path)]
     if began(path):

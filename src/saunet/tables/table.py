@@ -148,6 +148,14 @@ class Table:
         shown.title = shown.caption = None
         return Console(width=1000).measure(shown).maximum
 
+    def __str__(self) -> str:
+        """Return it as a terminal shows it, as wide as it is."""
+        from rich.console import Console
+
+        text = io.StringIO()
+        Console(file=text, width=max(80, self.width()), color_system=None).print(self.rich())
+        return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
+
     def rich(self) -> RichTable:
         """Return the table for a terminal, narrow enough for 80 columns where its texts are short."""
         from rich.box import HORIZONTALS

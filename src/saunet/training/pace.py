@@ -43,7 +43,7 @@ class Pace:
 
 
 def _ms(seconds: float) -> str:
-    return f"{1000 * seconds:.3g} ms"
+    return f"{1000 * seconds:{'.0f' if seconds >= 0.1 else '.3g'}} ms"
 
 
 def measure(step: float, waiting: float, data: DepthDataModule, batch_size: int, device: torch.device) -> Pace:

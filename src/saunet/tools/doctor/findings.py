@@ -129,7 +129,9 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
     known = [camera for camera in survey.cameras if camera.estimate is not None and camera.estimate.is_known]
     looked, cameras = survey.focals
     if known:
-        text = f"the focal lengths of {len(known)} of {len(survey.cameras)} drives were compared with turns in them"
+        agree = sum(not each.estimate.contradicts(each.K[0, 0] / each.size[1]) for each in known if each.estimate)
+        told = f"turns tell the focal length of {len(known)} of {len(survey.cameras)} drives"
+        text = f"{told}, which agrees with K in {agree}"
         yield Finding("note", text)
     elif survey.cameras:
         text = f"K was not checked, as no examined drive turns enough, and means a field of view of {view}"
@@ -162,7 +164,10 @@ def _camera(camera: CameraFacts) -> Iterator[Finding]:
             f"{told} contradicts the pictures: turns in them say a focal length of {found.focal * width:.0f}, known to "
             f"{found.uncertainty:.1%}"
         )
-        fix = "calibrate with a board (saunet calibrate), or give the K and the distortion of this camera and this mode"
+        fix = (
+            "give the K and the distortion of this camera and this mode, calibrate (saunet calibrate with a board, or "
+            "video=DRIVE without), or leave it to the training with camera: unknown"
+        )
         yield Finding("error", text, fix)
     if not (0.35 < (cx + 0.5) / width < 0.65 and 0.2 < (cy + 0.5) / height < 0.8):
         text = f"{told}: the center is far from the middle of the image"

@@ -83,8 +83,9 @@ class Diagnosis:
         if found.judged and self.sheet:
             left_out = sum(len(frames) for reasons in self.manifest.leave_out.values() for frames in reasons.values())
             judged = "all" if found.judged == found.known else f"{found.judged} of {found.known}; frames=0 judges all"
-            lines.append(f"manifest: {path} names {left_out} frames to leave out (judged: {judged})")
-            if self.usable:
+            frames = "1 frame" if left_out == 1 else f"{left_out} frames"
+            lines.append(f"manifest: {path} names {frames} to leave out (judged: {judged})")
+            if self.usable and left_out:
                 lines.append(f"train with data.manifest={path}")
         return "\n".join(lines)
 
