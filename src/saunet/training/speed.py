@@ -30,7 +30,7 @@ class Speed:
     Args:
         compile: Compile networks, view synthesis and losses with ``torch.compile``; the first steps take minutes.
         checkpoint_activations: Keep only the inputs of each network block, of an encoder's first layers, and of each
-            level of a skip decoder, and compute the rest again for the gradient: about a third more work for half the
+            level of a skip decoder, and compute the rest again for the gradient: about a third more work for much less
             memory.
     """
 
