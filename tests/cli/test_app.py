@@ -314,8 +314,9 @@ def test_a_reader_that_has_seen_enough_ends_a_tool_quietly(words: list[str]) -> 
 
 def test_a_key_of_the_data_is_suggested_by_its_short_name(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        app.main(["doctor", "batch=2"])
-    assert "did you mean 'data.batch_size'?" in capsys.readouterr().err
+        app.main(["doctor", "workers=2"])
+    assert "did you mean 'data.workers'?" in capsys.readouterr().err
+    assert app.read_words(["batch=2"], table.TOOLS["doctor"], table.read())[1] == ["data.batch_size=2"]
 
 
 def test_resume_is_listed_and_has_help(capsys: pytest.CaptureFixture[str]) -> None:
