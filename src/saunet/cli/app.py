@@ -242,7 +242,8 @@ def call(name: str, composed: Composed, table: Table) -> tuple[int, object]:
     record = {"choices": composed.choices, "overrides": composed.overrides, "describe": sentence}
     wanted = inspect.signature(called).parameters
     quiet()
-    gc.freeze()  # what is imported stays: to search it for garbage again and again doubles the time of an index
+    if gc.get_freeze_count() == 0:  # not before each job of a sweep, whose remains would stay for good
+        gc.freeze()  # what is imported stays: to search it for garbage again and again doubles the time of an index
     result = called(options, **{key: value for key, value in record.items() if key in wanted})
     first = os.environ.get("RANK", "0") == "0"  # of the processes that torchrun started, if it did
     if isinstance(result, Shown) and first:

@@ -141,8 +141,8 @@ class BestCheckpoint(ModelCheckpoint):
     def _save_topk_checkpoint(self, trainer: Trainer, monitor_candidates: dict[str, Tensor]) -> None:
         """Choose what to monitor, then save."""
         wanted = EPOCH_LOSS if self.wanted == "train/loss" else self.wanted
-        measured = [name for name in (wanted, "val/loss", EPOCH_LOSS) if name in monitor_candidates]
         ranked = [wanted, "val/loss", EPOCH_LOSS]
+        measured = [name for name in ranked if name in monitor_candidates]
         before = self._scored_by.removesuffix(_IN_DOUBT)
         if self.best_model_path and before in ranked and ranked.index(before) < ranked.index((measured or ranked)[0]):
             return  # a run resumed for its last steps measures less: the best so far was chosen by more

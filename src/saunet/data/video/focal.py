@@ -182,8 +182,9 @@ def combined(found: Sequence[WindowFocal]) -> FocalEstimate | None:
 
 def refusal(found: FocalEstimate | None, source: str) -> str:
     """Say why a focal length cannot be known, and what to film."""
-    vague = found is None or not math.isfinite(found.uncertainty)
-    known = "nothing says it" if found is None or vague else f"it is known to {found.uncertainty:.1%} only"
+    known = "nothing says it"
+    if found is not None and math.isfinite(found.uncertainty):
+        known = f"it is known to {found.uncertainty:.1%} only"
     film = "film a minute with turns at 15 to 30 km/h: corners, a roundabout, a winding road"
     return f"the focal length cannot be known from {source}: {known}, {KNOWN:.1%} is required; {film}"
 

@@ -398,13 +398,13 @@ class VideoDataModule(DepthDataModule):
                     raise DataError(f"{why}; or train with model.intrinsics=learned, which starts from a guess")
                 rank_zero_info(f"{why}; model.intrinsics=learned starts from 60 degrees of view")
                 continue
-            focal = found.focal * several[0].frame_size[1]
+            K = found.intrinsics(height, width, several[0].frame_size[1])
+            focal = float(K[0, 0])
             view = math.degrees(2 * math.atan(width / 2 / focal))
             rank_zero_info(
                 f"focal length of {what}: {focal:.1f} px of {width} ({view:.0f} degrees), known to "
                 f"{found.uncertainty:.2%} from {found.windows} windows of {WINDOW} frames; {found.assumed}"
             )
-            K = found.intrinsics(height, width, several[0].frame_size[1])
             lens: dict[str, Any] = {"model": "division", "distortion": (found.distortion,)} if found.bend else {}
             for drive in several:
                 known[drive.name] = replace(drive.clip.camera, K=K, image_size=(height, width), is_known=True, **lens)
