@@ -7,7 +7,10 @@ translation.
 
 from __future__ import annotations
 
+import io
+import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +18,20 @@ from numpy.typing import NDArray
 
 CANONICAL_FOCAL = 0.58
 """Focal length over image width of KITTI's color cameras."""
+HEIGHT, WIDTH = 192, 640
+"""Of rendered frames."""
 Array = NDArray[np.float32]
+
+
+def save(path: Path, data: dict[str, Any]) -> None:
+    """Write a scene's file whole or not at all."""
+    sizes = np.array([len(x) for x in data["images"]])
+    plain = {**data, "images": np.frombuffer(b"".join(data["images"]), np.uint8), "sizes": sizes}
+    buffer = io.BytesIO()
+    np.savez(buffer, **plain)
+    part = path.with_suffix(".part")
+    part.write_bytes(buffer.getvalue())
+    os.replace(part, path)
 
 
 class Frames:
@@ -165,7 +181,7 @@ def photometric(
         x = x.clip(0, 1) ** np.exp(rng.normal(0, 0.3))
     if rng.uniform() < 0.8:
         x = (x - x.mean()) * np.exp(rng.normal(0.2, 0.3)) + x.mean() * np.exp(rng.normal(0, 0.2))
-    gray = x.mean(2, keepdims=True)
+    gray = x @ rng.dirichlet((1, 1, 1))[:, None]  # a red filter darkens the sky, a green one lightens leaves
     if rng.uniform() < 0.35:
         x = np.repeat(gray, 3, 2)
     elif rng.uniform() < 0.7:

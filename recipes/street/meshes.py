@@ -248,9 +248,8 @@ def young_tree(rng: np.random.Generator, bark: int, leaf: int, stake: int, heigh
     )
     for tip in centers:
         soup.add(tube([[0, stem * rng.uniform(0.9, 1.3), 0], tip], [radius * 0.4, 0.01], 4), bark)
-    triangles, tint = leaves(
-        rng, centers, radii, int(detail * rng.uniform(250, 1200)), 0.055 * height**0.6 / detail**0.5
-    )
+    count = detail * np.exp(rng.uniform(np.log(250), np.log(3000)))  # from see-through to dense
+    triangles, tint = leaves(rng, centers, radii, int(count), 0.055 * height**0.6 / detail**0.5)
     soup.add(triangles, leaf, tint=tint)
     if rng.uniform() < 0.5:
         count, away, tall = int(rng.integers(2, 5)), rng.uniform(0.25, 0.6), stem * rng.uniform(0.7, 1.1)

@@ -6,8 +6,6 @@ Run ``python render.py OUT --scenes 500 --seed 0``: a scene whose file exists is
 from __future__ import annotations
 
 import argparse
-import io
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -18,10 +16,9 @@ import numpy as np
 import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
+from frames import HEIGHT, WIDTH, save
 from meshes import Array, Soup
 from world import SURFACES, Street
-
-HEIGHT, WIDTH = 160, 512
 
 
 class Assets:
@@ -526,17 +523,6 @@ def scene(
         "second": np.array(second),
         "kind": street.kind,
     }
-
-
-def save(path: Path, data: dict[str, Any]) -> None:
-    """Write a scene's file whole or not at all."""
-    sizes = np.array([len(x) for x in data["images"]])
-    plain = {**data, "images": np.frombuffer(b"".join(data["images"]), np.uint8), "sizes": sizes}
-    buffer = io.BytesIO()
-    np.savez(buffer, **plain)
-    part = path.with_suffix(".part")
-    part.write_bytes(buffer.getvalue())
-    os.replace(part, path)
 
 
 def main() -> None:

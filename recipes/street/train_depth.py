@@ -77,19 +77,15 @@ def forward(network: nn.Module, image: Tensor, finest: int) -> tuple[Tensor, ...
     """Return depth at the decoder's scales from ``finest`` on, without the cost of the finer ones."""
     decoder = network.decoder
     features = network.encoder(image.contiguous(memory_format=torch.channels_last))
-    skips = dict(zip(decoder.skip_levels, features, strict=True))
-    level = decoder.skip_levels[-1]
+    skips = dict(zip(decoder.skips, features, strict=True))
+    level = decoder.deepest
     x, depths = skips[level], []
-    for before, after in zip(decoder.before, decoder.after, strict=True):
+    for place in range(level - finest):
         level -= 1
-        if level < finest:
-            break
-        x = F.interpolate(before(x), scale_factor=2, mode="nearest")
-        x = after(torch.cat([x, skips[level]], 1) if level in skips else x)
+        x = decoder.level(place, x, skips.get(level))
         if level < len(decoder.heads):
-            depths.append(
-                sigmoid_to_disparity(decoder.heads[level](x), network.min_depth, network.max_depth).reciprocal()
-            )
+            sigmoid = decoder.heads[level](x).float()
+            depths.append(sigmoid_to_disparity(sigmoid, network.min_depth, network.max_depth).reciprocal())
     return tuple(reversed(depths))
 
 
@@ -131,7 +127,13 @@ def main() -> None:
         "--minutes", type=float, default=1e9, help="end after so many minutes, if the steps take longer"
     )
     parser.add_argument("--batch", type=int, default=8)
-    parser.add_argument("--size", type=int, nargs=2, default=(128, 416))
+    parser.add_argument(
+        "--size",
+        type=int,
+        nargs=2,
+        action="append",
+        help="height and width; given several times, each step draws one, and scores are of the first",
+    )
     parser.add_argument("--rate", type=float, default=8e-4)
     parser.add_argument("--hold", type=float, default=0.6, help="fraction of the steps before the rate falls to 0")
     parser.add_argument("--encoder-rate", type=float, default=0.25, help="fraction of the rate for the encoder")
@@ -167,10 +169,11 @@ def main() -> None:
         return rate_factor(step, options.steps, (time.time() - begin) / 60, options.minutes, options.hold)
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-    size = tuple(options.size)
+    sizes = [tuple(each) for each in options.size or [(96, 320)]]
     for step in range(1, options.steps + 1):
         network.train()
         network.encoder.eval()
+        size = sizes[rng.integers(len(sizes))]
         samples = [frames.depth_sample(rng, int(i), size) for i in rng.integers(len(frames.images), size=options.batch)]
         image = torch.from_numpy(np.stack([s[0] for s in samples])).permute(0, 3, 1, 2)
         target = torch.from_numpy(np.stack([s[1] for s in samples]))[:, None]
@@ -196,10 +199,10 @@ def main() -> None:
             (options.out / "depth.part").replace(options.out / "depth.pt")
             report = {
                 k: " ".join(f"{x:.3f}" for x in v)
-                for k, v in score(average, clips, size, finest=options.finest).items()
+                for k, v in score(average, clips, sizes[0], finest=options.finest).items()
             }
             print(
-                f"step {step} real {report} held out {held_out(average, held, size, finest=options.finest):.4f}",
+                f"step {step} real {report} held out {held_out(average, held, sizes[0], finest=options.finest):.4f}",
                 flush=True,
             )
             frames.refresh()

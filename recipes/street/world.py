@@ -158,8 +158,10 @@ class Street:
         rng, add = self.rng, self._material
         season = rng.choice(["summer", "autumn", "dry"], p=[0.7, 0.15, 0.15])
         green = {"summer": (0.045, 0.085, 0.02), "autumn": (0.11, 0.075, 0.02), "dry": (0.085, 0.085, 0.035)}[season]
+        bright = np.exp(rng.uniform(np.log(0.7), np.log(2.5)))  # some cameras see leaves lighter than the sky
         self.leaf = [
-            add(np.asarray(green) * rng.uniform(0.5, 1.8) * rng.uniform(0.8, 1.2, 3), kind=m.LEAF) for _ in range(4)
+            add(np.asarray(green) * bright * rng.uniform(0.6, 1.7) * rng.uniform(0.8, 1.2, 3), kind=m.LEAF)
+            for _ in range(4)
         ]
         self.bark = [add((0.09, 0.07, 0.05), "wood", "noise_streak", "gravel", scale=1.0) for _ in range(2)] + [
             add((0.22, 0.2, 0.16), "noise_coarse", scale=0.8)
@@ -213,7 +215,7 @@ class Street:
         self.light = Light(
             sun,
             (warm * strength).astype(np.float32),
-            (sky * rng.uniform(0.6, 1.2)).astype(np.float32),
+            (sky * rng.uniform(0.25, 1.2)).astype(np.float32),
             horizon.astype(np.float32),
             float(rng.uniform(0, 1)),
             rng.uniform(0, 50, 2).astype(np.float32),

@@ -11,8 +11,13 @@ import pytest
 import torch
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "street"
-for needed in ("embreex", "trimesh"):
-    pytest.importorskip(needed, reason=f"{needed} of recipes/street/requirements.txt is not installed")
+
+
+@pytest.fixture
+def renderer() -> None:
+    """What only render.py needs."""
+    for needed in ("embreex", "trimesh"):
+        pytest.importorskip(needed, reason=f"{needed} of recipes/street/requirements.txt is not installed")
 
 
 @pytest.fixture(autouse=True)
@@ -22,15 +27,16 @@ def recipe_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def scenes(tmp_path: Path) -> Path:
+def scenes(tmp_path: Path, renderer: None) -> Path:
     """A folder with one scene of two views, one of them a pair, without textures."""
+    import frames
     import render
 
-    render.save(tmp_path / "000001.npz", render.scene(1, None, views=2, pairs=1, height=64, width=192))
+    frames.save(tmp_path / "000001.npz", render.scene(1, None, views=2, pairs=1, height=64, width=192))
     return tmp_path
 
 
-def test_depth_is_camera_z_of_the_planes_hit() -> None:
+def test_depth_is_camera_z_of_the_planes_hit(renderer: None) -> None:
     """A wall 10 m ahead has depth 10 in every pixel; the ground has camera height * fy / (row - cy)."""
     import meshes
     import render
@@ -82,32 +88,61 @@ def test_a_pair_agrees_with_its_motion(scenes: Path) -> None:
     assert np.median(error) < 0.03  # traffic and hidden parts differ
 
 
-def test_both_networks_learn_from_two_steps(scenes: Path) -> None:
-    """The losses of depth and pose are finite and their gradients reach the encoder."""
+def test_streets_of_the_own_world_are_scenes_too(tmp_path: Path) -> None:
+    """Frames read from a drive's file have its depth, seen as a camera of KITTI's angle sees it."""
+    import builtin
+    import frames
+
+    scene = builtin.scene(3, height=64, width=192)
+    frames.save(tmp_path / "900003.npz", scene)
+    loaded = frames.Frames(tmp_path)
+    assert (len(loaded.images), loaded.pairs) == (builtin.VIEWS, [])
+    image, depth = loaded.depth_sample(np.random.default_rng(0), 1, (64, 192), augment=False)
+    assert image.shape == (64, 192, 3)
+    truth = np.asarray(scene["depth"])[1].astype(np.float32)
+    ground = slice(48, None), slice(80, 112)  # the road before the camera has no gaps to close
+    focal = np.asarray(scene["K"])[1][0, 0] / 192
+    np.testing.assert_allclose(depth[ground], truth[ground] * frames.CANONICAL_FOCAL / focal, rtol=1e-3)
+
+
+def test_the_depth_network_learns_from_two_steps(tmp_path: Path) -> None:
+    """Its loss is finite, gradients reach the encoder, and the training's way through it gives its own depths."""
+    import builtin
     import frames
     import train_depth
+
+    frames.save(tmp_path / "900001.npz", builtin.scene(1, height=64, width=192))
+    rng, size, network = np.random.default_rng(0), (64, 192), train_depth.build(weights=None)
+    loaded, optimizer = frames.Frames(tmp_path), torch.optim.SGD(network.parameters(), lr=1e-4)
+    for _ in range(2):
+        image, target = loaded.depth_sample(rng, 0, size)
+        batch = torch.from_numpy(image).permute(2, 0, 1)[None]
+        value = train_depth.loss(train_depth.forward(network, batch, 0), torch.from_numpy(target)[None, None])
+        optimizer.zero_grad()
+        value.backward()
+        assert torch.isfinite(value)
+        assert network.encoder.conv_stem.weight.grad.abs().sum() > 0
+        optimizer.step()
+    batch = torch.rand(1, 3, *size)
+    whole = network(batch).depth
+    for finest in range(3):
+        torch.testing.assert_close(train_depth.forward(network, batch, finest), whole[finest:])
+
+
+def test_the_pose_network_learns_from_two_steps(scenes: Path) -> None:
+    """Its loss is finite and gradients reach its first layer."""
+    import frames
     import train_pose
 
-    rng, size = np.random.default_rng(0), (64, 192)
-    loaded = frames.Frames(scenes)
+    rng, network, loaded = np.random.default_rng(0), train_pose.build(), frames.Frames(scenes)
     assert loaded.pairs == [0]
-    depth, pose = train_depth.build(weights=None), train_pose.build()
-    for network in (depth, pose):
-        optimizer = torch.optim.SGD(network.parameters(), lr=1e-4)
-        for _ in range(2):
-            if network is depth:
-                image, target = loaded.depth_sample(rng, 0, size)
-                batch = torch.from_numpy(image).permute(2, 0, 1)[None]
-                value = train_depth.loss(train_depth.forward(depth, batch, 0), torch.from_numpy(target)[None, None])
-            else:
-                a, b, T = loaded.pair_sample(rng, 0, size)
-                one, two = (torch.from_numpy(x).permute(2, 0, 1)[None] for x in (a, b))
-                value = train_pose.loss(train_pose.motion(pose, one, two), torch.from_numpy(T)[None].float())
-            optimizer.zero_grad()
-            value.backward()
-            assert torch.isfinite(value)
-            first = network.encoder.conv_stem if network is depth else network.layers[0]
-            assert first.weight.grad.abs().sum() > 0
-            optimizer.step()
-    out = train_depth.forward(depth, batch := torch.rand(1, 3, *size), 0)
-    torch.testing.assert_close(out, depth(batch).depth)
+    optimizer = torch.optim.SGD(network.parameters(), lr=1e-4)
+    for _ in range(2):
+        a, b, T = loaded.pair_sample(rng, 0, (64, 192))
+        one, two = (torch.from_numpy(x).permute(2, 0, 1)[None] for x in (a, b))
+        value = train_pose.loss(train_pose.motion(network, one, two), torch.from_numpy(T)[None].float())
+        optimizer.zero_grad()
+        value.backward()
+        assert torch.isfinite(value)
+        assert network.layers[0].weight.grad.abs().sum() > 0
+        optimizer.step()
