@@ -1,7 +1,7 @@
 """Run the tiny training in one process or two: ``python ddp_curve.py FOLDER PROCESSES EPOCHS [RANK SIGNAL]``.
 
-Writes the logged losses of its steps and the validation metric to ``FOLDER/curve.json``. With a rank and a signal, that
-process sends itself the signal in its fourth step.
+Writes the logged losses of its steps, the steps after which it validates, and the last metric to ``FOLDER/curve.json``.
+With a rank and a signal, that process sends itself the signal in its fourth step.
 """
 
 from __future__ import annotations
@@ -28,6 +28,10 @@ class Curve(Callback):
     def __init__(self, folder: Path, rank: int | None, number: int) -> None:
         self.folder, self.rank, self.number = folder, rank, number
         self.losses: list[float] = []
+        self.validated: list[int] = []
+
+    def on_validation_end(self, trainer: Trainer, *_: Any) -> None:
+        self.validated.append(trainer.global_step)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any) -> None:
         self.losses.append(float(trainer.callback_metrics["train/loss"]))  # as it is logged
@@ -59,6 +63,7 @@ def main(folder: Path, processes: int, epochs: int, rank: int | None = None, num
         trainer = tiny.tiny_trainer(
             folder,
             max_epochs=epochs,
+            max_steps=3 * epochs - 1,  # one before the end of the last epoch
             devices=processes,
             log_every_n_steps=1,
             strategy="ddp" if processes > 1 else "auto",
@@ -68,9 +73,8 @@ def main(folder: Path, processes: int, epochs: int, rank: int | None = None, num
         if trainer.is_global_zero:
             metrics = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("val")}
             focals = [after / before for before, after in model.found_intrinsics().focals.values()]
-            (folder / "curve.json").write_text(
-                json.dumps({"losses": curve.losses, "metrics": metrics, "focals": focals})
-            )
+            seen = {"losses": curve.losses, "validated": curve.validated, "metrics": metrics, "focals": focals}
+            (folder / "curve.json").write_text(json.dumps(seen))
 
 
 if __name__ == "__main__":

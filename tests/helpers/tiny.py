@@ -25,6 +25,7 @@ from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
 from saunet.geometry.pose import pose_matrix
 from saunet.registry import objectives
 from saunet.training.callbacks import AtomicCheckpointIO, LastCheckpoint
+from saunet.training.loop import EpochLoop
 from saunet.training.module import SelfSupervisedDepth
 from saunet.training.optim import Recipe
 from saunet.training.speed import Speed
@@ -138,7 +139,7 @@ def tiny_trainer(folder: Path, **kwargs: Any) -> Trainer:
         "plugins": [AtomicCheckpointIO()],
         "default_root_dir": folder,
     }
-    return Trainer(**{**quiet, **kwargs})
+    return EpochLoop.install(Trainer(**{**quiet, **kwargs}))
 
 
 class Ask(Callback):

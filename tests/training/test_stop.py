@@ -235,3 +235,62 @@ def test_the_setting_that_ended_a_training_before_its_steps_is_named(limits: dic
     trainer.fit(BoringModel())  # 64 batches an epoch
     told = _ended_early(trainer)
     assert words in told if words else not told
+
+
+LAST = [  # what ends two epochs of six batches, after which step, and the steps after which is validated
+    ({"max_steps": 9}, 9, [6, 9]),
+    ({"max_steps": 4}, 4, [4]),
+    ({"max_steps": 8, "val_check_interval": 3}, 8, [3, 6, 8]),
+    ({"max_steps": 9, "val_check_interval": 3}, 9, [3, 6, 9]),
+    ({"val_check_interval": 5}, 12, [5, 11, 12]),
+    ({"check_val_every_n_epoch": 5}, 12, [12]),
+    ({"check_val_every_n_epoch": None, "val_check_interval": 7}, 12, [7, 12]),
+    ({"accumulate_grad_batches": 2, "max_steps": 4}, 4, [3, 4]),
+    ({"limit_val_batches": 0, "max_steps": 4}, 4, []),
+]
+
+
+@pytest.mark.parametrize(("settings", "end", "validated"), LAST)
+def test_the_last_weights_are_validated_wherever_a_training_ends(
+    settings: dict[str, Any], end: int, validated: list[int], tmp_path: Path
+) -> None:
+    trainer = train(tmp_path, every=0, **settings)
+    assert trainer.global_step == end
+    assert [int(row["step"]) + 1 for row in rows(tmp_path) if "val/abs_rel" in row] == validated
+    last, best = (torch.load(tmp_path / name, weights_only=True) for name in ("last.ckpt", "best.ckpt"))
+    assert last["global_step"] == end
+    assert best["global_step"] in (validated or [end])
+    assert not last["saunet_training"]["validation_due"]
+
+
+class Enough(Callback):
+    """Ask the trainer to end after a step, as a limit of time or early stopping do."""
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
+        trainer.should_stop = trainer.global_step == self.step
+
+
+@pytest.mark.parametrize("every", [1, 5])
+def test_a_training_that_is_told_to_end_is_validated_first(every: int, tmp_path: Path) -> None:
+    train(tmp_path, None, False, Enough(4), check_val_every_n_epoch=every)
+    assert [int(row["step"]) + 1 for row in rows(tmp_path) if "val/abs_rel" in row] == [4]
+    assert torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] == 4
+
+
+@pytest.mark.parametrize(("steps", "validated"), [(4, [4]), (9, [BATCHES, 9])])
+def test_a_training_goes_on_from_the_validation_at_its_end_as_if_there_had_been_none(
+    steps: int, validated: list[int], tmp_path: Path
+) -> None:
+    one, other = tmp_path / "one", tmp_path / "other"
+    for folder, batches in ((one, 2), (other, 0)):
+        train(folder, max_steps=steps, limit_val_batches=batches)
+        train(folder, resume=True)
+    more = [row for row in rows(one) if row not in rows(other)]
+    assert [int(row["step"]) + 1 for row in more] == validated
+    assert all("val/abs_rel" in row for row in more)
+    assert [row for row in rows(one) if row not in more] == rows(other)
+    states = [torch.load(folder / "last.ckpt", weights_only=True)["state_dict"] for folder in (one, other)]
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())

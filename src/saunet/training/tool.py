@@ -29,6 +29,7 @@ from saunet.runs.folder import Describe, locked, recording
 from saunet.runs.record import ModelRecord, Scale
 from saunet.training.callbacks import AtomicCheckpointIO, BestCheckpoint
 from saunet.training.intrinsics import focal_lengths
+from saunet.training.loop import EpochLoop
 from saunet.training.module import SelfSupervisedDepth
 from saunet.training.optim import Recipe
 from saunet.training.resume import check_resume, check_unused, keep_rows, resume_path, validation_due, warm_start
@@ -412,7 +413,7 @@ def _trainer(options: TrainOptions, loggers: list[Any]) -> Trainer:
     callbacks = [*_callbacks(options), *(arguments.pop("callbacks", None) or [])]
     arguments |= {"logger": loggers or False, "default_root_dir": str(options.output_dir)}
     try:
-        return Trainer(**arguments, callbacks=callbacks, plugins=plugins)
+        return EpochLoop.install(Trainer(**arguments, callbacks=callbacks, plugins=plugins))
     except (MisconfigurationException, ValueError, TypeError) as reason:
         raise ConfigError(" ".join(f"trainer: {reason}".split())) from reason
 

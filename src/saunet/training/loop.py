@@ -1,0 +1,35 @@
+"""Lightning's loop over the steps of an epoch, but that no training ends without a validation of its last weights."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lightning import Trainer
+from lightning.pytorch.loops.training_epoch_loop import _TrainingEpochLoop
+
+
+class EpochLoop(_TrainingEpochLoop):
+    """Validates after the last step of a training too, wherever in an epoch or between two validations that falls.
+
+    Lightning leaves that out where ``max_steps`` ends it, or ``check_val_every_n_epoch`` or ``val_check_interval`` do
+    not divide its length: the last row and ``best.ckpt`` would be of older weights than ``last.ckpt``.
+    """
+
+    @classmethod
+    def install(cls, trainer: Trainer) -> Trainer:
+        """Put this loop in the place of the trainer's own, and return the trainer."""
+        own = trainer.fit_loop.epoch_loop
+        trainer.fit_loop.epoch_loop = cls(trainer, own.min_steps, own.max_steps)
+        return trainer
+
+    def _should_check_val_fx(self, data_fetcher: Any) -> bool:
+        due: bool = super()._should_check_val_fx(data_fetcher)
+        return due or (self.trainer.enable_validation and self._ends())
+
+    def _ends(self) -> bool:
+        """Return whether no step follows the one just done."""
+        trainer, epochs = self.trainer, self.trainer.fit_loop
+        if 0 <= self.max_steps <= self.global_step or (trainer.should_stop and epochs._can_stop_early):
+            return True
+        done = epochs.epoch_progress.current.processed + 1
+        return self._num_ready_batches_reached() and 0 < (trainer.max_epochs or 0) <= done
