@@ -66,6 +66,19 @@ def test_few_drives_hold_out_their_tails_with_a_gap():
     assert {frame.side for frame in val} == {"l", "r"}
 
 
+def test_frames_between_the_parts_are_counted_for_each_recording():
+    recordings = {"a": range(20), "short": range(3), "b": range(40)}
+    parts = selecting.divide(recordings, {"val_clips": (), "test_clips": ()}, 0.1, gap=3, seed=0)
+    assert parts.unused == {"a": 3, "short": 2, "b": 3}
+    train, val = parts.of("train"), parts.of("val")
+    assert {name: len(train[name]) + len(val[name]) + parts.unused[name] for name in recordings} == {
+        name: len(numbers) for name, numbers in recordings.items()
+    }
+    assert list(train) == ["a", "b", "short"]  # the last without a frame: it is counted all the same
+    named = selecting.divide(recordings, {"val_clips": ["b"], "test_clips": ()}, 0.1, gap=3, seed=0)
+    assert not named.unused
+
+
 def test_no_share_holds_nothing_out():
     everything = frames(2, 5)
     assert selecting.hold_out(everything, 0.0, gap=2, seed=0) == (everything, [])

@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import pickle
+import re
 import shutil
 
 import cv2
@@ -249,6 +250,19 @@ def test_a_broken_frame_is_named_or_skipped_and_counted(tmp_path):
     assert len(names(data, "train")) == 16 - 1 - 2 - 2
 
 
+def test_what_is_left_out_is_said_of_the_clip_that_it_belongs_to(tmp_path):
+    for name, count in (("a", 16), ("b", 20), ("c", 3)):
+        make_clip(tmp_path / "r", name, frames(count))
+    data = module(tmp_path / "r", static="keep")
+    data.setup("fit")
+    assert data.summary("train").splitlines()[1:] == [
+        "  a: 11 frames used; left out: 2 between training and validation, 1 without neighbor",
+        "  b: 15 frames used; left out: 2 between training and validation, 1 without neighbor",
+        "  c: 0 frames used; left out: 2 between training and validation",
+    ]
+    assert "train (2 of 3 drives): 26 frames used; left out: 6 between" in data.summary("train")
+
+
 @pytest.mark.parametrize("content", [b"", b"not a video", "half"])
 def test_a_video_that_cannot_be_decoded_is_named(tmp_path, content):
     video = make_video(tmp_path / "r" / "dréve 1.avi")
@@ -267,7 +281,8 @@ def test_a_video_that_cannot_be_decoded_is_left_out_and_counted(tmp_path):
     with pytest.warns(UserWarning, match=r"clip left out: .*b\.avi is not a video"):
         data.setup("fit")
     assert [drive.name for drive in data.drives()] == ["a"]
-    assert "1 clips that cannot be read" in data.summary("train")
+    assert re.search(r"\n  clip left out: .*b\.avi is not a video", data.summary("train"))
+    assert "clip left out" not in data.summary("val")
     with pytest.raises(DataError, match=r"hold no usable frame, such as .*b\.avi is not a video"), pytest.warns():
         module(tmp_path / "r" / "b.avi", on_error="skip", camera=str(tmp_path / "r" / "camera.yaml")).setup("fit")
 

@@ -13,7 +13,7 @@ from saunet.data.kitti import splits
 from saunet.data.kitti.raw import CAMERA_HEIGHT, CAMERAS, DEPTH_KINDS, DepthKind, KittiRaw
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
-from saunet.data.loading.selecting import Frame, has_speed, hold_out, hold_out_drives, moving, with_truth
+from saunet.data.loading.selecting import BETWEEN, Frame, has_speed, hold_out, hold_out_drives, moving, with_truth
 from saunet.data.loading.stored import DENSE_KINDS, DepthMaps
 from saunet.data.loading.windows import Selection, measured_distance, reach
 from saunet.errors import ConfigError, DataError, in_range, one_of, suggest
@@ -122,9 +122,7 @@ class KittiDataModule(DepthDataModule):
             numbers.setdefault((frame.drive, frame.side), []).append(frame.number)
         cameras = {side: camera for camera, (_, side) in CAMERAS.items()}
         selections = [
-            Selection(
-                raw.drive(drive, cameras[side], kind), wanted, {"between training and validation": between[drive, side]}
-            )
+            Selection(raw.drive(drive, cameras[side], kind), wanted, {BETWEEN: between[drive, side]})
             for (drive, side), wanted in numbers.items()
         ]
         if self.static != "keep" and split in ("train", "val"):

@@ -17,7 +17,7 @@ from saunet.data.kitti.files import read_matrices, read_times, zero_based
 from saunet.data.kitti.raw import CAMERA_HEIGHT, frame_files
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
-from saunet.data.loading.selecting import Frame, hold_out_tails, with_poses
+from saunet.data.loading.selecting import BETWEEN, Frame, hold_out_tails, with_poses
 from saunet.data.loading.windows import Selection, reach
 from saunet.errors import DataError, in_range, one_of
 from saunet.io.images import read_image
@@ -179,7 +179,7 @@ class KittiOdometryDataModule(DepthDataModule):
                 listed = [Frame(name, index, "l") for index in frames]
                 train, val = hold_out_tails(listed, self.val_share, gap=reach(self.offsets))
                 if split == "train":
-                    left_out = {"between training and validation": len(frames) - len(train) - len(val)}
+                    left_out = {BETWEEN: len(frames) - len(train) - len(val)}
                 frames = [frame.number for frame in (train if split == "train" else val)]
                 if not frames:
                     continue

@@ -43,6 +43,8 @@ class Frame(NamedTuple):
         return f"{self.drive} {self.number:010d} {self.side}"
 
 
+BETWEEN = "between training and validation"
+"""Why frames are left out that neighbors of training and validation frames would share."""
 Parts = tuple[list[Frame], list[Frame]]
 """Training and validation frames."""
 
@@ -118,14 +120,19 @@ class Division(NamedTuple):
     train: list[Frame]
     val: list[Frame]
     test: list[Frame]  # those of ``val`` where no recordings are named for it
-    unused: int  # between training and validation
+    unused: Mapping[str, int]  # recording -> frames between its training and its validation part
     settings: tuple[str, str]  # which name recordings for validation and test
 
     def of(self, split: str) -> dict[str, list[int]]:
-        """Return recording -> frame numbers of ``train``, ``val``, ``test`` or ``predict``."""
+        """Return recording -> frame numbers of ``train``, ``val``, ``test`` or ``predict``.
+
+        Training names recordings that are too short for a training part too, without a frame, so that they are counted.
+        """
         numbers: dict[str, list[int]] = {}
         for frame in {"train": self.train, "val": self.val}.get(split, self.test):
             numbers.setdefault(frame.drive, []).append(frame.number)
+        for name in self.unused if split == "train" else ():
+            numbers.setdefault(name, [])
         return numbers
 
     def overlap(self) -> str | None:
@@ -174,7 +181,8 @@ def divide(
 
     rest = listed(name for name in frames if name not in test and name not in named)
     train, val = (rest, listed(named)) if named else hold_out(rest, share, gap, seed)
-    unused = 0 if named else len(rest) - len(train) - len(val)
+    used = {*train, *val}
+    unused = {} if named else Counter(frame.drive for frame in rest if frame not in used)
     return Division(train, val, listed(test) if test else val, unused, (val_setting, test_setting))
 
 

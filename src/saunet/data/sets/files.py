@@ -15,7 +15,7 @@ from lightning.pytorch.utilities import rank_zero_warn
 from numpy.typing import NDArray
 
 from saunet.data.drive import Drive
-from saunet.data.loading.selecting import Division, divide
+from saunet.data.loading.selecting import BETWEEN, Division, divide
 from saunet.data.loading.windows import Selection, reach
 from saunet.data.sets.base import FilesDataModule, FilesDrive
 from saunet.errors import DataError, in_range
@@ -103,12 +103,11 @@ class RecordingsDataModule(FilesDataModule):
 
     def select(self, split: str) -> Sequence[Selection]:
         """Return the frames of a split, and with training how many are in none."""
-        selections = list(super().select(split))
-        if split == "train" and selections:
-            drive, frames, left_out = selections[0]
-            unused = {"between training and validation": self._division.unused}
-            selections[0] = Selection(drive, frames, {**left_out, **unused})
-        return selections
+        unused = self._division.unused if split == "train" else {}
+        return [
+            Selection(drive, frames, {**left_out, BETWEEN: unused.get(drive.name, 0)})
+            for drive, frames, left_out in super().select(split)
+        ]
 
 
 def numbered(folder: Path, pattern: str) -> dict[int, Path]:

@@ -24,7 +24,7 @@ from saunet.data.checks import common_size
 from saunet.data.drive import GAP, Drive
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
-from saunet.data.loading.selecting import Division, divide
+from saunet.data.loading.selecting import BETWEEN, Division, divide
 from saunet.data.loading.windows import Selection, measured_distance, reach
 from saunet.data.video.camera import FILE_NAME, CameraFile, Lens, check_crop
 from saunet.data.video.clips import (
@@ -351,9 +351,15 @@ class VideoDataModule(DepthDataModule):
         heights = {drive.camera_height for drive in self.drives()}
         return heights.pop() if len(heights) == 1 else None
 
-    def overlap(self) -> str | None:
-        return self._division().overlap()
+    def summary(self, split: str) -> str:
+        """Return what a split uses and leaves out; training names the clips that cannot be read."""
+        broken = self._broken if split == "train" else []
+        return "\n  ".join([super().summary(split), *(f"clip left out: {error}" for error in broken)])
 
+    def overlap(self) -> str | None:
+        return self._division.overlap()
+
+    @functools.cached_property
     def _division(self) -> Division:
         frames = {drive.name: drive.indices for drive in self.drives()}
         held = {"val_clips": self.val_clips, "test_clips": self.test_clips}
@@ -364,18 +370,17 @@ class VideoDataModule(DepthDataModule):
         if not any(drive.indices for drive in drives.values()):
             example = next(iter(drives), None) or self._broken[0]
             raise DataError(f"the clips below {self.root} hold no usable frame, such as {example}")
-        division = self._division()
+        division = self._division
         if split == "train" and not division.train and not division.unused:
             raise ConfigError(
                 f"val_clips and test_clips hold out all clips ({', '.join(drives)}); leave one to train on"
             )
         selections = []
-        for place, (name, wanted) in enumerate(division.of(split).items()):
+        for name, wanted in division.of(split).items():
             drive = drives[name]
             left_out = {} if split == "val" else dict(drive.left_out)
-            if split == "train" and place == 0:
-                left_out["between training and validation"] = division.unused
-                left_out["clips that cannot be read"] = len(self._broken)
+            if split == "train":
+                left_out[BETWEEN] = division.unused.get(name, 0)
             if self.static == "drop" and split in ("train", "val"):
                 static = drive.static()
                 left_out["static"] = sum(frame in static for frame in wanted)
