@@ -37,11 +37,11 @@ def test_a_trained_run_becomes_a_page(smoke_run: Path, tmp_path: Path, monkeypat
     code, out, err = tool(str(smoke_run), "output_dir=page", f"scenes={{kitti: '{pictures}'}}", "title=Smoke")
     assert code == 0, err
     assert "report: page/report.html" in out
-    assert "left out: Fig. 10" in err
+    assert "left out: Accuracy against time" in err
     assert "<title>Smoke</title>" in (tmp_path / "page" / "report.html").read_text()
     code, _, err = tool("compare", str(smoke_run))
     assert code == 1
-    assert err.strip().endswith("name two or more: saunet report compare A B")
+    assert err.strip().endswith("or saunet report compare street A for the shipped model and a run")
     assert {path.name for path in tmp_path.iterdir()} <= {"page", "outputs"}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import re
@@ -25,7 +26,9 @@ from saunet.reporting.compare import compared
 from saunet.reporting.figures import speed
 from saunet.reporting.page import Document, Section, as_html, as_markdown, write
 from saunet.reporting.scenes import Seen, look
+from saunet.reporting.tables import networks, with_pose
 from saunet.reporting.tool import build
+from saunet.runs.folder import read_run
 from saunet.tables import Column, Row, Table, show
 
 
@@ -80,11 +83,11 @@ def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path:
         "Accuracy", "Runs", "Training", "Depth side by side", "Networks", "Accuracy and time",
     ]  # fmt: skip
     for words in (
-        "Fig. 4",
-        "Fig. 5",
-        "Fig. 8",
-        "Fig. 9",
-        "Fig. 10",
+        "Loss by epoch (the paper’s Fig. 4)",
+        "Accuracy by epoch (the paper’s Fig. 5)",
+        "Models side by side: kitti (the paper’s Fig. 8)",
+        "Models side by side: campus sunny (the paper’s Fig. 9)",
+        "Accuracy against time of run (cpu, fp32, eager, batch 2)",
         "the loss became NaN",
         "α/β",
         "SAU-Net",
@@ -102,9 +105,9 @@ def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path:
     methods = [row["Method"] for row in csv.DictReader(io.StringIO(files["tables/table1.csv"].read_text()))]
     assert not any(method.startswith("α/β") for method in methods)
     missing = {one.what: one.why for one in document.missing}
-    assert "in the tables of their sweeps" in missing["Table 1, jobs of sweeps"]
-    assert missing["Fig. 7"] == "no group of runs differs in its loss alone"
-    assert "Fig. 8" not in missing
+    assert "in the tables of their sweeps" in missing["Errors and accuracy of the jobs of sweeps"]
+    assert missing["Loss functions side by side (the paper’s Fig. 7)"] == "no group of runs differs in its loss alone"
+    assert "Models side by side (the paper’s Fig. 8)" not in missing
     text = files["report.md"].read_text()
     for reference in re.findall(r"\]\((figures/[^)]+)\)", text):
         assert (tmp_path / "report" / reference).is_file()
@@ -136,10 +139,10 @@ def test_losses_side_by_side_are_figure_7(sweep: Path, picture: Path) -> None:
         add_checkpoint(sweep / str(job))
     document = build(collect([sweep]), ReportOptions(scenes={"kitti": str(picture)}, figures=False))
     titles = [block.title for section in document.sections for block in section.blocks]
-    assert "Fig. 7. Loss functions side by side: kitti" in titles
+    assert "Loss functions side by side: kitti (the paper’s Fig. 7)" in titles
     missing = {one.what: one.why for one in document.missing}
-    assert missing["Figs. 4, 5 and 10"] == "figures=false"
-    assert "Fig. 7" not in missing
+    assert missing["Curves, and accuracy against time"] == "figures=false"
+    assert not any(what.startswith("Loss functions side") for what in missing)
 
 
 def test_one_run_of_ones_own_comes_first_and_by_its_folders_name(tmp_path: Path) -> None:
@@ -161,8 +164,8 @@ def test_one_run_of_ones_own_comes_first_and_by_its_folders_name(tmp_path: Path)
 def test_what_has_no_data_is_listed(tmp_path: Path) -> None:
     document = build(collect([make_run(tmp_path / "a", abs_rel=())]))
     what = {one.what for one in document.missing}
-    assert {"Size and pictures of a", "Table 1, row of a", "Figs. 7, 8, 9 and 11", "Fig. 10"} <= what
-    assert "Fig. 4, loss of runs" in what
+    assert {"Size and pictures of a", "Errors and accuracy of a", "Depth side by side", "Accuracy against time"} <= what
+    assert "Loss by epoch of runs" in what
 
 
 def test_without_matplotlib_the_page_has_no_drawings_and_says_why(
@@ -170,7 +173,7 @@ def test_without_matplotlib_the_page_has_no_drawings_and_says_why(
 ) -> None:
     monkeypatch.setattr("saunet.reporting.tool.find_spec", lambda name: None)
     result = report(ReportOptions(runs=(make_run(tmp_path / "a"),), output_dir=tmp_path / "page"))
-    (told,) = (sentence for sentence in result.left_out if sentence.startswith("Figs. 4, 5 and 10: "))
+    (told,) = (sentence for sentence in result.left_out if sentence.startswith("Curves, and accuracy against time: "))
     assert "pip install 'saunet[plot]'" in told
     assert (tmp_path / "page" / "report.html").is_file()
     assert not list((tmp_path / "page").rglob("*.svg"))
@@ -221,7 +224,7 @@ def test_two_runs_are_compared_image_by_image(tmp_path: Path) -> None:
         make_evaluation(folder / "test", "x", value)
     text = _compared(*runs)
     assert re.search(r"objective\.beta\s+0\.1\s+0\.2", text)
-    assert "synthetic: second 'beta = 0.2' against first 'beta = 0.1'" in text
+    assert "synthetic: second 'b' against first 'a'" in text
     assert re.search(r"Abs Rel ↓\s+0\.2750\s+0\.3250\s+\+0\.0500\s+\+0\.0500\s+\+0\.0500\s+0%\s+–", text)
 
 
@@ -231,7 +234,7 @@ def test_what_cannot_be_paired_is_said(tmp_path: Path) -> None:
     make_evaluation(runs[1] / "test", "x", images=5)
     text = " ".join(_compared(*runs).split())
     assert "do not pair up" in text
-    assert "are not compared (beta = 0.3 not evaluated)" in text
+    assert "are not compared (c not evaluated)" in text
     with pytest.raises(DataError, match="not enough to compare"):
         _compared(runs[0])
 
@@ -256,12 +259,12 @@ def test_runs_on_clips_without_ground_truth_are_compared_frame_by_frame(tmp_path
     _explained(one / "test", 0.1)
     _explained(two / "test", 0.2)
     text = _compared(one, two)
-    assert "campus: second 'beta = 0.2' against first 'beta = 0.1'" in text
+    assert "campus: second 'b' against first 'a'" in text
     assert re.search(r"warped ↓\s+0\.1250\s+0\.2250\s+\+0\.1000\s+\+0\.1000\s+\+0\.1000\s+0%", text)
     assert re.search(r"explained ↑\s+0\.8000\s+0\.8000\s+\+0\.0000", text)
     assert "left out" not in text
     assert "status" not in text  # both are finished
-    assert re.search(r"beta = 0\.1\s+3\s+1\.2000", text)  # the loss of the last of nine steps, in epoch 3
+    assert re.search(r"a\s+3\s+1\.2000", text)  # the loss of the last of nine steps, in epoch 3
     assert "these losses do not compare" in " ".join(text.split())  # their objectives have other weights
 
 
@@ -365,5 +368,46 @@ def test_figure_10_has_a_point_where_a_run_was_timed_at_its_own_size(everything:
         ("mine", "64x128", None),
     ]
     told = {one.what: one.why for one in missing}
-    assert "that runs at 64x128" in told["Fig. 10, accuracy of mine (64x128, cpu, fp32, eager, batch 1)"]
-    assert "several images at once" in told["Fig. 10, point of run (cpu, fp32, eager, batch 2)"]
+    assert "that runs at 64x128" in told["Accuracy of mine (64x128, cpu, fp32, eager, batch 1)"]
+    assert "several images at once" in told["Accuracy against time of run (cpu, fp32, eager, batch 2)"]
+
+
+def test_the_shipped_model_is_compared_with_a_run_under_its_own_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = add_checkpoint(make_run(tmp_path / "town", status="finished")).parents[1]
+    text = " ".join(_compared(Path("street"), run).split())
+    assert "only a training has settings to compare" in text
+    commands = (
+        "`saunet evaluate street data=synthetic output_dir=town/compared_street`",
+        "`saunet evaluate town data=synthetic output_dir=town/compared`",
+    )
+    assert " and ".join(commands) in text
+    make_evaluation(run / "compared", "x", 0.25)
+    make_evaluation(run / "compared_street", "street", 0.3)
+    text = _compared(Path("street"), run)
+    assert "second 'town' against first 'street'" in text
+    assert "left out" not in text
+    document = build(collect([run]), ReportOptions(figures=False))  # which shows both
+    parameters = next(table for table in document.tables if table.name == "table2")
+    assert [row.cells[0] for row in parameters.rows][:2] == ["stratified_nano + aunet", "street"]
+    with pytest.raises(DataError, match=r"nothing at nowhere; .* shipped model: street"):
+        collect(["nowhere"])
+
+
+def test_runs_of_folders_alike_are_told_apart_by_the_folders_above(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / place / "first", status="finished") for place in ("a", "b")]
+    other = make_run(tmp_path / "b" / "second", status="finished")
+    text = _compared(*runs, other)
+    assert re.search(r"key\s+a/first\s+b/first\s+second", text)
+
+
+def test_a_whole_model_goes_by_its_name_unless_a_part_was_changed(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "a"))
+    for encoder, name in (("efficientnet_lite0", "street"), ("resnet18", "resnet18 + unet_narrow")):
+        parts = {"model": "street", "model/encoder": encoder, "model/decoder": "unet_narrow", "model/pose": "posecnn"}
+        chosen = dataclasses.replace(run, choices={**run.choices, **parts})
+        assert (networks(chosen), with_pose(chosen)) == (name, f"{name}, pose posecnn")
+    parts |= {"model/encoder": "efficientnet_lite0", "model/pose": "efficientnet_lite0"}
+    assert with_pose(dataclasses.replace(run, choices=parts)) == "street"

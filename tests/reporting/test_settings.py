@@ -45,7 +45,7 @@ def test_a_key_that_older_versions_lack_is_no_difference_while_it_is_off(tmp_pat
 
 def test_runs_alike_go_by_their_own_names_and_never_twice_by_one(tmp_path: Path) -> None:
     one, other = (read_run(make_run(tmp_path / folder / "same")) for folder in ("x", "y"))
-    assert labels([[one, other]]) == [["same (same)", "same (same) 2"]]
+    assert labels([[one, other]]) == [["same (x/same)", "same (y/same)"]]
     assert labels([[one]]) == [["same"]]
 
 

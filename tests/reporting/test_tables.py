@@ -38,7 +38,7 @@ def test_published_rows_stand_only_beside_scores_on_the_same_split(tmp_path: Pat
     table, missing = table1({"mine": collect([folder]).runs[0]})
     assert table is not None
     assert {row.kind for row in table.rows} == {"measured"}
-    assert [one.what for one in missing] == ["Published rows of Table 1"]
+    assert [one.what for one in missing] == ["Published errors to compare with"]
 
 
 def test_validation_fills_in_and_says_so(tmp_path: Path) -> None:
@@ -51,7 +51,7 @@ def test_a_run_without_a_score_is_listed_with_its_reason(tmp_path: Path) -> None
     (run,) = collect([broken]).runs
     table, missing = table1({"a": run})
     assert table is None
-    assert [(one.what, one.why) for one in missing] == [("Table 1, row of a", "failed: the disk is full")]
+    assert [(one.what, one.why) for one in missing] == [("Errors and accuracy of a", "failed: the disk is full")]
 
 
 def test_supervision_shows_in_the_pattern(tmp_path: Path) -> None:

@@ -14,8 +14,9 @@ from saunet.evaluation.statistics import compare as paired
 from saunet.reporting.inputs import Evaluation, Inputs, read_evaluation
 from saunet.reporting.tables import Groups, explained_table, health_tables, losses_table
 from saunet.runs.folder import SUBJECTS, Run
-from saunet.runs.sweep import differing, labels, values
+from saunet.runs.sweep import differing, settings, typed_names, values
 from saunet.tables import Column, Row, Table
+from saunet.weights.locate import BOX
 
 _OF_TRAINING = ("height", "width", "offsets", "batch_size", "workers", "crop_margin", "flip_prob", "color_jitter_prob")
 """Settings of the data that an evaluation takes from the checkpoint, or has no use for."""
@@ -32,7 +33,8 @@ def settings_table(runs: Mapping[str, Run]) -> Table:
     for key, cells in (("status", ended), ("code", commits)):
         if len(set(itertools.compress(cells, trained))) > 1:
             rows.append(Row((key, *(cell if known else "" for cell, known in zip(cells, trained, strict=True)))))
-    notes = () if rows else ("no setting differs",)
+    alone = sum(map(bool, map(settings, members))) < 2
+    notes = () if rows else ("only a training has settings to compare" if alone else "no setting differs",)
     return Table("settings", "Settings that differ", (Column("key"), *map(Column, runs)), tuple(rows), notes)
 
 
@@ -148,36 +150,43 @@ def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
 
 
 def _remedy(first: Run, other: Run) -> str:
-    """Say what to run so that two runs compare: both on the data of the first, with results where we look."""
-    data, choice = first.config.get("data") or {}, first.choices.get("data")
+    """Say what to run so that two runs compare: both on the data of the first training, with results where we look."""
+    trained = [run for run in (first, other) if run.path.parent != BOX]
+    leading = next(iter(trained), first)
+    data, choice = leading.config.get("data") or {}, leading.choices.get("data")
     if not choice or not all(run.path.is_dir() and run.checkpoint for run in (first, other)):
         return "run saunet evaluate on both with the same data and settings, and name the results too"
     given = {f"data.{key}": str(data[key]) for key in ("root",) if data.get(key)}
-    given |= {key: value for key, value in first.overrides.items() if key.startswith(("data.", "plugins"))}
+    given |= {key: value for key, value in leading.overrides.items() if key.startswith(("data.", "plugins"))}
     words = [f"{key}={value}" for key, value in given.items() if key.removeprefix("data.") not in _OF_TRAINING]
     if any((run.config.get("data") or {}).get("track_motion") for run in (first, other)):
         words.append("motion=tracked")  # which the training had: a young pose network would hide the depth
-    places = [
-        str(run.path.relative_to(Path.cwd()) if run.path.is_relative_to(Path.cwd()) else run.path)
-        for run in (first, other)
-    ]
-    commands = [
-        shlex.join(["saunet", "evaluate", place, f"data={choice}", *words, f"output_dir={place}/compared"])
-        for place in places
-    ]
-    splits = [(run.record.get("splits") or {}).get("val") for run in (first, other)]
-    seen = "" if splits[0] == splits[1] else " (frames that the second may have been trained on)"
+    commands = []
+    for run in (first, other):  # what a shipped model scored is kept with the training that it is compared with
+        known = run.path.parent == BOX
+        place = run.name if known else _typed(run.path)
+        folder = f"{_typed(leading.path)}/compared_{run.name}" if known else f"{place}/compared"
+        commands.append(shlex.join(["saunet", "evaluate", place, f"data={choice}", *words, f"output_dir={folder}"]))
+    splits = [(run.record.get("splits") or {}).get("val") for run in trained]
+    seen = "" if len(set(splits)) < 2 else " (frames that the second may have been trained on)"
     return f"run `{commands[0]}` and `{commands[1]}`{seen}, then compare again"
+
+
+def _typed(path: Path) -> str:
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
 
 def compared(inputs: Inputs, wanted: Sequence[str]) -> tuple[list[Table], list[str]]:
     """Return all that can be said about how runs differ: tables, and sentences about what is left out."""
     members = inputs.all_runs
     if len(members) < 2:
-        raise DataError(f"{len(members)} run is not enough to compare; name two or more: saunet report compare A B")
+        raise DataError(
+            f"{len(members)} run is not enough to compare; name two or more: saunet report compare A B, or "
+            "saunet report compare street A for the shipped model and a run"
+        )
     if wanted and len(set(wanted)) != len(members):
         raise ConfigError(f"labels holds {len(set(wanted))} names for {len(members)} runs; give each its own")
-    runs = dict(zip(wanted or labels([members])[0], members, strict=True))
+    runs = dict(zip(wanted or typed_names(members), members, strict=True))
     scores = scores_table(runs)
     side_by_side = (losses_table(runs), scores if scores.rows else None, explained_table(runs))
     found, left_out = comparisons(runs)

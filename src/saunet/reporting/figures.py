@@ -166,7 +166,7 @@ def speed(
         owners = [name for name in scores if networks.get(name) == (row["depth_parameters"], size.lower())]
         if not owners:
             why = f"no scored run has a depth network of exactly this many parameters that runs at {size}"
-            missing.append(Missing(f"Fig. 10, accuracy of {row['model']} ({size}, {how})", why))
+            missing.append(Missing(f"Accuracy of {row['model']} ({size}, {how})", why))
             alone.append(Row((str(row["model"]), how, size, None, seconds * 1e3), "measured", "Measured: times alone"))
         for name in owners:
             accuracy = scores[name].errors[4]
@@ -176,9 +176,11 @@ def speed(
                 points[name, kind] = Point(name, accuracy, seconds, kind)
             else:
                 why = "its time is of several images at once" if batch > 1 else "its accuracy is of other images"
-                missing.append(Missing(f"Fig. 10, point of {name} ({how})", why))
+                missing.append(Missing(f"Accuracy against time of {name} ({how})", why))
     if not measured:
-        missing.append(Missing("Fig. 10", "no benchmark given; name the folder that saunet benchmark wrote"))
+        missing.append(
+            Missing("Accuracy against time", "no benchmark given; name the folder that saunet benchmark wrote")
+        )
         return [], None, missing
     headings = columns("Method", "Device", "Size", "δ < 1.25 ↑|.3f", "ms per image|.1f")
     notes = ("Times on different devices cannot be compared; the paper's were taken on an AGX Orin.",)

@@ -26,6 +26,7 @@ from saunet.runs.folder import (
     split_overrides,
 )
 from saunet.runs.sweep import read_plan
+from saunet.weights.locate import BOX, locate, shipped
 
 _KEPT = {"lr": "initial_lr", "weight_decay": "weight_decay"}
 """Settings of a recipe that live on in an optimizer's state, and what they are called there."""
@@ -91,7 +92,7 @@ def collect(paths: Sequence[str | Path], checkpoint: str = "best", *, strangers:
         alone = take or evaluation.foreign or evaluation.folder.resolve() in named
         if alone and not any(belongs(evaluation, run) for run in known):
             orphan, origin = Run(evaluation.folder, name=evaluation.name), evaluation.checkpoint
-            if origin is not None and origin.is_file() and not evaluation.foreign:
+            if origin is not None and origin.exists() and not evaluation.foreign:
                 orphan = _read_checkpoint(origin)
             runs[orphan.path] = orphan
             order.setdefault(orphan.path, order.get(evaluation.folder, len(order)))
@@ -132,16 +133,15 @@ def _as_trained(run: Run) -> Run:
 
 
 def _find(path: Path, depth: int = 3) -> list[tuple[str, Path]]:
-    """Return (kind, place) of everything at or below a path, sorted by name."""
+    """Return (kind, place) of everything at or below a path, sorted by name; a shipped model is a checkpoint."""
+    if not path.exists() and str(path) in shipped():
+        return [("checkpoint", locate(str(path)))]
     if path.is_file():
         kinds = {".ckpt": "checkpoint", ".json": "benchmark" if path.stem == "benchmark" else "evaluation"}
         kind = kinds.get(path.suffix, "")
         return [(kind, path.parent if path.suffix == ".json" else path)] if kind else []
     if not path.is_dir():
-        raise DataError(
-            f"there is nothing at {path}; check the path (a shipped model's scores are in the folder that saunet "
-            "evaluate wrote)"
-        )
+        raise DataError(f"there is nothing at {path}; check the path, or name a shipped model: {', '.join(shipped())}")
     if (path / "multirun.yaml").is_file():
         return [("sweep", path)]
     if began(path):
@@ -211,6 +211,11 @@ class Evaluation:
         return self.predictions is not None
 
     @property
+    def shipped(self) -> bool:
+        """Whether it is of a model that comes with saunet, wherever its results are."""
+        return self.checkpoint is not None and self.checkpoint.parent == BOX
+
+    @property
     def name(self) -> str:
         """What it goes by without a run: its folder, or the predictions where Hydra named the folder by the time."""
         dated = re.match(r"\d{4}-\d\d-\d\d_", self.folder.name)
@@ -228,6 +233,8 @@ def read_evaluation(folder: Path) -> Evaluation:
     starts = [Path(runtime["cwd"])] if runtime.get("cwd") else [Path.cwd(), *folder.parents]
     candidates = [Path(start, str(given)).resolve() for start in starts] if given else []
     checkpoint = next((each for each in candidates if each.is_file()), next(iter(candidates), None))
+    if given in shipped():  # as `locate` reads it: a local file of that name is ./street
+        checkpoint = locate(str(given))
     data = (runtime.get("choices") or {}).get("data") or settings.get("data") or "unknown data"
     place = f"{data}, {config.get('split') or settings.get('split') or 'test'} split"
     how, images = _how(settings), content.get("images") or {}
@@ -270,7 +277,7 @@ def belongs(evaluation: Evaluation, run: Run) -> bool:
     """Return whether an evaluation is one of a run: of its checkpoint, or in its folder and not of another system."""
     if run.path == evaluation.folder:
         return True
-    if evaluation.foreign:
+    if evaluation.foreign or (evaluation.shipped and evaluation.checkpoint != run.checkpoint):
         return False
     if run.path.is_dir() and run.path in evaluation.folder.parents:
         return True

@@ -16,9 +16,9 @@ from saunet.io.images import as_rgb_bytes, read_image, resize
 from saunet.prediction.predictor import Predictor
 from saunet.prediction.sources import find_sources
 from saunet.reporting.page import Picture, Scene, Tile
-from saunet.runs.checkpoint import read_checkpoint
 from saunet.runs.folder import Run
 from saunet.tools.benchmark.measure import count_parameters
+from saunet.weights.files import read_model
 
 MARKS = ((226, 52, 58), (0, 190, 220), (120, 200, 60))
 """Colors of the boxes, RGB."""
@@ -77,7 +77,7 @@ def look(run: Run, views: Sequence[View], device: str = "cpu", flip: bool = Fals
     if run.checkpoint is None:
         return run.error or "it has no checkpoint"
     try:
-        checkpoint = read_checkpoint(run.checkpoint)
+        checkpoint = read_model(run.checkpoint)
         depth, pose = checkpoint.networks()
         record = checkpoint.record
         predictor = Predictor(depth, record.height, record.width, device, record.scale, flip)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from saunet.evaluation.result import ERROR_COLUMNS
 from saunet.metrics.functional import A1, ABS_REL, RMSE
 from saunet.published import published
+from saunet.registry import Spec, models
 from saunet.reporting.page import Missing
 from saunet.runs.folder import Detail, Explained, Run, Score
 from saunet.runs.sweep import RATIO, differing, ratio, values
@@ -79,7 +80,7 @@ def table1(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
         who = score.predictor if score.trivial else name
         rows.append(Row((who, _pattern(runs[name], score), *score.errors), "measured", group(score)))
     missing = [
-        Missing(f"Table 1, row of {name}", _no_score(run))
+        Missing(f"Errors and accuracy of {name}", _no_score(run))
         for name, run in runs.items()
         if not (run.scores or run.explained)
     ]
@@ -93,9 +94,9 @@ def table1(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
         notes.append("Eigen's last two numbers are equal in the paper; Klodt's RMSE log is a dash there.")
     elif ours:
         why = "they are of KITTI's Eigen split, and no run was scored on it"
-        missing.append(Missing("Published rows of Table 1", why))
+        missing.append(Missing("Published errors to compare with", why))
     headings = (*columns("Method", "Pattern"), *ERROR_COLUMNS)
-    table = Table("table1", "Table 1. Errors and accuracy", headings, tuple(rows), tuple(notes))
+    table = Table("table1", "Errors and accuracy (the paper’s Table 1)", headings, tuple(rows), tuple(notes))
     return table if rows else None, missing
 
 
@@ -158,7 +159,7 @@ def detail_tables(runs: Mapping[str, Run]) -> list[Table]:
 def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table | None, list[Missing]]:
     """Return the parameters of our networks, with the paper's Table 2; None without any."""
     if not sizes:
-        return None, [Missing("Table 2", "no run has a checkpoint")]
+        return None, [Missing("Parameters of the networks", "no run has a checkpoint")]
     rows = [
         Row((name, depth / 1e6, pose / 1e6 if pose else None, (depth + pose) / 1e6), "measured", "Counted here")
         for name, (depth, pose) in sizes.items()
@@ -166,7 +167,7 @@ def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table | None, list[Mis
     rows += [Row((row.method, None, None, row.megaparameters), "published", "Published") for row in published().table2]
     headings = columns("Method", "Depth network|.1f", "Pose network|.1f", "Together|.1f")
     notes = ("Millions of parameters; the paper's unit is “Mb”.",)
-    return Table("table2", "Table 2. Parameters", headings, tuple(rows), notes), []
+    return Table("table2", "Parameters (the paper’s Table 2)", headings, tuple(rows), notes), []
 
 
 def table3(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
@@ -176,7 +177,7 @@ def table3(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
     group = Groups(score for _, score in models)
     headings = (*columns("Method", "STF-T", "Attention"), *ERROR_COLUMNS)
     if len({networks(run) for run, _ in models}) < 2:
-        return None, [Missing("Table 3", "no two scored runs differ in encoder or decoder")]
+        return None, [Missing("Encoders and decoders compared", "no two scored runs differ in encoder or decoder")]
     rows = [Row((networks(run), *_ticks(run), *score.errors), "measured", group(score)) for run, score in models]
     rest, notes = [key for key in differing([run for run, _ in models]) if not key.startswith("model.")], []
     if rest:
@@ -187,7 +188,8 @@ def table3(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
             Row((row.method, _tick(row.stratified), _tick(row.attention), *row.errors), "published", PRINTED)
             for row in published().table3
         ]
-    return Table("table3", "Table 3. Ablation of the networks", headings, tuple(rows), tuple(notes)), []
+    title = "Encoders and decoders compared (the paper’s Table 3)"
+    return Table("table3", title, headings, tuple(rows), tuple(notes)), []
 
 
 def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -> Table:
@@ -226,8 +228,25 @@ def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -
 
 
 def networks(run: Run) -> str:
-    """Return a run's networks in words, such as ``resnet18 + unet``."""
-    return f"{run.component('model/encoder')} + {run.component('model/decoder')}"
+    """Return a run's networks in words: a whole model's name, such as ``street``, or ``resnet18 + unet``."""
+    return _system(run) or f"{run.component('model/encoder')} + {run.component('model/decoder')}"
+
+
+def with_pose(run: Run) -> str:
+    """Return a run's networks in words, with the pose network where it is not the whole model's own."""
+    pose, system = run.component("model/pose"), _system(run)
+    own = Spec.of("model", system).get("pose") if system else None
+    return networks(run) + (f", pose {pose}" if pose and pose != own else "")
+
+
+def _system(run: Run) -> str:
+    """Return the name of the whole model that was chosen, where its encoder and decoder were left as they are."""
+    name = run.choices.get("model", "")
+    if name not in models.names():
+        return ""
+    own = Spec.of("model", name)
+    alike = all(run.component(f"model/{part}") == own.get(part) for part in ("encoder", "decoder"))
+    return name if alike else ""
 
 
 def last_mean(run: Run, key: str) -> float | None:

@@ -188,7 +188,7 @@ def build(
         sections += [Section("Training", curves, "Each point is a mean over neighboring steps.")] if curves else []
     else:
         why = "they need matplotlib: run `pip install 'saunet[plot]'`" if options.figures else "figures=false"
-        missing.append(Missing("Figs. 4, 5 and 10", why))
+        missing.append(Missing("Curves, and accuracy against time", why))
     galleries = [gallery for group in groups for gallery in _galleries(group, views, seen, options.zooms)]
     if galleries:
         sections.append(Section("Depth side by side", galleries, _READING))
@@ -201,7 +201,7 @@ def build(
     missing.append(Missing("Published curves and pictures", "the paper prints them as images only"))
     if len(shown) < len(everyone):
         why = "they are in the tables of their sweeps; evaluate their checkpoints to have them here too"
-        missing.append(Missing("Table 1, jobs of sweeps", why))
+        missing.append(Missing("Errors and accuracy of the jobs of sweeps", why))
     return Document(options.title, _facts(everyone), tuple(sections), tuple(missing))
 
 
@@ -263,14 +263,14 @@ def _curves(group: _Group, missing: list[Missing]) -> list[Figure]:
          "On validation frames, after each epoch."),
     )  # fmt: skip
     found = []
-    for number, what, panels, caption in wanted:
+    for figure, what, panels, caption in wanted:
         drawing = figures.draw_curves(group.runs, panels, ordered=ordered)
         if drawing is None:
-            missing.append(Missing(f"{number}, {what} of {group.title}", "no run has logged it"))
+            missing.append(Missing(f"{what.capitalize()} by epoch of {group.title}", "no run has logged it"))
             continue
-        picture = Picture(f"{group.name}_{what}.svg", drawing, f"{what} against epoch")
+        picture = Picture(f"{group.name}_{what}.svg", drawing, f"{what} by epoch")
         place = f": {group.title}" if group.swept else ""
-        found.append(Figure(f"{number}. {what.capitalize()} against epoch{place}", picture, caption))
+        found.append(Figure(f"{what.capitalize()} by epoch{place} (the paper’s {figure})", picture, caption))
     return found
 
 
@@ -293,7 +293,7 @@ def _galleries(group: _Group, views: Sequence[View], seen: Mapping[str, Seen], z
         if what == "settings":  # which is no figure of the paper
             numbers = ()
         else:
-            title = f"Fig{'s' * (len(numbers) > 1)}. {' and '.join(numbers)}. {title}"
+            title = f"{title} (the paper’s Fig{'s' * (len(numbers) > 1)}. {' and '.join(numbers)})"
         scenes: list[Scene] = []
         for place, view in enumerate(views):
             if view.condition == condition:
@@ -304,19 +304,24 @@ def _galleries(group: _Group, views: Sequence[View], seen: Mapping[str, Seen], z
 
 
 def _no_pictures(views: Sequence[View], galleries: Sequence[Gallery]) -> list[Missing]:
+    what = "Depth side by side"
     if not views:
         why = "no scenes given; name images, such as 'scenes={kitti: FOLDER, campus_sunny: FOLDER}'"
-        return [Missing("Figs. 7, 8, 9 and 11", why)]
+        return [Missing(what, why)]
     if not galleries:
-        return [Missing("Figs. 7, 8, 9 and 11", "no run has a checkpoint that can be used")]
+        return [Missing(what, "no run has a checkpoint that can be used")]
     found = {number for gallery in galleries for number in gallery.numbers}
     reasons = {
-        "7": "no group of runs differs in its loss alone",
-        "8": "no scenes but those of the campus, or runs that differ in their loss alone",
-        "9": "no scenes named campus_CONDITION",
-        "11": "no runs of different networks",
+        "7": ("Loss functions", "no group of runs differs in its loss alone"),
+        "8": ("Models", "no scenes but those of the campus, or runs that differ in their loss alone"),
+        "9": ("Models on the campus", "no scenes named campus_CONDITION"),
+        "11": ("Different networks", "no runs of different networks"),
     }
-    return [Missing(f"Fig. {number}", reason) for number, reason in reasons.items() if number not in found]
+    return [
+        Missing(f"{what} side by side (the paper’s Fig. {number})", reason)
+        for number, (what, reason) in reasons.items()
+        if number not in found
+    ]
 
 
 def _speed(points: Sequence[Point]) -> list[Figure]:
@@ -330,7 +335,7 @@ def _speed(points: Sequence[Point]) -> list[Figure]:
         "Hollow: the only time that the paper gives in numbers, from another device and data set."
     )
     picture = Picture("figure10.svg", drawing, "seconds per image against accuracy")
-    return [Figure("Fig. 10. Accuracy against time", picture, caption)]
+    return [Figure("Accuracy against time (the paper’s Fig. 10)", picture, caption)]
 
 
 def _by_networks(runs: Named, sizes: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
@@ -341,8 +346,7 @@ def _by_networks(runs: Named, sizes: Mapping[str, tuple[int, int]]) -> dict[str,
 
 
 def _words(run: Run) -> str:
-    pose = run.component("model/pose")
-    return tables.networks(run) + (f", pose {pose}" if pose else "") if run.component("model/encoder") else run.name
+    return tables.with_pose(run) if run.component("model/encoder") else run.name
 
 
 def _facts(runs: Named) -> tuple[str, ...]:

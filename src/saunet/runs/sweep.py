@@ -80,6 +80,29 @@ def sweeps_ratio(runs: Sequence[Run]) -> bool:
     return bool(keys) and keys <= {"objective.alpha", "objective.beta"} and len(ratios) > 1
 
 
+def typed_names(runs: Sequence[Run]) -> list[str]:
+    """Return a name for every run by which whoever named its folder knows it: the folder; a sweep's job by settings."""
+    singles = [run for run in runs if run.job is None]
+    ends = dict(zip([run.path for run in singles], _ends([run.path for run in singles]), strict=True))
+    jobs = [run for run in runs if run.job is not None]
+    settled = dict(zip([run.path for run in jobs], labels([jobs])[0], strict=True))
+    return [settled[run.path] if run.path in settled else ends[run.path] if run.config else run.name for run in runs]
+
+
+def _ends(paths: Sequence[Path]) -> list[str]:
+    """Return as many of the last parts of each path as make it unlike all others."""
+    found = []
+    for path in paths:
+        others = [other.parts for other in paths if other != path]
+        count = next(
+            count
+            for count in range(1, len(path.parts) + 1)
+            if count == len(path.parts) or all(parts[-count:] != path.parts[-count:] for parts in others)
+        )
+        found.append(str(Path(*path.parts[-count:])))
+    return found
+
+
 _LONGEST_LABEL = 32  # characters; single runs whose settings take more go by their folders
 
 
@@ -87,14 +110,17 @@ def labels(groups: Sequence[Sequence[Run]]) -> list[list[str]]:
     """Return a short name for every run, unlike all others, made of what sets it apart within its group."""
     named = [_labels(group) for group in groups]
     counts = Counter(name for names in named for name in names)
-    taken: Counter[str] = Counter()
-
-    def unique(run: Run, name: str) -> str:
-        name = name if counts[name] == 1 else f"{name} ({run.path.name})"
-        taken[name] += 1
-        return name if taken[name] == 1 else f"{name} {taken[name]}"
-
-    return [list(map(unique, group, names)) for group, names in zip(groups, named, strict=True)]
+    alike = [
+        run.path
+        for group, names in zip(groups, named, strict=True)
+        for run, name in zip(group, names, strict=True)
+        if counts[name] > 1
+    ]
+    ends = dict(zip(alike, _ends(alike), strict=True))
+    return [
+        [name if counts[name] == 1 else f"{name} ({ends[run.path]})" for run, name in zip(group, names, strict=True)]
+        for group, names in zip(groups, named, strict=True)
+    ]
 
 
 def _labels(runs: Sequence[Run]) -> list[str]:
