@@ -20,7 +20,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, NoReturn, Protocol, cast, runtime_checkable
 
 from saunet import __version__, plugins
 from saunet.cli.table import PLUGINS, TOOLS, Table, Tool, config_dir, imported, read
@@ -28,6 +28,8 @@ from saunet.errors import ELSEWHERE, ConfigError, SaunetError, suggest
 from saunet.threads import wait_briefly
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     from omegaconf import DictConfig
 
     from saunet import schema
@@ -152,7 +154,7 @@ def _ended_by_signals() -> Iterator[None]:
 
     main = threading.current_thread() is threading.main_thread()
     wanted = [getattr(signal, each) for each in ("SIGTERM", "SIGHUP") if main and hasattr(signal, each)]
-    before: dict[int, Any] = {
+    before: dict[int, Callable[[int, FrameType | None], object] | int | None] = {
         each: signal.signal(each, stop) for each in wanted if signal.getsignal(each) == signal.SIG_DFL
     }
     try:
