@@ -14,7 +14,9 @@ import pytest
 from rich.console import Console
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation.result import EvaluationResult, ImageRow, ViewRow, as_json, markdown, read_rows, write_results
+from saunet.evaluation.files import as_json, markdown, read_rows, write_results
+from saunet.evaluation.result import EvaluationResult
+from saunet.evaluation.rows import ImageRow, ViewRow
 from saunet.metrics.functional import ERROR_HEADINGS
 from saunet.metrics.protocols import protocol
 from saunet.tables import show

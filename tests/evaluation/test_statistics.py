@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from saunet.errors import DataError
-from saunet.evaluation.result import EvaluationResult, ImageRow, ViewRow, read_rows, write_results
+from saunet.evaluation.files import read_rows, write_results
+from saunet.evaluation.result import EvaluationResult
+from saunet.evaluation.rows import ImageRow, ViewRow
 from saunet.evaluation.statistics import bootstrap_mean, compare, spreads, with_statistics
 from saunet.metrics.protocols import protocol
 

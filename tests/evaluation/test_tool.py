@@ -14,7 +14,7 @@ import torch
 
 from saunet.errors import ConfigError, DataError
 from saunet.evaluation import EvaluateOptions, evaluate, write_results
-from saunet.evaluation.result import read_rows
+from saunet.evaluation.files import read_rows
 from saunet.evaluation.scoring import score_views
 from saunet.evaluation.statistics import with_statistics
 from saunet.evaluation.tool import evaluate_network, passes, tracked

@@ -19,7 +19,9 @@ from made_runs import ERRORS, add_checkpoint, make_evaluation, make_run
 from rich.console import Console
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation.result import EvaluationResult, ViewRow, write_results
+from saunet.evaluation.files import write_results
+from saunet.evaluation.result import EvaluationResult
+from saunet.evaluation.rows import ViewRow
 from saunet.metrics.protocols import protocol
 from saunet.reporting import ReportOptions, collect, report
 from saunet.reporting.compare import compared

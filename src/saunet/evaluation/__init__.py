@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from saunet.evaluation.files import write_results
 from saunet.evaluation.paths import OdometryOptions, odometry
 from saunet.evaluation.predictors import NetworkPredictor
-from saunet.evaluation.result import write_results
 from saunet.evaluation.scoring import score
 from saunet.evaluation.tool import EvaluateOptions, evaluate
 

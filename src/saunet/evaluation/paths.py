@@ -14,8 +14,8 @@ from numpy import ndarray
 
 from saunet.data.drive import Drive
 from saunet.errors import ConfigError, checked, positive, usable_device
+from saunet.evaluation.files import without_nan
 from saunet.evaluation.predictors import file_stem
-from saunet.evaluation.result import without_nan
 from saunet.io.atomic import check_folder, write_bytes, write_json
 from saunet.io.trajectories import write_kitti, write_tum
 from saunet.metrics.odometry import (

@@ -1,221 +1,35 @@
-"""What an evaluation found: a row for each image, predictor and protocol, their means, and tables and files of both."""
+"""What an evaluation found, as an object: its rows, their means as tables and pictures, parts of it and joins."""
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.errors import ConfigError, DataError, one_of, positive, require_matplotlib
-from saunet.fingerprint import fingerprint
-from saunet.io.atomic import write_bytes, write_json
-from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
-from saunet.metrics.protocols import Protocol
-from saunet.tables import Row, Table, columns, csv_text, notebook_html, show
-from saunet.tables.drawing import Drawing, colors, new_figure, svg
-
-T = TypeVar("T")
-ERROR_COLUMNS = columns(*(f"{heading}|.3f" for heading in ERROR_HEADINGS))
-COMPARED = dict(
-    zip((*ERROR_NAMES, "warped", "explained"), (*ERROR_COLUMNS, *columns("warped ↓", "explained ↑")), strict=True)
+from saunet.errors import ConfigError, one_of, positive, require_matplotlib
+from saunet.evaluation.rows import (
+    ERROR_COLUMNS,
+    BucketRow,
+    Comparison,
+    ImageRow,
+    ShapeRow,
+    ShapeSummary,
+    Spread,
+    Summary,
+    ViewRow,
+    ViewSummary,
+    interval,
 )
-"""What of an image is compared between two predictors, by name."""
-
-
-@dataclass(frozen=True, slots=True)
-class ImageRow:
-    """The errors of one predictor on one image under one protocol."""
-
-    predictor: str
-    protocol: str
-    name: str
-    pixels: int
-    """Pixels compared; 0 where the image has no ground truth, and then the numbers are NaN."""
-    scale: float
-    """Factor on the depth: that of the alignment, or under none median(truth)/median(prediction)."""
-    errors: tuple[float, ...]
-    """In the order of `saunet.metrics.functional.ERROR_NAMES`, as everywhere below."""
-
-    @property
-    def compared(self) -> dict[str, float]:
-        """What two predictors are compared by, one of `COMPARED` each; empty where nothing was measured."""
-        return dict(zip(ERROR_NAMES, self.errors, strict=True)) if self.pixels else {}
-
-
-@dataclass(frozen=True, slots=True)
-class BucketRow:
-    """Errors over all pixels of all images that fall into one bucket (not a mean over images: some have few there)."""
-
-    predictor: str
-    protocol: str
-    group: str
-    """What the buckets of one group divide, such as ``distance``."""
-    bucket: str
-    """Such as ``10-20 m``, ``bottom third`` or ``near an edge``."""
-    pixels: int
-    errors: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class ShapeRow:
-    """How well one predictor keeps the shapes of one image under one protocol; NaN for what was not measured."""
-
-    predictor: str
-    protocol: str
-    name: str
-    edge_accuracy: float
-    """Pixels from predicted depth edges to true ones; see `saunet.metrics.shapes.boundary_scores`."""
-    edge_completeness: float
-    """Pixels from true depth edges to predicted ones."""
-    precision: float
-    """Fraction of predicted points near true ones; see `saunet.metrics.shapes.cloud_scores`."""
-    recall: float
-    """Fraction of true points near predicted ones."""
-    f_score: float
-
-
-@dataclass(frozen=True, slots=True)
-class ViewRow:
-    """How well a prediction explains the neighboring frames of one image, where no depth is known.
-
-    NaN, and visible nowhere, where the motion of the camera is unknown.
-    """
-
-    predictor: str
-    protocol: str
-    name: str
-    condition: str
-    """The condition or the recording that the image belongs to."""
-    warped: float
-    """Photometric error after warping the neighbors by depth and motion, SAU-Net eqs. (8) to (10)."""
-    unwarped: float
-    """The same without warping: what a network that has learned nothing reaches."""
-    explained: float
-    """Fraction of pixels that warping brings closer, SAU-Net eq. (11)."""
-    visible: float
-    """Fraction of pixels that any neighbor sees."""
-
-    @property
-    def compared(self) -> dict[str, float]:
-        """As in `ImageRow`."""
-        return {"warped": self.warped, "explained": self.explained} if self.visible else {}
-
-
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """Means of one predictor under one protocol over the images that have ground truth; NaN if none has."""
-
-    predictor: str
-    protocol: str
-    errors: tuple[float, ...]
-    scale: float
-    scale_std: float
-    images: int
-    images_without_truth: int
-
-
-@dataclass(frozen=True, slots=True)
-class ViewSummary:
-    """Means of one predictor without ground truth over the images of one condition, or of ``all``."""
-
-    protocol: str
-    predictor: str
-    condition: str
-    images: int
-    warped: float
-    unwarped: float
-    explained: float
-    visible: float
-
-
-@dataclass(frozen=True, slots=True)
-class ShapeSummary:
-    """Means of `ShapeRow` of one predictor under one protocol, over the images that have each number."""
-
-    protocol: str
-    predictor: str
-    edge_accuracy: float
-    edge_completeness: float
-    precision: float
-    recall: float
-    f_score: float
-    edge_images: int
-    """Images whose ground truth is dense and has edges."""
-    cloud_images: int
-    """Images whose point clouds were compared."""
-
-
-@dataclass(frozen=True, slots=True)
-class Spread:
-    """How sure the means of one predictor under one protocol are: bootstrap intervals."""
-
-    predictor: str
-    protocol: str
-    level: float
-    by: str
-    """What was resampled: whole ``drive``s, or single ``image``s where there are too few drives."""
-    groups: int
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """The means of one error of two predictors on the same images."""
-
-    name: str
-    """One of `COMPARED`."""
-    first: float
-    second: float
-    difference: float
-    """``second - first``."""
-    low: float
-    high: float
-    """Bootstrap interval of the difference; with zero outside it, the predictors differ."""
-    better: float
-    """Fraction of images on which the second is better, ties counted half."""
-    p_value: float | None
-    """Chance of a difference at least this large if the labels were exchanged at random drive by drive (two-sided);
-    None with too few drives."""
-
-
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """Two predictors on the same images under one protocol."""
-
-    protocol: str
-    first: str
-    second: str
-    images: int
-    level: float
-    by: str
-    groups: int
-    differences: tuple[Difference, ...]
-
-    def table(self, *notes: str) -> Table:
-        """Return the differences as a table; bold where the interval leaves out zero."""
-        level = f"{self.level:.0%}".replace("%", " %")
-        headings = columns(
-            *("error", "first|.4f", "second|.4f", "difference|+.4f", f"{level} low|+.4f", f"{level} high|+.4f"),
-            *("second better|.0%", "p|.2g"),
-        )
-        rows = []
-        for one in self.differences:
-            column = COMPARED[one.name]
-            sure = one.low > 0 or one.high < 0
-            good = (one.difference > 0) == (column.better > 0)
-            cells = (column.label, *astuple(one)[1:])
-            rows.append(Row(cells, marks={3: "good" if good else "bad"} if sure else {}))
-        title = f"{self.protocol}: second '{self.second}' against first '{self.first}'"
-        told = f"{self.images} images, paired; {_interval(self)}"
-        return Table("comparison", title, headings, tuple(rows), (*notes, told))
+from saunet.fingerprint import fingerprint
+from saunet.metrics.functional import ERROR_NAMES
+from saunet.metrics.protocols import Protocol
+from saunet.tables import Row, Table, columns, notebook_html, show
+from saunet.tables.drawing import Drawing, colors, new_figure, svg
 
 
 @dataclass(frozen=True)
@@ -464,15 +278,9 @@ class EvaluationResult:
                 ends = zip(spread.low, spread.high, strict=True)
                 cells = [f"{low:.3f} to {high:.3f}" if ranges else f"±{(high - low) / 2:.3f}" for low, high in ends]
                 rows.append(Row(("", *cells, ""), "dim"))
-                notes[1:] = [f"{'range' if ranges else '±'}: {_interval(spread)}"]
+                notes[1:] = [f"{'range' if ranges else '±'}: {interval(spread)}"]
         headings = (*columns("predictor"), *ERROR_COLUMNS, *columns("scale"))
         return Table("metrics", f"{protocol.name}: {protocol.summary}", headings, tuple(rows), tuple(notes))
-
-
-def _interval(of: Spread | Comparison) -> str:
-    """Return what intervals mean, such as ``95 % bootstrap over 28 drives``."""
-    note = f"{of.level:.0%} bootstrap over {of.groups} {of.by}s".replace("%", " %")
-    return note if of.by == "drive" else f"{note}; neighboring frames are alike, so this is too narrow"
 
 
 def _view_table(protocol: Protocol, views: Sequence[ViewSummary]) -> Table:
@@ -508,131 +316,3 @@ def _shape_tables(protocols: Sequence[Protocol], shapes: Sequence[ShapeSummary],
             note = f"fractions of points with one of the other cloud within {cloud} m"
             found.append(Table("cloud", f"{protocol.name}: point clouds", headings, tuple(rows), (note,)))
     return found
-
-
-def markdown(result: EvaluationResult) -> str:
-    """Return all tables as Markdown, intervals as ranges."""
-    return "\n\n".join([*(table.markdown() for table in result.tables(ranges=True)), *result.warnings]) + "\n"
-
-
-def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
-    """Write ``metrics.json``, ``metrics.csv``, ``metrics.md`` and ``per_image.csv``, each whole or not at all.
-
-    What else the result holds goes to ``buckets.csv``, ``shapes.csv`` and ``views.csv`` (an image a line) and
-    ``comparison.csv``.
-    """
-    summaries = [_summary(summary, result.spreads) for summary in result.summaries()]
-    header = [*_names(Summary), *(f"{name}_{end}" for end in ("low", "high") for name in ERROR_NAMES)]
-    texts = {
-        "per_image.csv": _csv(ImageRow, result.rows),
-        "metrics.csv": csv_text(header, ([row.get(name) for name in header] for row in summaries)),
-    }
-    if result.buckets:
-        texts["buckets.csv"] = _csv(BucketRow, result.buckets)
-    if result.shapes:
-        texts["shapes.csv"] = _csv(ShapeRow, result.shapes)
-    if result.views:
-        texts["views.csv"] = _csv(ViewRow, result.views)
-    if result.comparisons:
-        lines = ((c.protocol, c.first, c.second, *astuple(d)) for c in result.comparisons for d in c.differences)
-        names = ("protocol", "before", "now", "error", "mean_before", "mean_now", *_names(Difference)[3:])
-        texts["comparison.csv"] = csv_text(names, lines)
-    texts["metrics.md"] = markdown(result)
-    for name, text in texts.items():
-        write_bytes(folder / name, text.encode())
-    for name in {"buckets.csv", "shapes.csv", "views.csv", "comparison.csv"} - texts.keys():
-        (folder / name).unlink(missing_ok=True)  # of an earlier evaluation in this folder, which these replace
-    write_json(folder / "metrics.json", as_json(result))
-    return {name: folder / name for name in (*texts, "metrics.json")}
-
-
-def as_json(result: EvaluationResult) -> dict[str, object]:
-    """Return the summaries and the exact rules they were computed under as plain data; NaN becomes None.
-
-    ``images`` holds the `fingerprint` of each protocol's images, which shows whether numbers are comparable.
-    """
-    content: dict[str, object] = {
-        "settings": dict(result.settings),
-        "protocols": [asdict(protocol) for protocol in result.protocols],
-        "results": [_summary(summary, result.spreads) for summary in result.summaries()],
-        "images": {protocol.name: result.fingerprint(protocol.name) for protocol in result.protocols},
-    }
-    if result.spreads:
-        spread = result.spreads[0]
-        content["intervals"] = {"level": spread.level, "by": spread.by, "groups": spread.groups}
-    rest = {
-        "buckets": [_plain(row) for row in result.buckets],
-        "shapes": [_plain(shape) for shape in result.shape_summaries()],
-        "views": [_plain(view) for view in result.view_summaries()],
-        "comparisons": [asdict(comparison) for comparison in result.comparisons],
-        "warnings": list(result.warnings),
-    }
-    plain: dict[str, object] = without_nan(content | {key: value for key, value in rest.items() if value})
-    return plain
-
-
-def read_rows(path: Path) -> tuple[ImageRow | ViewRow, ...]:
-    """Read the rows of an evaluation back, for comparisons, from its folder or its ``per_image.csv``."""
-    path = path / "per_image.csv" if path.is_dir() else path
-    views = path.with_name("views.csv")
-    return (*_read(path, ImageRow, _image), *(_read(views, ViewRow, _view) if views.is_file() else ()))
-
-
-def _image(row: Mapping[str, str]) -> ImageRow:
-    start = (row["predictor"], row["protocol"], row["name"], int(row["pixels"]), float(row["scale"] or math.nan))
-    return ImageRow(*start, tuple(float(row[name] or math.nan) for name in ERROR_NAMES))
-
-
-def _view(row: Mapping[str, str]) -> ViewRow:
-    numbers = (float(row[name] or math.nan) for name in ("warped", "unwarped", "explained", "visible"))
-    return ViewRow(row["predictor"], row["protocol"], row["name"], row["condition"], *numbers)
-
-
-def _read(path: Path, kind: type, made: Callable[[Mapping[str, str]], T]) -> list[T]:
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            table = csv.DictReader(file)
-            missing = [name for name in _names(kind) if name not in (table.fieldnames or ())]
-            if missing:
-                raise DataError(f"'{path}' has no column '{missing[0]}'; give a {path.name} written by an evaluation")
-            return list(map(made, table))
-    except DataError:
-        raise
-    except OSError as error:
-        raise DataError(f"cannot read '{path}': {error.strerror}; give a per_image.csv of an evaluation") from error
-    except (ValueError, TypeError, csv.Error) as error:
-        raise DataError(f"'{path}' holds a line that is not a row of numbers ({error}); evaluate again") from error
-
-
-def without_nan(value: Any) -> Any:
-    """Return plain data with None in place of NaN, which JSON cannot hold."""
-    if isinstance(value, dict):
-        return {key: without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(item) for item in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
-
-
-def _names(kind: type) -> list[str]:
-    """Return the names of a row's values, each error by its own."""
-    names = (each.name for each in fields(kind))
-    return [each for name in names for each in (ERROR_NAMES if name == "errors" else (name,))]
-
-
-def _plain(row: Any) -> dict[str, Any]:
-    values = (getattr(row, each.name) for each in fields(row))
-    flat = [each for value in values for each in (value if isinstance(value, tuple) else (value,))]
-    return dict(zip(_names(type(row)), flat, strict=True))
-
-
-def _csv(kind: type, rows: Iterable[Any]) -> str:
-    return csv_text(_names(kind), (tuple(_plain(row).values()) for row in rows))
-
-
-def _summary(summary: Summary, spreads: Sequence[Spread]) -> dict[str, object]:
-    row = _plain(summary)
-    for spread in spreads:
-        if (spread.predictor, spread.protocol) == (summary.predictor, summary.protocol):
-            for end, values in (("low", spread.low), ("high", spread.high)):
-                row |= {f"{name}_{end}": value for name, value in zip(ERROR_NAMES, values, strict=True)}
-    return row

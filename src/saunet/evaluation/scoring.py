@@ -16,7 +16,8 @@ from torch.nn.functional import max_pool2d, pad
 
 from saunet.errors import ConfigError, DataError, one_of, positive
 from saunet.evaluation.predictors import Motion, Predictor, truths_of
-from saunet.evaluation.result import BucketRow, EvaluationResult, ImageRow, ShapeRow, ViewRow
+from saunet.evaluation.result import EvaluationResult
+from saunet.evaluation.rows import BucketRow, ImageRow, ShapeRow, ViewRow
 from saunet.evaluation.team import ALONE, Team
 from saunet.geometry.camera import scale_intrinsics
 from saunet.geometry.depth import disparity_to_depth, enlarge

@@ -14,7 +14,8 @@ from scipy import stats
 
 from saunet.data.loading.windows import recording_of
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation.result import COMPARED, Comparison, Difference, EvaluationResult, ImageRow, Spread, ViewRow
+from saunet.evaluation.result import EvaluationResult
+from saunet.evaluation.rows import COMPARED, Comparison, Difference, ImageRow, Spread, ViewRow
 
 FEWEST_DRIVES = 5
 """With fewer drives than this, resampling them says nothing: images are resampled, and the result says so."""

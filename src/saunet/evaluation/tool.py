@@ -19,6 +19,7 @@ from saunet.data.loading.module import surroundings
 from saunet.data.loading.stored import cache_truths
 from saunet.data.loading.windows import measured_distance, recording_of, tracked_poses
 from saunet.errors import ConfigError, DataError, checked, one_of, usable_device
+from saunet.evaluation.files import read_rows, write_results
 from saunet.evaluation.predictors import (
     ExportingPredictor,
     FilePredictor,
@@ -28,7 +29,7 @@ from saunet.evaluation.predictors import (
     PredictorNetwork,
     existing,
 )
-from saunet.evaluation.result import EvaluationResult, read_rows, write_results
+from saunet.evaluation.result import EvaluationResult
 from saunet.evaluation.scoring import Buckets, Shapes, score, score_views
 from saunet.evaluation.statistics import with_statistics
 from saunet.evaluation.team import Team, joined

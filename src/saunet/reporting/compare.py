@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation.result import ERROR_COLUMNS, ImageRow, ViewRow, read_rows
+from saunet.evaluation.files import read_rows
+from saunet.evaluation.rows import ERROR_COLUMNS, ImageRow, ViewRow
 from saunet.evaluation.statistics import compare as paired
 from saunet.reporting.inputs import Evaluation, Inputs, read_evaluation
 from saunet.reporting.tables import Groups, explained_table, health_tables, losses_table

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
-from saunet.evaluation.result import ERROR_COLUMNS
+from saunet.evaluation.rows import ERROR_COLUMNS
 from saunet.metrics.functional import A1, ABS_REL, RMSE
 from saunet.published import published
 from saunet.registry import Spec, models

@@ -1,0 +1,209 @@
+"""What an evaluation measures: rows for each image, predictor and protocol, their means, intervals and differences."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+
+from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
+from saunet.tables import Row, Table, columns
+
+ERROR_COLUMNS = columns(*(f"{heading}|.3f" for heading in ERROR_HEADINGS))
+COMPARED = dict(
+    zip((*ERROR_NAMES, "warped", "explained"), (*ERROR_COLUMNS, *columns("warped ↓", "explained ↑")), strict=True)
+)
+"""What of an image is compared between two predictors, by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImageRow:
+    """The errors of one predictor on one image under one protocol."""
+
+    predictor: str
+    protocol: str
+    name: str
+    pixels: int
+    """Pixels compared; 0 where the image has no ground truth, and then the numbers are NaN."""
+    scale: float
+    """Factor on the depth: that of the alignment, or under none median(truth)/median(prediction)."""
+    errors: tuple[float, ...]
+    """In the order of `saunet.metrics.functional.ERROR_NAMES`, as everywhere below."""
+
+    @property
+    def compared(self) -> dict[str, float]:
+        """What two predictors are compared by, one of `COMPARED` each; empty where nothing was measured."""
+        return dict(zip(ERROR_NAMES, self.errors, strict=True)) if self.pixels else {}
+
+
+@dataclass(frozen=True, slots=True)
+class BucketRow:
+    """Errors over all pixels of all images that fall into one bucket (not a mean over images: some have few there)."""
+
+    predictor: str
+    protocol: str
+    group: str
+    """What the buckets of one group divide, such as ``distance``."""
+    bucket: str
+    """Such as ``10-20 m``, ``bottom third`` or ``near an edge``."""
+    pixels: int
+    errors: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeRow:
+    """How well one predictor keeps the shapes of one image under one protocol; NaN for what was not measured."""
+
+    predictor: str
+    protocol: str
+    name: str
+    edge_accuracy: float
+    """Pixels from predicted depth edges to true ones; see `saunet.metrics.shapes.boundary_scores`."""
+    edge_completeness: float
+    """Pixels from true depth edges to predicted ones."""
+    precision: float
+    """Fraction of predicted points near true ones; see `saunet.metrics.shapes.cloud_scores`."""
+    recall: float
+    """Fraction of true points near predicted ones."""
+    f_score: float
+
+
+@dataclass(frozen=True, slots=True)
+class ViewRow:
+    """How well a prediction explains the neighboring frames of one image, where no depth is known.
+
+    NaN, and visible nowhere, where the motion of the camera is unknown.
+    """
+
+    predictor: str
+    protocol: str
+    name: str
+    condition: str
+    """The condition or the recording that the image belongs to."""
+    warped: float
+    """Photometric error after warping the neighbors by depth and motion, SAU-Net eqs. (8) to (10)."""
+    unwarped: float
+    """The same without warping: what a network that has learned nothing reaches."""
+    explained: float
+    """Fraction of pixels that warping brings closer, SAU-Net eq. (11)."""
+    visible: float
+    """Fraction of pixels that any neighbor sees."""
+
+    @property
+    def compared(self) -> dict[str, float]:
+        """As in `ImageRow`."""
+        return {"warped": self.warped, "explained": self.explained} if self.visible else {}
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Means of one predictor under one protocol over the images that have ground truth; NaN if none has."""
+
+    predictor: str
+    protocol: str
+    errors: tuple[float, ...]
+    scale: float
+    scale_std: float
+    images: int
+    images_without_truth: int
+
+
+@dataclass(frozen=True, slots=True)
+class ViewSummary:
+    """Means of one predictor without ground truth over the images of one condition, or of ``all``."""
+
+    protocol: str
+    predictor: str
+    condition: str
+    images: int
+    warped: float
+    unwarped: float
+    explained: float
+    visible: float
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeSummary:
+    """Means of `ShapeRow` of one predictor under one protocol, over the images that have each number."""
+
+    protocol: str
+    predictor: str
+    edge_accuracy: float
+    edge_completeness: float
+    precision: float
+    recall: float
+    f_score: float
+    edge_images: int
+    """Images whose ground truth is dense and has edges."""
+    cloud_images: int
+    """Images whose point clouds were compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """How sure the means of one predictor under one protocol are: bootstrap intervals."""
+
+    predictor: str
+    protocol: str
+    level: float
+    by: str
+    """What was resampled: whole ``drive``s, or single ``image``s where there are too few drives."""
+    groups: int
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """The means of one error of two predictors on the same images."""
+
+    name: str
+    """One of `COMPARED`."""
+    first: float
+    second: float
+    difference: float
+    """``second - first``."""
+    low: float
+    high: float
+    """Bootstrap interval of the difference; with zero outside it, the predictors differ."""
+    better: float
+    """Fraction of images on which the second is better, ties counted half."""
+    p_value: float | None
+    """Chance of a difference at least this large if the labels were exchanged at random drive by drive (two-sided);
+    None with too few drives."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two predictors on the same images under one protocol."""
+
+    protocol: str
+    first: str
+    second: str
+    images: int
+    level: float
+    by: str
+    groups: int
+    differences: tuple[Difference, ...]
+
+    def table(self, *notes: str) -> Table:
+        """Return the differences as a table; bold where the interval leaves out zero."""
+        level = f"{self.level:.0%}".replace("%", " %")
+        headings = columns(
+            *("error", "first|.4f", "second|.4f", "difference|+.4f", f"{level} low|+.4f", f"{level} high|+.4f"),
+            *("second better|.0%", "p|.2g"),
+        )
+        rows = []
+        for one in self.differences:
+            column = COMPARED[one.name]
+            sure = one.low > 0 or one.high < 0
+            good = (one.difference > 0) == (column.better > 0)
+            cells = (column.label, *astuple(one)[1:])
+            rows.append(Row(cells, marks={3: "good" if good else "bad"} if sure else {}))
+        title = f"{self.protocol}: second '{self.second}' against first '{self.first}'"
+        told = f"{self.images} images, paired; {interval(self)}"
+        return Table("comparison", title, headings, tuple(rows), (*notes, told))
+
+
+def interval(of: Spread | Comparison) -> str:
+    """Return what intervals mean, such as ``95 % bootstrap over 28 drives``."""
+    note = f"{of.level:.0%} bootstrap over {of.groups} {of.by}s".replace("%", " %")
+    return note if of.by == "drive" else f"{note}; neighboring frames are alike, so this is too narrow"
