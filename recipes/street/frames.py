@@ -135,13 +135,19 @@ def in_the_open(depth: NDArray[np.float16]) -> bool:
     return bool(((depth > 0) & (depth < 2.5)).mean() < 0.4)
 
 
-def close_gaps(depth: Array, side: int = 7) -> Array:
+def close_gaps(depth: Array, low: float = 7 / 160, high: float = 17 / 160) -> Array:
     """Return depth with the gaps in foliage and fences filled, as a laser or an eye takes a crown for one body.
 
-    Far pixels within fewer than ``side`` pixels between near ones get the near depth; near things keep their shape.
+    Far pixels within a gap between near ones get the near depth; near things keep their shape. Gaps may be ``low``
+    image heights wide in the lower half of the picture and ``high`` in the upper half, where crowns are.
     """
     far = np.where(depth > 0, depth, np.float32(1e4))
-    filled = cv2.morphologyEx(far, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
+    half = len(far) // 2
+    parts = []
+    for part, share in ((far[: half + half // 2], high), (far[half // 2 :], low)):
+        side = max(3, round(share * len(far)) | 1)
+        parts.append(cv2.morphologyEx(part, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))))
+    filled = np.concatenate([parts[0][:half], parts[1][half - half // 2 :]])
     return np.where(filled < 9e3, filled, np.float32(0))
 
 
