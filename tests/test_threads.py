@@ -14,7 +14,7 @@ import torch
 
 from saunet import threads
 from saunet.threads import WAITING, Usage, available_cores, free, wait_briefly
-from saunet.training.monitors import Threads
+from saunet.training.pace import Threads
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ class Machine:
         monkeypatch.setattr(threads.time, "monotonic", lambda: self.time)
         monkeypatch.setattr(threads.time, "sleep", self.sleep)
         monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load))
-        monkeypatch.setattr("saunet.training.monitors.available_cores", lambda: 8)
+        monkeypatch.setattr("saunet.training.pace.available_cores", lambda: 8)
         monkeypatch.setattr(torch, "get_num_threads", lambda: self.threads)
         monkeypatch.setattr(torch, "set_num_threads", lambda count: setattr(self, "threads", count))
         for name in threads.SETTINGS:

@@ -15,7 +15,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from saunet.errors import SaunetError
 from saunet.training.callbacks import LastCheckpoint
-from saunet.training.monitors import NonFinite
+from saunet.training.nonfinite import NonFinite
 
 
 class SpoilSecond(Callback):

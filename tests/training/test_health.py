@@ -16,9 +16,9 @@ from saunet.errors import ConfigError
 from saunet.geometry.pose import pose_matrix
 from saunet.registry import objectives
 from saunet.runs.folder import RunRecord
-from saunet.training.monitors import HealthMonitor, LoaderMonitor, Loading, doubt, health, holes, sentence
+from saunet.training.health import HealthMonitor, doubt, health, holes
 from saunet.training.optim import Recipe
-from saunet.training.pace import Pace, first_change
+from saunet.training.pace import LoaderMonitor, Loading, Pace, first_change, sentence
 from saunet.types import DepthPyramid, LossTerms
 
 
@@ -231,7 +231,7 @@ def test_copies_are_advised_where_the_data_can_be_read_from_them(
     if cached:
         monkeypatch.setattr(data, "copies", object())
     monkeypatch.setattr(trainer, "datamodule", data, raising=False)
-    monkeypatch.setattr("saunet.training.monitors.available_cores", lambda: 0)
+    monkeypatch.setattr("saunet.training.pace.available_cores", lambda: 0)
     said = sentence(Loading(images=360, seconds=10.0, waited=4.0), trainer)
     assert ("with saunet prepare cache" in said) == (cacheable and not cached)
     assert ("use a faster disk or more cores" in said) == (not cacheable or cached)
@@ -272,8 +272,8 @@ def test_a_slow_loader_is_named_with_its_figures_and_a_fast_one_is_not(
 ) -> None:
     clock = [0.0]  # a clock of our own: a busy machine must not decide this test
     monkeypatch.setattr("saunet.data.loading.sampling.time.perf_counter", lambda: clock[0])
-    monkeypatch.setattr("saunet.training.monitors.time.monotonic", lambda: clock[0])
-    monkeypatch.setattr("saunet.training.monitors._ENOUGH", 1)
+    monkeypatch.setattr("saunet.training.pace.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("saunet.training.pace._ENOUGH", 1)
     monkeypatch.setattr("saunet.training.pace.available_cores", lambda: 3)
     image = tiny.Wall.image
 

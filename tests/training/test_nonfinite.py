@@ -15,7 +15,7 @@ from processes import python
 
 from saunet.errors import SaunetError
 from saunet.training.callbacks import LastCheckpoint
-from saunet.training.monitors import NonFinite
+from saunet.training.nonfinite import NonFinite
 from saunet.training.stopping import GracefulStop
 
 

@@ -15,8 +15,9 @@ from training_options import train_options
 from saunet.data.loading.module import DepthDataModule
 from saunet.losses import one_pass
 from saunet.registry import objectives
+from saunet.training.health import health
 from saunet.training.module import SelfSupervisedDepth
-from saunet.training.monitors import NonFinite, health
+from saunet.training.nonfinite import NonFinite
 from saunet.training.tool import assemble
 
 WAITS = {

@@ -29,8 +29,8 @@ from saunet.io.progress import watched
 from saunet.metrics.functional import RISING
 from saunet.prediction.panel import panel
 from saunet.runs.checkpoint import atomic_save
+from saunet.training.health import DOUBTED, FEW, doubt
 from saunet.training.module import EPOCH_LOSS
-from saunet.training.monitors import DOUBTED, FEW, doubt
 from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
 
 _IN_DOUBT = " in doubt"
@@ -91,7 +91,7 @@ class BestCheckpoint(ModelCheckpoint):
         folder: Where it goes.
         monitor: What decides; where it is not measured (no validation frame has ground truth), ``val/loss`` does, and
             without validation ``train/loss``, its mean over the epoch. A state whose loss says little (see
-            `saunet.training.monitors.doubt`) is only taken while there is no other.
+            `saunet.training.health.doubt`) is only taken while there is no other.
     """
 
     def __init__(self, folder: str, monitor: str = "val/abs_rel") -> None:

@@ -24,8 +24,8 @@ from saunet.losses.base import Objective
 from saunet.metrics.depth import DepthMetrics
 from saunet.runs.folder import RunRecord
 from saunet.runs.record import Intrinsics
+from saunet.training.health import DOUBTED, health, learned_from
 from saunet.training.intrinsics import FocalLengths
-from saunet.training.monitors import DOUBTED, health, learned_from
 from saunet.training.optim import MovingAverage, Recipe
 from saunet.training.resume import continuation, owe_validation, validation_due
 from saunet.training.speed import Speed

@@ -54,10 +54,10 @@ CALLBACKS: Mapping[str, tuple[str, dict[str, str]]] = {
     "last": ("callbacks.LastCheckpoint", {"folder": "checkpoints"}),  # knows the best of the epoch that it closes
     "stop": ("stopping.GracefulStop", {"folder": "checkpoints"}),
     "processes": ("stopping.ProcessWatch", {"folder": "", "checkpoints": "checkpoints"}),
-    "non_finite": ("monitors.NonFinite", {"folder": "nonfinite"}),
-    "health": ("monitors.HealthMonitor", {}),
-    "loader": ("monitors.LoaderMonitor", {}),
-    "threads": ("monitors.Threads", {}),
+    "non_finite": ("nonfinite.NonFinite", {"folder": "nonfinite"}),
+    "health": ("health.HealthMonitor", {}),
+    "loader": ("pace.LoaderMonitor", {}),
+    "threads": ("pace.Threads", {}),
     "pictures": ("callbacks.PicturePanel", {"folder": "pictures"}),
 }
 """The usual callbacks by name, with the folders that they are given, below the run's own."""
