@@ -13,8 +13,10 @@ import pytest
 import torch
 
 from saunet.data.kitti.raw import KittiRaw
+from saunet.io.images import write_image
 from saunet.io.trajectories import read_kitti
 from saunet.metrics.functional import ERROR_NAMES
+from saunet.synthetic import SyntheticDrive
 
 Tool = Callable[..., Any]
 RAW = ("data=kitti", "data.split=all", "data.cameras=[left]", "data.workers=0", "baselines=false")
@@ -206,6 +208,33 @@ def test_odometry_writes_paths_errors_and_a_picture(tool: Tool, smoke_run: Path,
     assert {path.name for path in folder.iterdir()} == names | {"path.png"} | {p.name for p in folder.glob(".hydra")}
     assert len(read_kitti(folder / "predicted_kitti.txt")) == 6
     assert "ATE" in outcome.out
+
+
+def test_points_are_tracked_in_the_place_of_a_pose_network_where_that_is_asked_for(
+    tool: Tool, smoke_run: Path, tmp_path: Path
+) -> None:
+    drive = SyntheticDrive(seed=8, frames=5, height=64, width=192)
+    (tmp_path / "clip").mkdir()
+    for index in drive.indices:
+        write_image(tmp_path / "clip" / f"{index}.png", drive.image(index))
+    K = drive.intrinsics(0)
+    camera = f"camera=[{K[0, 0]},{K[1, 1]},{K[0, 2]},{K[1, 2]}]"
+    paths = {}
+    for motion in ("auto", "tracked"):
+        common = (checkpoint(smoke_run), f"motion={motion}")
+        outcome = tool("odometry", *common, "data=synthetic_tiny", f"output_dir=path_{motion}", "figure=false")
+        assert outcome.code == 0, outcome.err
+        assert ("asked for with motion=tracked" in outcome.out) == (motion == "tracked")
+        settings = json.loads((tmp_path / f"path_{motion}" / "odometry.json").read_text())["settings"]
+        assert settings.get("motion") == (None if motion == "auto" else motion)
+        predicted = tool("predict", "clip", *common, camera, f"output=out_{motion}", "outputs=[trajectory]")
+        assert predicted.code == 0, predicted.err
+        assert ("asked for with motion=tracked" in predicted.out) == (motion == "tracked")
+        paths[motion] = read_kitti(tmp_path / f"out_{motion}" / "clip_trajectory.txt")
+    assert not np.allclose(paths["auto"], paths["tracked"], atol=1e-3)
+    tool("predict", "clip", *common, "output=o", "outputs=[trajectory]").says("motion is 'tracked'", "set camera=")
+    tool("predict", "clip", *common, "output=o").says("no path is asked for", "outputs=[trajectory]")
+    tool("odometry", checkpoint(smoke_run), "motion=points").says("motion is 'points'", "auto, tracked")
 
 
 @pytest.mark.parametrize(

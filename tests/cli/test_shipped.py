@@ -93,6 +93,8 @@ def test_own_clips_and_paths_without_a_pose_network(tool: Tool, tmp_path: Path) 
     outcome = tool("predict", "clips/a", "output=out", "outputs=[trajectory]", "camera=clips/camera.yaml", "fps=10")
     assert outcome.code == 0, outcome.err
     assert "trajectory: from tracked points" in outcome.out
+    again = tool("odometry", "street", *common, "motion=tracked", "output_dir=again", "figure=false")
+    assert again.code == 0, again.err
     paths = [np.loadtxt(next(tmp_path.glob(each))) for each in ("path/*/predicted_kitti.txt", "out/*_trajectory.txt")]
     np.testing.assert_allclose(*paths, atol=1e-3)
     true = np.linalg.inv(drive.pose(0)) @ drive.pose(7)

@@ -17,7 +17,7 @@ from saunet.evaluation import EvaluateOptions, evaluate, write_results
 from saunet.evaluation.files import read_rows
 from saunet.evaluation.scoring import score_views
 from saunet.evaluation.statistics import with_statistics
-from saunet.evaluation.tool import evaluate_network, passes, tracked
+from saunet.evaluation.tool import _tracked, evaluate_network, passes
 from saunet.metrics.baselines import ConstantDepth
 from saunet.metrics.protocols import protocol
 from saunet.registry import Spec
@@ -196,7 +196,7 @@ def test_the_motion_of_tracked_points_is_the_true_one_and_where_there_are_none_a
 
     batches = [sample(1, (0, 2)), sample(2, (1, 3)), sample(2, (1, 3), lambda _: np.full((160, 512, 3), 99, np.uint8))]
     batches[2]["name"] = ["fog 0000000002"]
-    pairs = {"tracked": (depth, tracked), "true": (depth, true)}
+    pairs = {"tracked": (depth, _tracked), "true": (depth, true)}
     rules = {"protocol": protocol("campus"), "group_of": lambda name: name.split()[0], "progress": False}
     result = score_views(pairs, batches, **rules)
     found = {(row.predictor, row.name): row for row in result.views}
@@ -213,7 +213,7 @@ def test_the_motion_of_tracked_points_is_the_true_one_and_where_there_are_none_a
     (kept,) = [row for row in read_rows(write_results(result, tmp_path)["views.csv"].parent) if np.isnan(row.warped)]
     assert kept.compared == {}  # it does not take part in a comparison
     with pytest.raises(DataError, match="motion is known for none of the 1 images: too few points"):
-        score_views({"m": (depth, tracked)}, batches[2:], **rules)
+        score_views({"m": (depth, _tracked)}, batches[2:], **rules)
 
 
 def test_views_refuse_protocols_that_compare_depth():

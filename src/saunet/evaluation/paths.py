@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from saunet.data.drive import Drive
-from saunet.errors import ConfigError, checked, positive, usable_device
+from saunet.errors import ConfigError, checked, one_of, positive, usable_device
 from saunet.evaluation.files import without_nan
 from saunet.evaluation.predictors import file_stem
 from saunet.io.atomic import check_folder, write_bytes, write_json
@@ -31,6 +31,7 @@ from saunet.prediction.odometer import Odometer, follow
 from saunet.registry import Spec
 from saunet.tables import Row, Table, columns, csv_text, show
 from saunet.tables.drawing import new_figure, save
+from saunet.types import MOTIONS
 from saunet.weights.files import read_model
 from saunet.weights.locate import locate
 
@@ -241,8 +242,10 @@ class OdometryOptions:
     """Which path `odometry` predicts, and how it is compared.
 
     Args:
-        checkpoint: A trained model. Without a pose network, motion comes from tracked points, its length from depth.
+        checkpoint: A trained model.
         data: The data module, whose test split is followed; the size of its images follows the checkpoint.
+        motion: Where the camera's motion comes from: from points ``tracked`` between frames, its length from the
+            predicted depth; ``auto`` takes the pose network if the model has one.
         snippet: Frames in a snippet; published numbers use 5.
         lengths: Segment lengths in meters for t_rel and r_rel; by default KITTI's 100 to 800 m, or 20 to 80 % of a path
             that is shorter than 100 m.
@@ -262,6 +265,7 @@ class OdometryOptions:
 
     checkpoint: str | Path
     data: Spec
+    motion: str = "auto"
     snippet: int = 5
     lengths: tuple[float, ...] | None = None
     batch_size: int = 8
@@ -270,6 +274,7 @@ class OdometryOptions:
     output_dir: str | Path | None = None
 
     def __post_init__(self) -> None:
+        one_of("motion", self.motion, MOTIONS)
         if self.snippet < 2:
             raise ConfigError(
                 f"snippet is {self.snippet}; it counts frames and must be at least 2 (published numbers use 5)"
@@ -326,7 +331,7 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
     folder = None if options.output_dir is None else check_folder(options.output_dir)
     device, source = usable_device(options.device), locate(options.checkpoint)
     record = read_model(source).record
-    odometer = Odometer.from_model(source, device=str(device), batch_size=options.batch_size)
+    odometer = Odometer.from_model(source, options.motion, device=str(device), batch_size=options.batch_size)
     about = {} if odometer.tracks else {"guess_camera": True}  # pose networks need no intrinsics
     data = options.data.fitted(**about).build(height=record.height, width=record.width, offsets=list(record.offsets))
     data.setup("test")
@@ -334,7 +339,7 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
     paths, errors, notes = [], [], list[str]()
     predictor = TRACKED if odometer.tracks else MODEL
     if odometer.tracks:
-        notes.append("motion: from tracked points (the model has no pose network), its length from the predicted depth")
+        notes.append(f"motion: {odometer.told}")
     for drive in data.datasets["test"].drives:
         progress(drive.name)
         path = path_of(drive, follow(odometer, drive), predictor)

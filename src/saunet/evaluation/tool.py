@@ -46,7 +46,7 @@ from saunet.registry import Spec
 from saunet.runs.record import Intrinsics, ModelRecord
 from saunet.scale.estimate import MetricDepth, MetricMotion, estimate_scale, keep_scale
 from saunet.scale.options import ScaleOptions
-from saunet.types import EvalBatch
+from saunet.types import MOTIONS, EvalBatch
 from saunet.weights.files import read_model
 from saunet.weights.locate import locate
 
@@ -155,7 +155,7 @@ class EvaluateOptions:
         if self.intervals and not 0 < self.intervals < 1:
             raise ConfigError(f"intervals is {self.intervals:g}; it must lie between 0 and 1, such as intervals=0.95")
         one_of("split", self.split, STAGES)
-        one_of("motion", self.motion, ("auto", "tracked"))
+        one_of("motion", self.motion, MOTIONS)
         one_of("match", self.match, ("order", "name"))
         if self.predicted is not None:
             one_of("predicted", self.predicted, ("disparity", "depth"))
@@ -334,7 +334,7 @@ def _score_passes(
 ) -> tuple[EvaluationResult, tuple[str, ...]]:
     """Go through the images once for each ground truth; return the result, and what was exported."""
     split, name, exporter = options.split, "model" if model else "predictions", None
-    motion = tracked if pose is None or options.motion == "tracked" else predicted_by(pose)
+    motion = _tracked if pose is None or options.motion == "tracked" else _predicted_by(pose)
     buckets = Buckets(tuple(options.distances)) if options.buckets else None
     shapes = Shapes(options.boundaries, options.cloud) if options.boundaries or options.cloud else None
     results: list[EvaluationResult] = []
@@ -366,18 +366,18 @@ def _score_passes(
         )
     asked = [protocol(name) for name in options.protocols or [rule.name for _, rules in passes for rule in rules]]
     notes = [str(exporter)] if exporter else []
-    if whole.views and motion is tracked:
+    if whole.views and motion is _tracked:
         whole = replace(whole, settings={**whole.settings, "motion": "tracked"})
         notes.append(_told(whole, asked_for=pose is not None))
     return replace(whole, protocols=tuple(asked)), tuple(notes)
 
 
-def tracked(batch: EvalBatch, depth: Tensor) -> Tensor:
+def _tracked(batch: EvalBatch, depth: Tensor) -> Tensor:
     """Return the motion of tracked points; see `Motion`."""
     return tracked_poses(batch["target"], batch["sources"], batch["K"], depth)
 
 
-def predicted_by(pose: nn.Module) -> Motion:
+def _predicted_by(pose: nn.Module) -> Motion:
     return lambda batch, depth: pose(batch["target"], batch["sources"])
 
 

@@ -69,6 +69,7 @@ class Odometer:
         self.scale = scale
         self._pose, self._size, self._device = pose.to(device).eval(), (height, width), torch.device(device)
         self._batch_size = batch_size
+        self._asked_for = False  # to track points in the place of a pose network
         self._reach = max(abs(offset) for offset in self._offsets)
         self._stride = 2 if {-1, 1} <= set(self._offsets) else 1
         self._next = 1 if -1 in self._offsets else 0  # the first frame that has a neighbor on the side we look at
@@ -80,19 +81,26 @@ class Odometer:
 
     @classmethod
     def from_model(
-        cls, path: str | Path, scale: Scale | None = None, device: str = "cpu", batch_size: int = 1
+        cls,
+        path: str | Path,
+        motion: str = "auto",
+        scale: Scale | None = None,
+        device: str = "cpu",
+        batch_size: int = 1,
     ) -> Odometer:
         """Load the pose network of a checkpoint or exported folder, or its depth network to track points with.
 
-        Nothing in it is run.
+        With ``motion="tracked"`` points are tracked though there is a pose network. Nothing in the file is run.
         """
         if Path(path).suffix.lower() == ".onnx":
             raise ConfigError(f"{path} has no pose network, which a path needs; give the checkpoint")
         model = read_model(path)
         depth, pose = model.networks()
         size = model.record.height, model.record.width
-        motion = TrackedPose(depth) if pose is None else pose
-        return cls(motion, *size, scale or model.record.scale, device, batch_size)
+        followed = TrackedPose(depth) if pose is None or motion == "tracked" else pose
+        odometer = cls(followed, *size, scale or model.record.scale, device, batch_size)
+        odometer._asked_for = pose is not None
+        return odometer
 
     def restart(self) -> Odometer:
         """Return an odometer with the same network that stands before the first frame of another clip."""
@@ -102,6 +110,12 @@ class Odometer:
     def tracks(self) -> bool:
         """Whether there is no pose network, so that points are tracked, which takes the camera's intrinsics."""
         return isinstance(self._pose, TrackedPose)
+
+    @property
+    def told(self) -> str:
+        """Where the motion comes from if `tracks`, in words."""
+        why = "asked for with motion=tracked" if self._asked_for else "the model has no pose network"
+        return f"from tracked points ({why}), with the length that the predicted depth gives it"
 
     def add(self, image: UInt8[np.ndarray, "h w 3"], K: Float[np.ndarray, "3 3"] | None = None) -> None:
         """Take the next frame, with its intrinsics in pixels if `tracks`."""

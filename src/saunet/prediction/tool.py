@@ -25,6 +25,7 @@ from saunet.prediction.sinks import LAYOUTS, OUTPUTS, Sink, Style
 from saunet.prediction.sources import Frame, Input, Recording
 from saunet.registry import outputs as clip_outputs
 from saunet.scale.options import ScaleOptions
+from saunet.types import MOTIONS
 from saunet.weights.locate import locate
 
 if TYPE_CHECKING:
@@ -66,6 +67,8 @@ class PredictOptions:
         codec: Of the video: ``h264``, ``mp4v`` (quickest) or ``vp09``.
         flip: Average with the prediction of the mirrored image: twice the time, a little less error.
         keep_aspect: Feed each image at its own aspect ratio.
+        motion: Where the camera's motion of a ``trajectory`` comes from: from points ``tracked`` between frames, which
+            needs ``camera``, its length from the predicted depth; ``auto`` takes the pose network if the model has one.
         scale: How depth becomes meters.
         foreign: What an ONNX or TorchScript model of another system takes and gives.
         overwrite: Replace results that are already there, whoever made them.
@@ -98,6 +101,7 @@ class PredictOptions:
     codec: str = "h264"
     flip: bool = False
     keep_aspect: bool = False
+    motion: str = "auto"
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     foreign: ForeignOptions = NOTHING
     overwrite: bool = False
@@ -124,6 +128,12 @@ class PredictOptions:
         one_of("layout", self.layout, LAYOUTS)
         one_of("codec", self.codec, CODECS)
         one_of("runtime", self.runtime, RUNTIMES)
+        one_of("motion", self.motion, MOTIONS)
+        if self.motion != "auto" and "trajectory" not in (self.outputs or ()):
+            raise ConfigError(
+                f"motion is '{self.motion}', which decides the camera's path, and no path is asked for; "
+                "add outputs=[trajectory], or leave motion out"
+            )
         positive("batch_size", self.batch_size)
         for name in ("max_depth", "max_frames", "fps"):
             if getattr(self, name) is not None:
@@ -239,14 +249,15 @@ def predict(
             from saunet.prediction.odometer import Odometer
 
             path, device = locate(options.checkpoint), str(usable_device(options.device))
-            odometer = Odometer.from_model(path, predictor.scale, device, options.batch_size)
+            odometer = Odometer.from_model(path, options.motion, predictor.scale, device, options.batch_size)
             if odometer.tracks and camera is None:
+                why = "motion is 'tracked'" if options.motion == "tracked" else "the model has no pose network"
                 raise ConfigError(
-                    "outputs has 'trajectory', and the model has no pose network; tracked points tell the path too, "
+                    f"outputs has 'trajectory', and {why}; tracked points tell the path "
                     "with the camera: set camera=camera.yaml or camera=[fx,fy,cx,cy], or use a model trained on video"
                 )
             if odometer.tracks:
-                print("trajectory: from tracked points (the model has no pose network), its length from depth")
+                print(f"trajectory: {odometer.told}")
         style = Style(options.colormap, None, camera, options.max_depth)
         clips = _clip_sinks(options, outputs, recording, style, odometer)
         files = tuple(output for output in outputs if output in OUTPUTS)
