@@ -257,6 +257,19 @@ def test_help_says_what_each_key_is(echo: Said) -> None:
     assert "data.workers: int" in out
 
 
+def test_help_of_a_training_lists_the_experiments_with_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+    app.main(["train", "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    for group in ("experiment", "loss", "sweep"):
+        start = next(number for number, line in enumerate(lines) if line.startswith(f"{group}=NAME"))
+        listed = dict(line.split(maxsplit=1) for line in lines[start + 1 : lines.index("", start)])
+        folder = table.config_dir() / group
+        assert set(listed) == {path.relative_to(folder).as_posix()[:-5] for path in folder.rglob("*.yaml")}
+        assert all(told.endswith((".", "?")) for told in listed.values())
+    app.main(["evaluate", "--help"])
+    assert "experiment=" not in capsys.readouterr().out
+
+
 def test_help_shows_the_values_that_a_command_has(capsys: pytest.CaptureFixture[str]) -> None:
     app.main(["train", "--help"])
     said = " ".join(capsys.readouterr().out.split())

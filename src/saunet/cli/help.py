@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +21,12 @@ WIDTH = 118
 COMPONENT = ("component", "component?")
 PARTS = (TRAINER[0], "callbacks", "logger")
 """Keys that a config group fills, beside those of components."""
+RECIPES = {
+    "experiment": "a training with all that belongs to it, one of",
+    "loss": "a change of the objective, one of",
+    "sweep": "several trainings, one of",
+}
+"""Config groups of ``train`` that no component fills, and what they choose."""
 NETWORKS = ("encoder", "decoder", "attention", "pose")
 COUNTED = {"decoder": ", after stratified_tiny", "attention": ", for 64 channels"}
 """What `count` assumes, for the kinds whose size depends on their neighbors."""
@@ -53,6 +60,9 @@ def tool_help(tool: Tool, table: Table, values: Mapping[str, object], chosen: Ma
     lines += [f"  $ saunet {example}" for example in tool.examples]
     if tool.aliases:
         lines += ["", "short forms:", *(f"  {short}=... is {key}=..." for short, key in tool.aliases.items())]
+    for group, what in RECIPES.items() if tool.name == "train" else ():
+        width = max(len(name) for name, _ in recipes(group))
+        lines += ["", f"{group}=NAME, {what}:", *(f"  {name:{width}}  {told}" for name, told in recipes(group))]
     lines += ["", "keys:", *described(_with_folder(node.keys, tool), "  ", values)]
     for group in groups(node):
         now = chosen.get(group)
@@ -61,6 +71,16 @@ def tool_help(tool: Tool, table: Table, values: Mapping[str, object], chosen: Ma
     return "\n".join(
         each for line in lines for each in (textwrap.wrap(line, WIDTH, subsequent_indent=" " * 8) if line else [""])
     )
+
+
+def recipes(group: str) -> Iterator[tuple[str, str]]:
+    """Yield the name of each YAML file of a group, and the first sentence of its comment."""
+    folder = config_dir() / group
+    for file in sorted(folder.rglob("*.yaml"), key=lambda each: (len(each.parts), each)):
+        comment = itertools.takewhile(lambda line: line.startswith("#"), file.read_text(encoding="utf-8").splitlines())
+        text = " ".join(line.lstrip("# ") for line in comment if not line.startswith("# @"))
+        first = re.match(r".*?[.?!](?=\s|$)", text)
+        yield file.relative_to(folder).with_suffix("").as_posix(), first[0] if first else text
 
 
 def _with_folder(keys: Sequence[schema.Key], tool: Tool) -> list[schema.Key]:
@@ -208,7 +228,7 @@ def _completed(start: str, tool: str, table: Table, given: Mapping[str, str]) ->
     """Return keys, one level at a time: ``data.`` and then ``data.root=``."""
     chosen = chosen_names(TOOLS[tool], table, given)
     found = {name for name, _ in leaves(table.tools[tool].keys)}
-    found.update(("experiment", "loss", "sweep") if tool == "train" else ())
+    found.update(RECIPES if tool == "train" else ())
     for group in groups(table.tools[tool]):
         inner = leaves(chosen_keys(group, chosen, table), f"{group.replace('/', '.')}.")
         found |= {group, *(name for name, _ in inner)}
