@@ -56,7 +56,7 @@ def slow(session: nox.Session) -> None:
 def old_runtime(session: nox.Session) -> None:
     """Run exported files in onnxruntime 1.14, which needs Python 3.10 or older and NumPy 1."""
     install(session, "-e", ".[dev]")
-    old = Path(session.create_tmp()) / "old"
+    old = Path(session.create_tmp()).resolve() / "old"
     session.run("python3.10", "-m", "venv", str(old), external=True)
     session.run(str(old / "bin" / "pip"), "install", "onnxruntime==1.14.1", "numpy==1.26.4", external=True)
     tests = ("-m", "not gpu", "tests/exporting/test_old_runtime.py")
@@ -67,7 +67,7 @@ def old_runtime(session: nox.Session) -> None:
 def first_hour(session: nox.Session) -> None:
     """Run the tutorials' commands as printed, in an environment that has the wheel and its own dependencies only."""
     install(session, "-e", ".[dev]")
-    folder = Path(session.create_tmp())
+    folder = Path(session.create_tmp()).resolve()
     session.run("python", "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), ".")
     session.run("python", "-m", "venv", "--clear", str(folder / "fresh"))
     pip = (str(folder / "fresh" / "bin" / "pip"), "install", "-q", "-c", str(ROOT / "constraints.txt"))
@@ -84,7 +84,7 @@ def app(session: nox.Session) -> None:
     own = (ROOT / "constraints-app.txt").read_text().splitlines()
     names = {line.partition("==")[0] for line in own}
     pins = (ROOT / "constraints.txt").read_text().splitlines()
-    file = Path(session.create_tmp()) / "constraints.txt"
+    file = Path(session.create_tmp()).resolve() / "constraints.txt"
     file.write_text("\n".join([*own, *(line for line in pins if line.partition("==")[0] not in names)]))
     session.install("-c", str(file), next(line for line in pins if line.startswith("torch==")))
     session.install("-c", str(file), "-e", ".[dev,app,browser]")
