@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 import saunet
 from saunet.cli.compose import structured
-from saunet.errors import ConfigError
+from saunet.errors import ConfigError, checked
 from saunet.registry import REGISTRIES, Registry, Spec, encoders, find, instantiate, terms
 
 
@@ -161,3 +161,12 @@ def test_a_component_that_moved_to_another_module_is_found() -> None:
     assert moved.target is terms.entry("photometric").target
     assert find("saunet.losses.terms.of_another_day.Monet") is None
     assert find("elsewhere.Photometric") is None
+
+
+def test_what_is_no_spec_is_told_how_one_is_written() -> None:
+    @checked
+    def take(data: Spec) -> Spec:
+        return data
+
+    with pytest.raises(ConfigError, match=r"data is 'video' \(str\); it must be Spec, such as saunet\.Spec\.of\("):
+        take("video")  # type: ignore[arg-type]

@@ -202,7 +202,8 @@ def check_arguments(target: Callable[..., Any], given: Mapping[str, Any], hints:
                 allowed = allowed.replace("typing.", "").replace("collections.abc.", "")
                 limits = ", with names of at most 255 bytes" if not can_name(value, 255) else ""
                 got = " ".join(got.split())
-                fix = ", such as saunet.Spec.of('data', 'video', root='clips')" if allowed == "Spec" else ""
+                example = getattr(hints[name], "example", None)
+                fix = f", such as {example}" if isinstance(example, str) else ""
                 raise ConfigError(f"{target.__name__}: {name} is {got} ({kind}); it must be {allowed}{limits}{fix}")
 
 

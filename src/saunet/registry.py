@@ -13,7 +13,7 @@ import inspect
 import pkgutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from saunet import plugins, schema
 from saunet.errors import ConfigError, check_arguments, checked, suggest
@@ -196,6 +196,8 @@ class Spec:
 
     node: Mapping[str, Any]
     name: str | None = None
+    example: ClassVar[str] = "saunet.Spec.of('data', 'video', root='clips')"
+    """What a message shows where something else was given."""
 
     @classmethod
     def of(cls, kind: str, name: str, /, **kwargs: Any) -> Spec:

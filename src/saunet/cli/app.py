@@ -229,7 +229,7 @@ def resumed(words: Sequence[str]) -> list[str]:
     if not content:
         given = " ".join(words) or "none"
         raise ConfigError(f"saunet resume takes the folder of a run, with its run.json; got {given}")
-    again = [word for word in content.get("overrides", []) if not word.startswith(("resume=", "init_from="))]
+    again = [word for word in content.get("overrides", []) if not word.startswith("resume=")]
     return [*again, f"resume={folder / 'checkpoints' / 'last.ckpt'}", f"hydra.run.dir='{folder}'", *words[1:]]
 
 
