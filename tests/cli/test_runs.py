@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -196,10 +197,12 @@ def test_a_finished_run_is_not_replaced_by_mistake(tool: Tool, smoke_run: Path, 
 
 def test_a_training_of_some_length_ends_with_a_picture(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="the extra 'plot' is not installed")
-    few = ("trainer.limit_train_batches=1", "trainer.limit_val_batches=0", "trainer.log_every_n_steps=1")
+    few = ("trainer.limit_train_batches=1", "trainer.limit_val_batches=0", "trainer.log_every_n_steps=10")
     outcome = tool("train", "experiment=smoke", *SMALL, *few, "trainer.max_epochs=10", "hydra.run.dir=run")
     assert outcome.code == 0, outcome.err
     assert cv2.imread(str(tmp_path / "run" / "results.png")).shape[1] > 500
+    with (tmp_path / "run" / "csv" / "metrics.csv").open() as file:
+        assert sum(bool(row["train/loss"]) for row in csv.DictReader(file)) == 10  # not one alone: it is short
     assert not (smoke_run / "results.png").exists()  # two steps are no curve
 
 

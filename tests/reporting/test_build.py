@@ -85,8 +85,8 @@ def test_a_report_of_everything(everything: list[Path], picture: Path, tmp_path:
         "Accuracy", "Runs", "Training", "Depth side by side", "Networks", "Accuracy and time",
     ]  # fmt: skip
     for words in (
-        "Loss by epoch (the paper’s Fig. 4)",
-        "Accuracy by epoch (the paper’s Fig. 5)",
+        "Loss during training (the paper’s Fig. 4)",
+        "Accuracy during training (the paper’s Fig. 5)",
         "Models side by side: kitti (the paper’s Fig. 8)",
         "Models side by side: campus sunny (the paper’s Fig. 9)",
         "Accuracy against time of run (cpu, fp32, eager, batch 2)",
@@ -167,7 +167,7 @@ def test_what_has_no_data_is_listed(tmp_path: Path) -> None:
     document = build(collect([make_run(tmp_path / "a", abs_rel=())]))
     what = {one.what for one in document.missing}
     assert {"Size and pictures of a", "Errors and accuracy of a", "Depth side by side", "Accuracy against time"} <= what
-    assert "Loss by epoch of runs" in what
+    assert "Loss during training of runs" in what
 
 
 def test_without_matplotlib_the_page_has_no_drawings_and_says_why(

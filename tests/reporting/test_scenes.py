@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 
 from saunet.errors import ConfigError, DataError
 from saunet.reporting import ReportOptions
-from saunet.reporting.figures import curve
+from saunet.reporting.figures import curve, plot_curves
 from saunet.reporting.scenes import View, edge_boxes, read_views, scene
+from saunet.runs.folder import Run
+from saunet.tables.drawing import new_figure
 
 
 def test_training_lies_within_epochs_and_validation_at_their_ends() -> None:
@@ -20,6 +23,23 @@ def test_training_lies_within_epochs_and_validation_at_their_ends() -> None:
     assert curve(history, "train/loss") == ([(step + 1) / 4 for step in range(8)], [float(step) for step in range(8)])
     assert curve(history, "val/a1") == ([1, 2], [0.5, 0.5])
     assert curve(history, "val/none") == ([], [])
+
+
+def test_a_validation_within_an_epoch_lies_where_it_was_made() -> None:
+    history = [{"epoch": 0.0, "step": 3.0, "val/a1": 0.4}, {"epoch": 1.0, "step": 5.0, "val/a1": 0.5}]
+    assert curve(history, "val/a1") == ([1, 1.5], [0.4, 0.5])
+    assert curve(history, "val/a1", by_step=True) == ([4, 6], [0.4, 0.5])
+
+
+@pytest.mark.parametrize(("epochs", "label", "places"), [(1, "step", [1, 2, 3]), (2, "epoch", [1 / 3, 2 / 3, 1])])
+def test_a_first_epoch_is_drawn_by_steps_and_few_points_have_marks(epochs: int, label: str, places: Any) -> None:
+    pytest.importorskip("matplotlib")
+    rows = [{"epoch": step // 3.0, "step": float(step), "train/loss": 1.0} for step in range(3 * epochs)]
+    _, (axis,) = new_figure(1, 5.0, 3.0)
+    plot_curves([axis], {"a": Run(Path("a"), history=rows)}, [("train/loss", "loss")])
+    (line,) = axis.lines
+    assert (axis.get_xlabel(), line.get_marker()) == (label, "o")
+    np.testing.assert_allclose(line.get_xdata()[:3], places)
 
 
 def test_a_long_curve_is_thinned_by_means() -> None:

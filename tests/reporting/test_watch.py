@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import urllib.error
 import urllib.request
@@ -44,6 +45,7 @@ def test_a_run_is_read_shown_and_drawn(folder: Path) -> None:
     assert repr(run) == f"Run({folder}: finished, 9 steps, loss 1.2)"
     assert run.table.rows[0].cells[1] == "finished"
     assert run.plot()._repr_svg_().count("<svg") == 1
+    assert re.fullmatch(r"Drawing\(\d+ kB of SVG; .*\)", repr(run.plot()))
     assert "<table>" in run._repr_html_()
     with pytest.raises(DataError, match="logged nothing"):
         saunet.Run(make_run(folder.parent / "new", status="running", abs_rel=())).plot()

@@ -1,4 +1,4 @@
-"""Curves against epochs (Figs. 4 and 5), errors against alpha/beta, and accuracy against time (Fig. 10)."""
+"""Curves of trainings (Figs. 4 and 5), errors against alpha/beta, and accuracy against time (Fig. 10)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from saunet.tables.drawing import COLORS, Point, colors, new_figure, stacked_fig
 
 
 def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, ordered: bool = False) -> bytes | None:
-    """Draw columns of the runs' logs against epochs, one panel a column, one line a run."""
+    """Draw columns of the runs' logs against epochs, or steps of a first epoch; one panel a column, one line a run."""
     drawn = logged(runs, panels)
     if not drawn:
         return None
@@ -57,14 +57,15 @@ def plot_curves(
     axes: Sequence[Any], runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, ordered: bool = False
 ) -> None:
     tints = colors(len(runs), ordered=ordered)
+    first = all(row.get("epoch", 0) == 0 for run in runs.values() for row in run.history)
     for axis, (key, title) in zip(axes, panels, strict=True):
-        few = max(len(curve(run.history, key)[0]) for run in runs.values()) <= 25
-        for (name, run), color in zip(runs.items(), tints, strict=True):
-            x, y = curve(run.history, key)
+        drawn = [curve(run.history, key, by_step=first) for run in runs.values()]
+        few = max(len(x) for x, _ in drawn) <= 25
+        for name, (x, y), color in zip(runs, drawn, tints, strict=True):
             if x:
                 axis.plot(x, y, color=color, label=name, marker="o" if few else None, markersize=3.5)
         axis.set_title(title, loc="left", fontsize=10)
-        axis.set_xlabel("epoch")
+        axis.set_xlabel("step" if first else "epoch")
         axis.set_xlim(left=0)
         if axis.get_ylim()[0] < 0 <= axis.dataLim.y0:  # no negative values below a curve that has none
             axis.set_ylim(bottom=0)
@@ -104,8 +105,10 @@ def _legend(figure: Any, axes: Sequence[Any]) -> None:
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=ncols, frameon=False, fontsize=9)
 
 
-def curve(history: Sequence[Mapping[str, float]], key: str, points: int = 150) -> tuple[list[float], list[float]]:
-    """Return one column of a log against epochs; long ones as means of neighbors.
+def curve(
+    history: Sequence[Mapping[str, float]], key: str, points: int = 150, *, by_step: bool = False
+) -> tuple[list[float], list[float]]:
+    """Return one column of a log against epochs, or steps; long ones as means of neighbors.
 
     What is logged during an epoch lies between its whole numbers, what is logged after it on the next one: epoch 1 is
     the end of the first.
@@ -113,10 +116,8 @@ def curve(history: Sequence[Mapping[str, float]], key: str, points: int = 150) -
     rows = [row for row in history if key in row and "step" in row and "epoch" in row]
     if not rows:
         return [], []
-    if key.startswith("val/"):
-        return [row["epoch"] + 1 for row in rows], [row[key] for row in rows]
-    steps = _steps_per_epoch(history)
-    size = -(-len(rows) // points)
+    steps = 1 if by_step else _steps_per_epoch(history)
+    size = 1 if key.startswith("val/") else -(-len(rows) // points)
     groups = [rows[start : start + size] for start in range(0, len(rows), size)]
     return (
         [sum(row["step"] + 1 for row in group) / len(group) / steps for group in groups],
@@ -125,11 +126,8 @@ def curve(history: Sequence[Mapping[str, float]], key: str, points: int = 150) -
 
 
 def _steps_per_epoch(history: Sequence[Mapping[str, float]]) -> float:
-    """Return the length of an epoch: exact after a validation, else from how far the log goes."""
-    placed = [row for row in history if "step" in row and "epoch" in row]
-    ends = [row for row in placed if any(key.startswith("val/") for key in row)] or placed
-    last = max(ends, key=lambda row: row["step"])
-    return (last["step"] + 1) / (last["epoch"] + 1)
+    """Return the length of an epoch: exact once something was logged at the end of one, else what the log has of it."""
+    return max((row["step"] + 1) / (row["epoch"] + 1) for row in history if "step" in row and "epoch" in row)
 
 
 def read_benchmark(folder: Path) -> list[dict[str, object]]:

@@ -72,7 +72,7 @@ class Run(folder.Run):
         return runs_table("run", f"{self.name}: {self.path}", {self.name: self}, swept=False)
 
     def plot(self) -> Drawing:
-        """Draw the curves of its losses and errors by epoch.
+        """Draw the curves of its losses and errors.
 
         Returns:
             What a notebook shows and `Drawing.save` writes.
@@ -155,8 +155,8 @@ def _overview(name: str, title: str, runs: Mapping[str, folder.Run], *, swept: b
     blocks: list[Table | Figure] = [runs_table(name, heading, runs, swept=swept)]
     drawn = draw_curves(runs, _CURVES) if draw else None
     if drawn:
-        caption = "By epoch. Losses with different weights cannot be compared."
-        blocks.append(Figure("Curves", Picture(f"{name}.svg", drawn, "losses and errors by epoch"), caption))
+        caption = "Losses with different weights cannot be compared."
+        blocks.append(Figure("Curves", Picture(f"{name}.svg", drawn, "losses and errors"), caption))
     return Section(title[0].upper() + title[1:] if len(runs) > 1 else "Progress", tuple(blocks))
 
 
@@ -195,8 +195,8 @@ def _health(run: folder.Run, draw: bool) -> Section:
     verdict = f"Noticed: {', '.join(said)}" if said else "Nothing unusual was seen"
     blocks: list[Table | Figure] = [Table("health", verdict, columns("Measure", "Latest value|.4g"), tuple(rows))]
     if draw and (drawn := draw_curves({run.name: run}, _health_panels())):
-        picture = Picture("health.svg", drawn, "health measures by epoch")
-        blocks.append(Figure("Health measures", picture, "By epoch."))
+        picture = Picture("health.svg", drawn, "health measures")
+        blocks.append(Figure("Health measures", picture, "They move early where a training goes wrong."))
     return Section("Health", tuple(blocks))
 
 

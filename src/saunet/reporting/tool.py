@@ -260,17 +260,17 @@ def _curves(group: _Group, missing: list[Missing]) -> list[Figure]:
         ("Fig. 4", "loss", (("train/loss", "training loss, total"), ("train/photometric", "photometric term")),
          "Totals with different weights cannot be compared; the photometric term, eqs. (8) to (12), can be."),
         ("Fig. 5", "accuracy", (("val/a1", "accuracy, δ < 1.25"), ("val/abs_rel", "Abs Rel")),
-         "On validation frames, after each epoch."),
+         "On validation frames."),
     )  # fmt: skip
     found = []
     for figure, what, panels, caption in wanted:
         drawing = figures.draw_curves(group.runs, panels, ordered=ordered)
         if drawing is None:
-            missing.append(Missing(f"{what.capitalize()} by epoch of {group.title}", "no run has logged it"))
+            missing.append(Missing(f"{what.capitalize()} during training of {group.title}", "no run has logged it"))
             continue
-        picture = Picture(f"{group.name}_{what}.svg", drawing, f"{what} by epoch")
+        picture = Picture(f"{group.name}_{what}.svg", drawing, f"{what} during training")
         place = f": {group.title}" if group.swept else ""
-        found.append(Figure(f"{what.capitalize()} by epoch{place} (the paper’s {figure})", picture, caption))
+        found.append(Figure(f"{what.capitalize()} during training{place} (the paper’s {figure})", picture, caption))
     return found
 
 

@@ -43,6 +43,9 @@ class Drawing:
             raise ConfigError(f"the drawing {path} must end in .svg")
         write_bytes(path, self.svg)
 
+    def __repr__(self) -> str:
+        return f"Drawing({len(self.svg) / 1024:.0f} kB of SVG; a notebook shows it, .save('drawing.svg') writes it)"
+
     def _repr_svg_(self) -> str:
         return self.svg.decode()
 

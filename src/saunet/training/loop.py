@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from lightning import Trainer
@@ -33,3 +34,17 @@ class EpochLoop(_TrainingEpochLoop):
             return True
         done = epochs.epoch_progress.current.processed + 1
         return self._num_ready_batches_reached() and 0 < (trainer.max_epochs or 0) <= done
+
+
+def total_steps(trainer: Trainer, data: Any) -> int:
+    """Return the optimizer steps of a whole training on a data module.
+
+    The trainer could count them too, but sets up its loader for that: before a resumed run knows where in an epoch it
+    was, so that it would begin the epoch again.
+    """
+    if data is None or trainer.overfit_batches > 0 or trainer.max_epochs in (None, -1):
+        return int(trainer.estimated_stepping_batches)
+    batches, limit = len(data.train_dataloader()), trainer.limit_train_batches
+    batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
+    steps = math.ceil(batches / trainer.accumulate_grad_batches) * int(trainer.max_epochs or 0)
+    return min(steps, trainer.max_steps) if trainer.max_steps != -1 else steps

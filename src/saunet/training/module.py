@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -26,6 +25,7 @@ from saunet.runs.folder import RunRecord
 from saunet.runs.record import Intrinsics
 from saunet.training.health import DOUBTED, health, learned_from
 from saunet.training.intrinsics import FocalLengths
+from saunet.training.loop import total_steps
 from saunet.training.optim import MovingAverage, Recipe
 from saunet.training.resume import continuation, owe_validation, validation_due
 from saunet.training.speed import Speed
@@ -249,22 +249,8 @@ class SelfSupervisedDepth(LightningModule):
             self.average.update(self)
 
     def configure_optimizers(self) -> Any:
-        return self.recipe.configure(self.recipe.groups(self), self._total_steps())
-
-    def _total_steps(self) -> int:
-        """Return the optimizer steps of the whole training.
-
-        The trainer could count them too, but sets up its loader for that: before a resumed run knows where in an epoch
-        it was, so that it would begin the epoch again.
-        """
-        trainer = self.trainer
-        data = getattr(trainer, "datamodule", None)
-        if data is None or float(getattr(trainer, "overfit_batches", 0.0)) > 0 or trainer.max_epochs in (None, -1):
-            return int(trainer.estimated_stepping_batches)
-        batches, limit = len(data.train_dataloader()), trainer.limit_train_batches
-        batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
-        steps = math.ceil(batches / trainer.accumulate_grad_batches) * int(trainer.max_epochs or 0)
-        return min(steps, trainer.max_steps) if trainer.max_steps != -1 else steps
+        total = total_steps(self.trainer, getattr(self.trainer, "datamodule", None))
+        return self.recipe.configure(self.recipe.groups(self), total)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the record from which the networks are rebuilt, and what a resumed training must share."""

@@ -29,7 +29,7 @@ from saunet.runs.folder import Describe, locked, recording
 from saunet.runs.record import ModelRecord, Scale
 from saunet.training.callbacks import AtomicCheckpointIO, BestCheckpoint
 from saunet.training.intrinsics import focal_lengths
-from saunet.training.loop import EpochLoop
+from saunet.training.loop import EpochLoop, total_steps
 from saunet.training.module import SelfSupervisedDepth
 from saunet.training.optim import Recipe
 from saunet.training.resume import check_resume, check_unused, keep_rows, resume_path, validation_due, warm_start
@@ -62,6 +62,8 @@ CALLBACKS: Mapping[str, tuple[str, dict[str, str]]] = {
 }
 """The usual callbacks by name, with the folders that they are given, below the run's own."""
 LOGGERS = {"csv": "CSVLogger", "tensorboard": "TensorBoardLogger"}
+POINTS = 20
+"""Rows of the curves that a short training has at least, where nobody has said how often it logs."""
 DRAWN_FROM = 10
 """Steps of a training from which its curves are worth a picture."""
 _TRUSTED = ("lightning.", "torch.", "saunet.")
@@ -238,6 +240,9 @@ def train(
     trainer = _trainer(options, loggers)
     data.setup("fit")
     data.train_dataloader()  # knows whether there are enough samples
+    if trainer.log_every_n_steps == TRAINER["log_every_n_steps"]:  # type: ignore[attr-defined]
+        often = max(1, total_steps(trainer, data) // POINTS)
+        trainer.log_every_n_steps = min(TRAINER["log_every_n_steps"], often)  # type: ignore[attr-defined]
     if shared := data.overlap():
         rank_zero_info(shared)
     model.intrinsics = focal_lengths(options.model.intrinsics, data)
