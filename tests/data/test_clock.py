@@ -11,6 +11,7 @@ import pytest
 from clip_tree import CAMERA, frames, make_clip, texture
 from drives import NumberDrive
 from kitti_tree import make_drive, name
+from PIL import Image
 
 import saunet
 from saunet.data.kitti.files import read_timestamps
@@ -20,6 +21,8 @@ from saunet.data.video.clips import find_clips, frame_paths, read_clip
 from saunet.data.video.module import ClipDrive
 from saunet.errors import DataError
 from saunet.io.images import name_times
+from saunet.io.times import frame_times
+from saunet.prediction.sources import Recording
 
 
 def kitti(root, steps=(), speed=10.0):
@@ -146,3 +149,73 @@ def test_speeds_of_another_clock_are_refused_and_aligned_by_the_flow(tmp_path, c
     (folder / "speeds.csv").unlink()
     with pytest.raises(DataError, match=r"no speeds\.csv to align"):
         saunet.build("data", "video", align_speeds=True, **common).drives()
+
+
+def test_a_table_of_times_orders_a_clip_and_gives_its_clock(tmp_path):
+    """A camera's counter that wraps, and steps of 0.1 and 0.2 s."""
+    folder = make_clip(tmp_path, "clip", [], CAMERA.replace("fps: 10\n", ""))
+    seconds = {"IMG_9998": 7.0, "IMG_9999": 7.1, "IMG_0001": 7.2, "IMG_0002": 7.4, "IMG_0003": 7.5, "IMG_0004": 7.6}
+    for stem, picture in zip(seconds, frames(6), strict=True):
+        cv2.imwrite(str(folder / f"{stem}.png"), picture)
+    rows = [f"{stem}{'.png' if stem < 'IMG_1' else ''}, {seconds[stem]}" for stem in sorted(seconds)]
+    (folder / "times.csv").write_text("\n".join(["file, time", *rows]))
+    clip = find_clips(tmp_path)[0]
+    assert [path.stem for path in frame_paths(folder)] == list(seconds)
+    recording = read_clip(clip, None, tmp_path, 1280)
+    assert recording.times == tuple(seconds.values())
+    assert recording.fps == pytest.approx(10)
+    assert ClipDrive(clip, recording).gaps == {2}
+    assert read_clip(clip, 5.0, tmp_path, 1280).times == (7.0, 7.2, 7.4, 7.6)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("file,time\na.png,1\n", r"times\.csv has no time of 1 of 2 images, such as b\.png"),
+        ("file,time\na.png,1\nb.png,soon\n", r"times\.csv, line 3: 'soon' is no time"),
+        ("file,time\na.png,1\nb.png\n", r"times\.csv, line 3: '' is no time"),
+        ("file,time\na.png,1\nb.png,1\n", r"2 images at 1 different times"),
+        ("frame,time\n0,1\n", r"has the columns frame, time; expected the columns 'file'"),
+        ("", r"has the columns none; expected"),
+        ("file,time\n\xff,1\n", r"is not a CSV file of text"),
+    ],
+)
+def test_a_wrong_table_of_times_is_refused(tmp_path, text, words):
+    (tmp_path / "times.csv").write_bytes(text.encode("latin1"))
+    with pytest.raises(DataError, match=words):
+        frame_times(tmp_path, ["a.png", "b.png"])
+
+
+def exif_jpeg(path, original, fraction=None, offset=None):
+    image = Image.fromarray(frames(1)[0])
+    exif = Image.Exif()
+    block = exif.get_ifd(0x8769)
+    block |= {tag: text for tag, text in ((0x9003, original), (0x9291, fraction), (0x9011, offset)) if text}
+    image.save(path, exif=exif)
+
+
+def test_exif_gives_the_times_of_photographs(tmp_path):
+    folder = make_clip(tmp_path, "clip", [], CAMERA.replace("fps: 10\n", ""))
+    for number, original, fraction in (("0002", "59", "05"), ("0003", "59", "55"), ("0001", "58", "550")):
+        exif_jpeg(folder / f"DSC_{number}.JPG", f"2024:05:03 12:00:{original}", fraction, "+02:00")
+    recording = read_clip(find_clips(tmp_path)[0], None, tmp_path, 1280)
+    noon = np.datetime64("2024-05-03T10:00:58").astype(int)
+    assert recording.times == pytest.approx((noon + 0.55, noon + 1.05, noon + 1.55), abs=1e-6)
+    assert recording.fps == pytest.approx(2)
+    (frame, *_, last) = Recording(str(folder))
+    assert last.time - frame.time == pytest.approx(1)
+    exif_jpeg(folder / "DSC_0004.jpg", "2024:05:03 12:01:00")  # whole seconds are too coarse
+    assert frame_times(folder, [path.name for path in frame_paths(folder)]) is None
+    exif_jpeg(folder / "DSC_0004.jpg", "2024:05:03 12:00:58", "55", "+02:00")  # copied from another image
+    assert frame_times(folder, [path.name for path in frame_paths(folder)]) is None
+
+
+@pytest.mark.parametrize("damage", [slice(30, 36), slice(36, 38), slice(40, 44), slice(46, 400)])
+def test_a_damaged_exif_block_means_no_time(tmp_path, damage):
+    exif_jpeg(tmp_path / "a.jpg", "2024:05:03 12:00:58", "5")
+    assert frame_times(tmp_path, ["a.jpg"]) is not None
+    data = bytearray((tmp_path / "a.jpg").read_bytes())
+    start = data.find(b"Exif") - 30
+    data[start + damage.start : start + damage.stop] = b"\xff" * (damage.stop - damage.start)
+    (tmp_path / "a.jpg").write_bytes(data)
+    assert frame_times(tmp_path, ["a.jpg"]) is None

@@ -8,15 +8,16 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from saunet.errors import ConfigError, DataError
-from saunet.io.images import IMAGE_SUFFIXES, image_size, name_times, natural_order
+from saunet.io.images import IMAGE_SUFFIXES, image_size, natural_order
 from saunet.io.live import CameraReader, live_source, live_title
+from saunet.io.times import frame_times
 from saunet.io.video import VIDEO_SUFFIXES, VideoReader
 from saunet.prediction.prediction import ImageLike, as_image
 
@@ -80,8 +81,10 @@ class Recording:
         ):
             self._frames = self.images = found = find_sources(source, output_dir)
             self.declared = len(found)
-            stamps = name_times([PurePath(frame.stem).name for frame in found])
-            if stamps and len({PurePath(frame.stem).parent for frame in found}) == 1 and (np.diff(stamps) > 0).all():
+            files = [Path(str(frame.image)) for frame in found]
+            together = len({file.parent for file in files}) == 1
+            stamps = frame_times(files[0].parent, [file.name for file in files]) if together else None
+            if stamps and (np.diff(stamps) > 0).all():
                 self.timed, times = True, zip(found, stamps, strict=True)
                 self._frames = self.images = [replace(frame, time=stamp) for frame, stamp in times]
                 self.fps = float(fps or 1 / np.median(np.diff(stamps))) if len(stamps) > 1 else self.fps

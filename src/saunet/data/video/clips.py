@@ -22,8 +22,9 @@ import numpy as np
 from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera, unknown_camera
 from saunet.errors import DataError
 from saunet.io.atomic import partial_name, remove_partial_files, write_json
-from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, name_times, natural_order
+from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, natural_order
 from saunet.io.plain import read_json
+from saunet.io.times import frame_times
 from saunet.io.video import BARE_SUFFIXES, VIDEO_SUFFIXES, VideoReader, nearest_steps
 
 _NO_CLIPS = frozenset({"@eaDir", "__MACOSX"})
@@ -57,7 +58,7 @@ class Recording:
     passed_over: int = 0  # frames between those taken, which the frame rate asked for does not need
     plain: int = 0  # frames of a video that have one single color, as where nothing could be decoded
     times: tuple[float, ...] | None = None
-    """Seconds of each from any fixed origin, by the video or by stamps in the names; None if unknown."""
+    """Seconds of each from any fixed origin, by the video, a table, stamps in the names or EXIF; None if unknown."""
 
     def time(self, place: int) -> float | None:
         """Return the time of one, by the rate if it has no other; None if unknown."""
@@ -118,10 +119,20 @@ class FramePaths(Sequence[Path]):
 
 
 def frame_paths(folder: Path) -> FramePaths:
-    """Return the images directly in a folder in order of time: ``frame_2`` before ``frame_10``, stamps as numbers."""
+    """Return the images directly in a folder in order of time: by their times, else ``frame_2`` before ``frame_10``."""
+    return timed_paths(folder)[0]
+
+
+def timed_paths(folder: Path) -> tuple[FramePaths, list[float] | None]:
+    """Return what `frame_paths` does, and the seconds of each image from any fixed origin; None if unknown."""
     with os.scandir(folder) as entries:
         names = [entry.name for entry in entries if _is_image(entry.name) and entry.is_file()]
-    return FramePaths(folder, [names[place] for place in frame_order(names)])
+    names = [names[place] for place in frame_order(names)]
+    times = frame_times(folder, names)
+    if times is not None:
+        order = sorted(range(len(names)), key=times.__getitem__)
+        names, times = [names[place] for place in order], [times[place] for place in order]
+    return FramePaths(folder, names), times
 
 
 def _is_image(name: str) -> bool:
@@ -169,8 +180,7 @@ def read_clip(
 
 
 def _read_folder(clip: Clip, fps: float | None) -> Recording:
-    paths = frame_paths(clip.path)
-    stamps = name_times([os.path.splitext(name)[0] for name in paths.names])
+    paths, stamps = timed_paths(clip.path)
     rate = clip.camera.fps
     if rate is None and stamps is not None and len(stamps) > 1:
         rate = 1 / float(np.median(np.diff(stamps)))
