@@ -316,7 +316,7 @@ def test_a_rotated_video_needs_the_calibration_of_the_upright_picture(tmp_path):
     assert drive.image(0).shape == (128, 96, 3)
     assert drive.intrinsics(0)[0, 2] == 47.5
     (wrong,) = module(tmp_path / "lying", static="keep", val_share=0.0).drives()
-    with pytest.raises(DataError, match=r"frames of 'phone\.mov' .* are 96x128 .* is for 128x96"):
+    with pytest.raises(DataError, match=r"'phone\.mov' .* are 96x128 .* is for 128x96; the sides are swapped"):
         wrong.image(0)
 
 

@@ -85,9 +85,14 @@ class CameraFile:
         else:
             rows, columns = self.image_size
             if abs(height / rows * columns / width - 1) > _SAME_SHAPE:
+                fix = "give frames of the calibrated shape (scaled as a whole, not cropped), or calibrate anew"
+                if abs(height / columns * rows / width - 1) < _SAME_SHAPE:
+                    fix = (
+                        "the sides are swapped: image_size is [width, height], and for a video that its tag rotates, "
+                        "it and K are those of the picture as players show it"
+                    )
                 raise DataError(
-                    f"{what} are {width}x{height} (width x height) but {self.path} is for {columns}x{rows}; "
-                    "give frames of the calibrated shape (scaled as a whole, not cropped), or calibrate anew"
+                    f"{what} are {width}x{height} (width x height) but {self.path} is for {columns}x{rows}; {fix}"
                 )
             scaled = scale_intrinsics(given, width / columns, height / rows)
         K: NDArray[np.float64] = scaled.numpy()
