@@ -94,7 +94,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     """
     image = _decode(path, _COLOR)
     bits = 8
-    if image.dtype != np.uint8:
+    if image.dtype == np.uint16:
         bits = max(_folder_bits(Path(path).resolve().parent, Path(path).suffix.lower()), _bits(image))
     return as_rgb_bytes(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), str(path), bits)
 
