@@ -33,7 +33,7 @@ from saunet.weights.files import read_model
 
 PYTHON = os.environ.get("SAUNET_FIRST_HOUR", "")
 SHORT = {
-    "train": "model=sau_net_nano model.encoder.weights=null model.pose.weights=null epochs=1 batch=2 size=64x96 "
+    "train": "model=sau_net_nano model/pose=posecnn model.encoder.weights=null epochs=1 batch=2 size=64x96 "
     "data.workers=0 trainer.limit_train_batches=1 trainer.limit_val_batches=1",
     "evaluate": "data.workers=0",
 }

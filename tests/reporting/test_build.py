@@ -393,6 +393,7 @@ def test_the_shipped_model_is_compared_with_a_run_under_its_own_name(
     assert "left out" not in text
     document = build(collect([run]), ReportOptions(figures=False))  # which shows both
     parameters = next(table for table in document.tables if table.name == "table2")
+    assert "2 runs: 1 finished, 1 shipped" in document.facts
     assert [row.cells[0] for row in parameters.rows][:2] == ["stratified_nano + aunet", "street"]
     with pytest.raises(DataError, match=r"nothing at nowhere; .* shipped model: street"):
         collect(["nowhere"])

@@ -60,7 +60,7 @@ def test_the_page_of_a_run_has_curves_the_last_picture_health_and_data(folder: P
     page = page_of(folder)
     assert [section.title for section in page.sections] == ["Progress", "Last pictures", "Health", "Data"]
     text = as_html(page, live=5.0)
-    assert "After epoch 11" in text
+    assert "Epoch 11" in text
     assert "8 % of the pixels lie in holes" in text
     assert "4 frames used; left out: 2 without neighbor" in text
     assert "connect-src" in text

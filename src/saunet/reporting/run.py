@@ -140,7 +140,7 @@ def page_of(path: str | Path) -> Document:
     running = sum(run.status == "running" for run in inputs.all_runs)
     states = f"{len(inputs.all_runs)} runs, {running} running" if several else inputs.all_runs[0].status
     facts = (states, str(path), f"as of {datetime.now(timezone.utc):%Y-%m-%d %H:%M:%S} UTC", f"saunet {__version__}")
-    title = Path(path).resolve().name if several else inputs.all_runs[0].name
+    title = Path(path).resolve().name if several else inputs.all_runs[0].called
     return Document(title, facts, tuple(sections), tuple(missing))
 
 
@@ -176,7 +176,7 @@ def _pictures(run: folder.Run) -> Section:
         epoch = int("".join(filter(str.isdigit, file.stem)) or 0) + 1
         alt = "validation images with disparity, warped neighbor, photometric error and mask"
         caption = "Input, disparity, the neighbor warped into it, where the two differ (bright), what the mask keeps."
-        blocks.append(Figure(f"After epoch {epoch}", Picture(file.name, file.read_bytes(), alt), caption))
+        blocks.append(Figure(f"Epoch {epoch}", Picture(file.name, file.read_bytes(), alt), caption))
     return Section("Last pictures", tuple(blocks), "" if blocks else "they are drawn after each validation")
 
 

@@ -13,6 +13,7 @@ from saunet.reporting.page import Missing
 from saunet.runs.folder import Detail, Explained, Run, Score
 from saunet.runs.sweep import RATIO, differing, ratio, values
 from saunet.tables import Cell, Column, Row, Table, columns
+from saunet.weights.locate import BOX
 
 _SHOWN = (ABS_REL, RMSE, A1)
 """The errors that a table of runs shows."""
@@ -212,7 +213,7 @@ def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -
     for (label, run), number in zip(runs.items(), ratios, strict=True):
         score = scores.get(label)
         cells = (
-            *(label, run.status, *values(run, keys), *[number] * show_ratio, *_progress(run)),
+            *(label, status(run), *values(run, keys), *[number] * show_ratio, *_progress(run)),
             *(score.errors[index] if score else None for index in _SHOWN),
             run.seconds / 60 if run.seconds is not None else None,
         )
@@ -230,6 +231,11 @@ def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -
 def networks(run: Run) -> str:
     """Return a run's networks in words: a whole model's name, such as ``street``, or ``resnet18 + unet``."""
     return _system(run) or f"{run.component('model/encoder')} + {run.component('model/decoder')}"
+
+
+def status(run: Run) -> str:
+    """Return how a run ended in one word, or ``shipped`` for a model that comes with saunet."""
+    return "shipped" if run.path.parent == BOX else run.status
 
 
 def with_pose(run: Run) -> str:

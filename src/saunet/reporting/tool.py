@@ -238,7 +238,8 @@ def _varied(group: _Group) -> Named:
 def _runs(groups: Sequence[_Group], draw: bool, missing: list[Missing]) -> list[Table | Figure]:
     blocks: list[Table | Figure] = []
     for group in groups:
-        heading = group.title[0].upper() + group.title[1:] + (f": {len(group.runs)} jobs" if group.swept else "")
+        jobs = f"{group.title[0].upper()}{group.title[1:]}: {len(group.runs)} jobs"
+        heading = jobs if group.swept else "What sets them apart, and what they reached"
         blocks.append(tables.runs_table(group.name, heading, group.runs, swept=group.swept))
         if not draw or not sweeps_ratio(list(group.runs.values())):
             continue
@@ -350,8 +351,9 @@ def _words(run: Run) -> str:
 
 
 def _facts(runs: Named) -> tuple[str, ...]:
-    counts = Counter("without run.json" if run.status == "unknown" else run.status for run in runs.values())
-    told = ", ".join(f"{count} {status}" for status, count in counts.items())
+    counts = Counter(map(tables.status, runs.values()))
+    counts["without run.json"] = counts.pop("unknown", 0)
+    told = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
     made = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     return (f"{len(runs)} run{'' if len(runs) == 1 else 's'}: {told}", f"made {made}", f"saunet {__version__}")
 
