@@ -299,7 +299,8 @@ def with_lens(
     def table(axis: int, steps: Sequence[float]) -> F64:
         return np.array([costs(moved(axis, step)) for step in steps])
 
-    for axis in (*axes, *axes):  # twice: a center aside looks like a bend as long as it is not found
+    # a free center twice: one aside looks like a bend as long as it is not found
+    for axis in (*axes, *axes) if free_center else axes:
         for way in (-_COARSE[axis], _COARSE[axis]):
             while abs(moved(axis, way)[axis]) < 1 and costs(moved(axis, way)).sum() < costs(best).sum():
                 best = moved(axis, way)
