@@ -107,7 +107,9 @@ def fold(
     seen = project(model, coefficients, np.stack([sines * np.cos(around), sines * np.sin(around), cosines], -1))
     grows = np.diff(np.linalg.norm(seen, axis=-1), axis=0) > 0  # NaN does not grow
     last = np.where(grows.all(0), len(angles) - 1, grows.argmin(0))
-    ends = np.stack([seen[place, column] for column, place in enumerate(last)]) @ K[:2, :2].T
+    ends = np.stack([seen[place, column] for column, place in enumerate(last)])
+    with np.errstate(invalid="ignore"):  # a NaN is no pixel inside
+        ends = ends @ K[:2, :2].T
     at = ends + K[:2, 2]
     inside = (at >= 0).all(1) & (at[:, 0] <= width - 1) & (at[:, 1] <= height - 1) & (last < len(angles) - 1)
     if not inside.any():
