@@ -33,7 +33,7 @@ from saunet.weights.files import read_model
 
 PYTHON = os.environ.get("SAUNET_FIRST_HOUR", "")
 SHORT = {
-    "train": "model=sau_net_nano model/pose=posecnn model.encoder.weights=null epochs=1 batch=2 size=64x96 "
+    "train": "model=sau_net_nano model.encoder.weights=null model.pose.weights=null epochs=1 batch=2 size=64x96 "
     "data.workers=0 trainer.limit_train_batches=1 trainer.limit_val_batches=1",
     "evaluate": "data.workers=0",
 }
@@ -73,6 +73,8 @@ def shortened(command: str) -> list[str]:
         words += [f"data.sources.town.{each}" for each in KITTI.split()]
     given = {word.partition("=")[0] for word in words}
     words += [word for word in SHORT.get(tool, "").split() if word.partition("=")[0] not in given]
+    if {"experiment=quick", "experiment=scratch"} & set(words):  # their pose network has no public weights to leave out
+        words = [word for word in words if not word.startswith("model.pose.weights=")]
     fitting = [("/data/", "data/"), ("/fast/", "fast/"), ("trainer=gpu", "trainer=cpu"), (".../best.ckpt", "best.ckpt")]
     for printed, here in fitting:
         words = [word.replace(printed, here) for word in words]
