@@ -42,7 +42,8 @@ def total_steps(trainer: Trainer, data: Any) -> int:
     The trainer could count them too, but sets up its loader for that: before a resumed run knows where in an epoch it
     was, so that it would begin the epoch again.
     """
-    if data is None or trainer.overfit_batches > 0 or trainer.max_epochs in (None, -1):
+    overfit = float(getattr(trainer, "overfit_batches", 0.0)) > 0
+    if data is None or overfit or trainer.max_epochs in (None, -1):
         return int(trainer.estimated_stepping_batches)
     batches, limit = len(data.train_dataloader()), trainer.limit_train_batches
     batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
