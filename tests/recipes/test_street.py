@@ -129,6 +129,32 @@ def test_the_depth_network_learns_from_two_steps(tmp_path: Path) -> None:
         torch.testing.assert_close(train_depth.forward(network, batch, finest), whole[finest:])
 
 
+def test_weights_are_averaged_and_counts_are_not() -> None:
+    """Floating point is averaged, and a batch normalization's count of batches is that of the first."""
+    import average
+
+    states = [{"w": torch.full((2,), x), "n": torch.tensor(n)} for x, n in ((1.0, 4), (2.0, 5), (6.0, 6))]
+    mean = average.average(states)
+    assert mean["w"].tolist() == [3.0, 3.0]
+    assert mean["n"] == 4
+
+
+def test_crowns_are_bodies_and_poles_stay_thin() -> None:
+    """Gaps between leaves are closed, wider ones in the upper half; what is near keeps its shape."""
+    import frames
+
+    depth = np.zeros((160, 200), np.float32)
+    depth[20:60:12, 40:100] = depth[20:60, 40:100:12] = 10.0  # leaves with gaps of 11 pixels before the sky
+    depth[100:140:12, 40:100] = depth[100:140, 40:100:12] = 10.0
+    depth[:, 150:152] = 5.0
+    closed = frames.close_gaps(depth)
+    assert (closed[24:56, 44:96] == 10).all()
+    assert (closed[101:112, 41:52] == 0).mean() > 0.3
+    assert (closed[:, 150:152] == 5).all()
+    assert (closed[:, 110:145] == 0).all()
+    assert (closed[:, 160:] == 0).all()
+
+
 def test_the_pose_network_learns_from_two_steps(scenes: Path) -> None:
     """Its loss is finite and gradients reach its first layer."""
     import frames
