@@ -50,7 +50,7 @@ def main() -> None:
     options = parser.parse_args()
     facts = {
         "name": "street",
-        "frames": "streets rendered by recipes/street with exact depth; no real frame",
+        "frames": "streets rendered by recipes/street, and of data=synthetic's world, with exact depth; no real frame",
         "depth": "meters for a camera whose focal length is 0.58 image widths; for another, times its own over 0.58",
     }
     checkpoint(options.out, options.depth, options.pose, tuple(options.size), facts)

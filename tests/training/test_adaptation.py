@@ -27,7 +27,7 @@ from saunet.metrics.protocols import evaluate_image, protocol
 from saunet.synthetic import SyntheticDrive
 from saunet.synthetic.world import turn
 
-SIZE = (96, 320)
+SIZE = (128, 416)
 Frame = tuple[NDArray[np.uint8], torch.Tensor, str]
 
 

@@ -1,4 +1,4 @@
-"""The README's demo: train on rendered video, evaluate on an unseen drive, and draw depth pictures and a video."""
+"""The README's demo: train on rendered video, score on its streets and on an unseen one, draw pictures and a video."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 import saunet
 from saunet.data.drive import Drive
+from saunet.data.loading.module import DepthDataModule
 from saunet.data.synthetic import SyntheticDataModule
 from saunet.evaluation import write_results
 from saunet.evaluation.predictors import NetworkPredictor, PredictorNetwork
@@ -19,13 +20,19 @@ from saunet.io.images import write_image
 from saunet.prediction.panel import depth_panel
 from saunet.prediction.predictor import Predictor
 from saunet.prediction.tool import PredictOptions, predict
+from saunet.synthetic import SyntheticDrive
 from saunet.tables import show
 from saunet.training.tool import TrainOptions, train
 
 SHIPPED = "street"
 """The model that comes with saunet, shown beside the one that the demo trains."""
 PICTURES = 3
-"""Test frames shown in the panel, evenly spread over the drive."""
+"""Frames shown in a panel: of one street evenly spread, of several one each."""
+STREETS = {
+    "driven": "Streets that the camera drove through: 'model' has learned from their video, not from their depth.",
+    "unseen": "A street that neither network has seen; 'model' was trained without any depth.",
+}
+"""What was scored, by the name of its files."""
 WIDTH = 640
 """Of the pictures in pixels; rendered frames are rendered anew at this width, and the networks reduce them."""
 
@@ -45,31 +52,44 @@ def demo(
     checkpoint = folder / "checkpoints" / "last.ckpt"
     trained, shipped = saunet.load(checkpoint), saunet.load(SHIPPED)
     others = {SHIPPED: NetworkPredictor(PredictorNetwork(shipped))}
-    result = evaluate_network(trained.network, data, others, Shapes(boundaries=True))
-    write_results(result, folder)
-    drive = large = data.datasets["test"].drives[0]
+    scored = {"unseen": data}
     if isinstance(data, SyntheticDataModule):
-        rendered = data.drives("test")[0]
-        large = replace(rendered, height=round(data.height * WIDTH / data.width), width=WIDTH, cache=None)
-    draw(trained, shipped, drive, large, folder)
-    show(result.tables())
-    print("The camera moved through a street that neither network had seen; 'model' was trained without any depth.")
-    print(f"pictures  {folder / 'depth.png'}")
-    print(f"video     {folder / 'depth.mp4'}")
-    print(f"metrics   {folder / 'metrics.md'}, metrics.json, per_image.csv")
+        scored = {"driven": data.driven(), **scored}
+    for place, each in scored.items():
+        result = evaluate_network(trained.network, each, others, Shapes(boundaries=True))
+        write_results(result, folder / place)
+        draw(trained, shipped, [large(drive, each) for drive in each.datasets["test"].drives], folder / f"{place}.png")
+        print(STREETS[place])
+        show(result.tables())
+    film(trained, data.datasets["test"].drives[0], folder)
+    for place in scored:
+        print(f"{place:9} {folder / f'{place}.png'}, {folder / place}/metrics.md, metrics.json, per_image.csv")
+    print(f"video     {folder / 'depth.mp4'}, of the unseen street")
     print(f"model     {checkpoint}")
 
 
-def draw(trained: Predictor, shipped: Predictor, drive: Drive, large: Drive, folder: Path) -> None:
-    """Write ``depth.png`` (a few large frames with truth and error) and ``depth.mp4`` (the whole drive)."""
-    frames, panels = list(drive.indices), []
-    for place in np.linspace(0, len(frames) - 1, PICTURES + 2)[1:-1]:
-        frame = frames[round(place)]
-        image, truth = large.image(frame), large.depth(frame)
+def large(drive: Drive, data: DepthDataModule) -> Drive:
+    """Return a rendered drive at the width of the pictures, and any other as it is."""
+    if not isinstance(drive, SyntheticDrive):
+        return drive
+    return replace(drive, height=round(data.height * WIDTH / data.width), width=WIDTH, cache=None)
+
+
+def draw(trained: Predictor, shipped: Predictor, drives: Sequence[Drive], file: Path) -> None:
+    """Write a panel of a few frames with both predictions, truth and error."""
+    several, panels = len(drives) >= PICTURES, []
+    for number, share in enumerate(np.linspace(0, 1, PICTURES + 2)[1:-1]):
+        drive = drives[number if several else 0]
+        frame = list(drive.indices)[round((len(drive.indices) - 1) * share)]
+        image, truth = drive.image(frame), drive.depth(frame)
         others = {f"{SHIPPED}, as shipped": shipped.predict(image).disparity}
         note, disparity = "of the model trained here", trained.predict(image).disparity
         panels.append(depth_panel(image, disparity, truth, tile_width=WIDTH, note=note, others=others))
-    write_image(folder / "depth.png", np.concatenate(panels, axis=1))
-    checkpoint, images = folder / "checkpoints" / "last.ckpt", (drive.image(frame) for frame in frames)
+    write_image(file, np.concatenate(panels, axis=1))
+
+
+def film(trained: Predictor, drive: Drive, folder: Path) -> None:
+    """Write ``depth.mp4``, a whole drive beside its depth."""
+    checkpoint, images = folder / "checkpoints" / "last.ckpt", (drive.image(frame) for frame in drive.indices)
     options = PredictOptions(checkpoint=checkpoint, input=images, output=folder, overwrite=True)
     predict(options, trained).clips[0].replace(folder / "depth.mp4")

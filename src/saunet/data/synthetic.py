@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -103,6 +104,17 @@ class SyntheticDataModule(DepthDataModule):
             pairs = [drive.stereo() for drive in self._drives[name]] if self.stereo and name in self.neighbors else []
             _render([*self._drives[name], *pairs], name, show=self._place()[0] == 0)
         return self._drives[name]
+
+    def driven(self) -> SyntheticDataModule:
+        """Return a data module whose test drives are this one's training drives, at the size of its networks.
+
+        Whoever adapts to a clip wants its depth: the video was learned from, its true depth was not.
+        """
+        other = copy.copy(self)
+        other.crop_margin, other.datasets, other.usage = 0.0, {}, {}
+        other._drives = {name: drives for name, drives in self._drives.items() if name != "train"}
+        other._drives["test"] = other.drives("train")
+        return other
 
     def select(self, split: str) -> Sequence[Selection]:
         return [Selection(drive, drive.indices) for drive in self.drives(split)]
