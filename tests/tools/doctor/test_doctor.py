@@ -138,7 +138,7 @@ def test_cameras_that_cannot_be_right_are_named(tmp_path):
 def test_a_field_of_view_that_was_not_checked_is_told(tmp_path, focal, level):
     make_clip(tmp_path / "r", "a", frames(16), camera=CAMERA.replace("K: [250, 252", f"K: [{focal}, {focal}"))
     text = look(campus(tmp_path / "r"))[2]
-    assert f"{level}: K was not checked, as no examined drive turns enough, and means a field of view of" in text
+    assert f"{level}: K was not checked, as no examined drive tells the focal length" in text
     assert ("car cameras usually have 60 to 120" in text) == (level == "warning")
 
 

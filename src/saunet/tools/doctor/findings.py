@@ -134,7 +134,8 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
         text = f"{told}, which agrees with K in {agree}"
         yield Finding("note", text)
     elif survey.cameras:
-        text = f"K was not checked, as no examined drive turns enough, and means a field of view of {view}"
+        unknown = "no examined drive tells the focal length (turns do, through the lens as it is given)"
+        text = f"K was not checked, as {unknown}, and means a field of view of {view}"
         if _USUAL_VIEW[0] <= low and high <= _USUAL_VIEW[1]:
             yield Finding("note", text, "is this your camera's?")
         else:
