@@ -109,7 +109,7 @@ def test_rendered_clips(kind: type[Winding], tmp_path: Path) -> None:
     for name in frames:
         start, *later = (row[name][0] for row in rows)
         assert max(later) < start + 0.01
-        assert later[-1] < 0.8 * start
+        assert later[-1] < 0.95 * start  # which knows such streets
 
 
 @pytest.mark.slow
@@ -130,7 +130,7 @@ def test_real_clips(seed: int, kitti_mini: Path, tmp_path: Path, monkeypatch: py
         text = yaml.safe_dump({"image_size": [640, 192], "K": [float(each) for each in K], "fps": 10})
         (tmp_path / "clips" / name / "camera.yaml").write_text(text)
     rows = adapt(tmp_path / "clips", real_frames(kitti_mini), tmp_path / "run", 50, f"seed={seed}").rows
-    for name, bound in (("9015", 0.9), ("06", 0.55)):
+    for name, bound in (("9015", 0.85), ("06", 0.55)):
         start, *later = (row[name][0] for row in rows)
         assert max(later) < start + 0.01
         assert later[-1] < bound * start
