@@ -14,9 +14,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from typing_extensions import NotRequired, TypedDict
 
-MOTIONS = ("auto", "tracked")
-"""Where the camera's motion comes from: a pose network if there is one, or tracked points."""
-
 
 class _Sample(TypedDict):
     K: Float[Tensor, "b 3 3"]

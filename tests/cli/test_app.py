@@ -280,8 +280,8 @@ def test_help_shows_the_values_that_a_command_has(capsys: pytest.CaptureFixture[
     assert "null" not in said
     app.main(["demo", "--help"])
     said = " ".join(capsys.readouterr().out.split())
-    assert "trainer.max_steps: int = 150" in said
-    assert "data.height: int = 96" in said
+    assert "trainer.max_steps: int = 100" in said
+    assert "data.height: int = 128" in said
     assert "model=NAME (now street)" in said
 
 

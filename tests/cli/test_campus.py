@@ -81,7 +81,7 @@ def test_a_video_of_a_real_drive_goes_all_the_way(tool: Tool, kitti_mini: Path, 
 
     trained = tool("train", *TINY, "data.root=campus", "data.manifest=doctor/manifest.json", "output_dir=run")
     assert trained.code == 0, trained.err
-    assert "training and validation share my drive.avi" in trained.err
+    assert "training and validation share 'my drive.avi'" in trained.err
     predicted = tool("predict", "checkpoint=run/checkpoints/last.ckpt", "input=campus/my drive.avi", "output=out")
     assert predicted.code == 0, predicted.err
     assert "48 frames" in predicted.out
@@ -113,7 +113,7 @@ def test_the_doctor_ends_with_an_error_where_training_would(tool: Tool, tmp_path
     _camera(tmp_path / "clips")
     outcome = tool("doctor", *arguments, "data.val_share=0.3")
     assert outcome.code == 0, outcome.out
-    assert "note: training and validation share a.avi" in outcome.out
+    assert "note: training and validation share 'a.avi'" in outcome.out
     left_out = re.search(r"names (\d+) frames? to leave out \(judged: all\)", outcome.out)
     assert left_out
     assert ("train with data.manifest=doctor/manifest.json" in outcome.out) == (left_out[1] != "0")

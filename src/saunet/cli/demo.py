@@ -20,7 +20,6 @@ from saunet.io.images import write_image
 from saunet.prediction.panel import depth_panel
 from saunet.prediction.predictor import Predictor
 from saunet.prediction.tool import PredictOptions, predict
-from saunet.synthetic import SyntheticDrive
 from saunet.tables import show
 from saunet.training.tool import TrainOptions, train
 
@@ -58,7 +57,7 @@ def demo(
     for place, each in scored.items():
         result = evaluate_network(trained.network, each, others, Shapes(boundaries=True))
         write_results(result, folder / place)
-        draw(trained, shipped, [large(drive, each) for drive in each.datasets["test"].drives], folder / f"{place}.png")
+        draw(trained, shipped, drawn(each), folder / f"{place}.png")
         print(STREETS[place])
         show(result.tables())
     film(trained, data.datasets["test"].drives[0], folder)
@@ -68,11 +67,12 @@ def demo(
     print(f"model     {checkpoint}")
 
 
-def large(drive: Drive, data: DepthDataModule) -> Drive:
-    """Return a rendered drive at the width of the pictures, and any other as it is."""
-    if not isinstance(drive, SyntheticDrive):
-        return drive
-    return replace(drive, height=round(data.height * WIDTH / data.width), width=WIDTH, cache=None)
+def drawn(data: DepthDataModule) -> Sequence[Drive]:
+    """Return the test drives, rendered ones at the width of the pictures."""
+    if not isinstance(data, SyntheticDataModule):
+        return data.datasets["test"].drives
+    height = round(data.height * WIDTH / data.width)
+    return [replace(drive, height=height, width=WIDTH, cache=None) for drive in data.drives("test")]
 
 
 def draw(trained: Predictor, shipped: Predictor, drives: Sequence[Drive], file: Path) -> None:

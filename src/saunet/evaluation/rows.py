@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import astuple, dataclass
 
 from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
-from saunet.tables import Row, Table, columns
+from saunet.tables import Column, Row, Table, columns
 
 ERROR_COLUMNS = columns(*(f"{heading}|.3f" for heading in ERROR_HEADINGS))
 COMPARED = dict(
@@ -187,9 +187,12 @@ class Comparison:
     def table(self, *notes: str) -> Table:
         """Return the differences as a table; bold where the interval leaves out zero."""
         level = f"{self.level:.0%}".replace("%", " %")
-        headings = columns(
-            *("error", "first|.4f", "second|.4f", "difference|+.4f", f"{level} low|+.4f", f"{level} high|+.4f"),
-            *("second better|.0%", "p|.2g"),
+        headings = (
+            *columns("error"),
+            *(Column(name, ".4f") for name in (self.first, self.second)),
+            *columns("difference|+.4f", f"{level} low|+.4f", f"{level} high|+.4f"),
+            Column(f"'{self.second}' better", ".0%"),
+            *columns("p|.2g"),
         )
         rows = []
         for one in self.differences:

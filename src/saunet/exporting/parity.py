@@ -88,7 +88,7 @@ def milliseconds(runs: Sequence[Run], image: NDArray[np.float32], repeats: int =
 
 def parity_table(reports: Sequence[Parity]) -> Table:
     """Return the comparisons for a terminal and for the card."""
-    columns = {"file": "", "MB": ".1f", "batch": "", "differs by": ".1e", "random": "", "real": ""}
+    columns = {"file": "", "MB": ".1f", "batch": "", "differs by": ".1e", "random images": "", "real images": ""}
     columns |= {"eager ms": ".1f", "this ms": ".1f", "depth differs by": ".1g"}
     shown = attrgetter("file", "megabytes", "batch", "difference", "random", "real", "eager_ms", "exported_ms")
     rows = [Row((*shown(each), each.depth_difference)) for each in reports]

@@ -142,7 +142,7 @@ class Division(NamedTuple):
         shared = sorted({frame.drive for frame in self.train} & held)
         told, fix = list[str](), list[str]()
         if shared:
-            names = ", ".join(shared[:5]) + (", ..." if len(shared) > 5 else "")
+            names = ", ".join(map(repr, shared[:5])) + (", ..." if len(shared) > 5 else "")
             told.append(f"training and validation share {names} (validation has the end of each)")
             fix.append(f"{val}=[NAME]")
         if self.val and {*self.val} == {*self.test}:

@@ -184,7 +184,7 @@ def refusal(found: FocalEstimate | None, source: str) -> str:
     """Say why a focal length cannot be known, and what to film."""
     known = "nothing says it"
     if found is not None and math.isfinite(found.uncertainty):
-        known = f"it is known to {found.uncertainty:.1%} only"
+        known = f"it looks like {found.focal:.2f} image widths, known to {found.uncertainty:.1%} only"
     film = "film a minute with turns at 15 to 30 km/h: corners, a roundabout, a winding road"
     return f"the focal length cannot be known from {source}: {known}, {KNOWN:.1%} is required; {film}"
 
