@@ -210,7 +210,7 @@ def test_clips_are_held_out_and_tested_by_name_and_condition(tmp_path):
     assert "validation and test are the same 6 frames" in module(tmp_path / "r", val_clips=["day/0"]).overlap()
     share = module(tmp_path / "r", val_share=0.3).overlap()
     for words in (
-        "validation share day/0, day/1",
+        "validation share 'day/0', 'day/1'",
         "validation and test are the same",
         "data.val_clips=[NAME] and data",
     ):
@@ -371,6 +371,19 @@ def test_an_unknown_camera_is_estimated_once_from_all_its_clips(tmp_path, monkey
         np.testing.assert_allclose(K, [[0.7 * 288, 0, 159.5 - 32], [0, 0.7 * 288, 99.5], [0, 0, 1]])
     assert asked == [(2, (128 / 288, 100 / 288))]  # a window a clip; the second time it is known
     assert "known to 0.40% from 5 windows" in caplog.text
+
+
+def test_a_camera_called_unknown_keeps_what_its_file_says_beside_the_lens(tmp_path):
+    lens = "K: [900, 900, 160, 100]\nimage_size: [320, 200]\ndistortion: [-0.1, 0, 0, 0]\n"
+    camera = f"{lens}fps: 12\ncrop: [0, 0.1, 0.1, 0]\n"
+    make_clip(tmp_path, "a", frames(14), camera=camera)
+    data = module(tmp_path, camera="unknown", guess_camera=True)
+    data.setup("fit")
+    drive = data.datasets["train"].drives[0]
+    assert drive.intrinsics(0)[0, 0] == pytest.approx(160 / np.tan(np.radians(30)))  # a guess, not 900
+    assert drive.clip.camera.fps == 12
+    assert drive.frame_size == (180, 288)
+    assert drive.clip.camera.is_straight
 
 
 def test_an_unknown_camera_that_nothing_tells_is_refused_or_guessed(tmp_path):

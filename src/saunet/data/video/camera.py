@@ -105,6 +105,13 @@ def unknown_camera(path: Path) -> CameraFile:
     return CameraFile(path, np.array([[GUESS, 0, 0.5], [0, GUESS, 0.5], [0, 0, 1]]), None, is_known=False)
 
 
+def forgotten(camera: CameraFile) -> CameraFile:
+    """Return a camera without what is known of its lens: K, distortion and model."""
+    blank = unknown_camera(camera.path)
+    kept = (camera.fps, camera.camera_height, camera.condition, camera.crop)
+    return CameraFile(blank.path, blank.K, None, (), blank.model, *kept, is_known=False)
+
+
 def read_camera(path: str | Path, *, may_be_unknown: bool = False) -> CameraFile:
     """Read a ``camera.yaml``, or ``FILE[:camera name]`` of another tool's calibration (docs/cameras.md)."""
     path, name = split_name(path)

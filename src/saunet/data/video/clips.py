@@ -19,7 +19,7 @@ from typing import overload
 
 import numpy as np
 
-from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera, unknown_camera
+from saunet.data.video.camera import FILE_NAME, CameraFile, forgotten, read_camera, unknown_camera
 from saunet.errors import DataError
 from saunet.io.atomic import partial_name, remove_partial_files, write_json
 from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, natural_order
@@ -86,13 +86,25 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
     if not paths:
         raise DataError(f"{root} holds neither folders of images nor videos; put each clip below it")
     base = root.parent if root.is_file() else root
-    given = None
-    if camera:
-        unknown = str(camera) == UNKNOWN and not Path(UNKNOWN).exists()
-        given = unknown_camera(Path(UNKNOWN)) if unknown else read_camera(camera, may_be_unknown=True)
+    unknown = str(camera) == UNKNOWN and not Path(UNKNOWN).exists()
+    given = read_camera(camera, may_be_unknown=True) if camera and not unknown else None
     known: dict[Path, CameraFile] = {}
+
+    def camera_of(path: Path) -> CameraFile:
+        found = given or _camera_of(path, base, known)
+        if unknown:  # what a file says beside K and the lens holds all the same
+            return forgotten(found) if found else unknown_camera(Path(UNKNOWN))
+        if found is None:
+            place = (base.parent if path == base else base) / FILE_NAME
+            raise DataError(
+                f"no {FILE_NAME} for {path}: put one beside it or at {place}, or set data.camera; saunet "
+                "calibrate makes one, and data.camera=unknown estimates the focal length from turns (see "
+                "docs/your_camera.md)"
+            )
+        return found
+
     names = [path.absolute().name if path == base else path.relative_to(base).as_posix() for path in paths]
-    return [Clip(name, path, given or _camera_of(path, base, known)) for name, path in zip(names, paths, strict=True)]
+    return [Clip(name, path, camera_of(path)) for name, path in zip(names, paths, strict=True)]
 
 
 class FramePaths(Sequence[Path]):
@@ -288,7 +300,8 @@ def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
         yield from _clip_paths(link, seen)
 
 
-def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraFile:
+def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraFile | None:
+    """Return the nearest camera file of a clip, or None without one."""
     folders = [path, *path.parents] if path.is_dir() else list(path.parents)
     highest = base.parent if path == base else base  # the root may be a clip itself, with the file beside it
     for folder in folders[: folders.index(highest) + 1]:
@@ -297,7 +310,4 @@ def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraF
             known[file] = read_camera(file, may_be_unknown=True)
         if file in known:
             return known[file]
-    raise DataError(
-        f"no {FILE_NAME} for {path}: put one beside it or at {highest / FILE_NAME}, or set data.camera; saunet "
-        "calibrate makes one, and data.camera=unknown estimates the focal length from turns (see docs/your_camera.md)"
-    )
+    return None
