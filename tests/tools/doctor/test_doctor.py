@@ -278,6 +278,8 @@ def test_reading_a_cache_is_measured_by_its_files_and_offered_where_there_is_one
         found.frames = [replace(frame, seconds=0.1) for frame in found.frames]
         text = "\n".join(map(str, diagnose(found)))
         assert "a core reads 10 images per second" in text
+        assert f"of {found.samples} samples needs {3 * found.samples} images" in text
+        assert found.samples == data.batch_size
         assert ("make a cache of small images once" in text) == offered
 
 

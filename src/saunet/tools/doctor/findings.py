@@ -339,7 +339,8 @@ def _speed(survey: Survey) -> Iterator[Finding]:
     yield Finding("note", text)
     if seconds > 0.05:
         cache = "make a cache of small images once (saunet prepare cache), " if survey.cacheable else ""
-        text = f"a core reads {1 / seconds:.0f} images per second; a training step of 12 samples needs 36"
+        step = f"a training step of {survey.samples} samples needs {survey.samples * survey.images} images"
+        text = f"a core reads {1 / seconds:.0f} images per second; {step}"
         yield Finding("warning", text, f"{cache}use more data.workers or a faster disk")
 
 

@@ -163,6 +163,10 @@ class Survey:
     """Names that different recordings share."""
     step: int = 1
     """Offset of the neighbor that motion is measured against."""
+    samples: int = 12
+    """In a training step, over all devices."""
+    images: int = 3
+    """In a sample: the target and its sources."""
     cacheable: bool = False
     """Whether the data module could read a cache of smaller images and does not."""
 
@@ -183,7 +187,11 @@ def survey(
     """Set a data module's splits up, and read ``frames`` frames at most (0: all) of all recordings, evenly spread."""
     cacheable = data.cacheable and data.copies is None
     found = Survey(
-        step=min((abs(offset) for offset in data.offsets), default=1), cacheable=cacheable, protocol=data.protocol
+        step=min((abs(offset) for offset in data.offsets), default=1),
+        samples=data.batch_size,
+        images=1 + len(data.offsets) + data.stereo,
+        cacheable=cacheable,
+        protocol=data.protocol,
     )
     datasets = dict(_set_up(data, splits, found))
     if "train" in datasets and "val" in datasets:
