@@ -13,7 +13,6 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from saunet.data.drive import Drive
-from saunet.data.loading.options import MOTIONS
 from saunet.errors import ConfigError, checked, one_of, positive, usable_device
 from saunet.evaluation.files import without_nan
 from saunet.evaluation.predictors import file_stem
@@ -30,6 +29,7 @@ from saunet.metrics.odometry import (
 )
 from saunet.prediction.odometer import Odometer, follow
 from saunet.registry import Spec
+from saunet.scale.options import MOTIONS
 from saunet.tables import Row, Table, columns, csv_text, show
 from saunet.tables.drawing import new_figure, save
 from saunet.weights.files import read_model

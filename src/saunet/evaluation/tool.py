@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from saunet.data.drive import Drive
 from saunet.data.loading.module import surroundings
-from saunet.data.loading.options import MOTIONS
 from saunet.data.loading.stored import cache_truths
 from saunet.data.loading.windows import measured_distance, recording_of, tracked_poses
 from saunet.errors import ConfigError, DataError, checked, one_of, usable_device
@@ -46,7 +45,7 @@ from saunet.prediction.prediction import load
 from saunet.registry import Spec
 from saunet.runs.record import Intrinsics, ModelRecord
 from saunet.scale.estimate import MetricDepth, MetricMotion, estimate_scale, keep_scale
-from saunet.scale.options import ScaleOptions
+from saunet.scale.options import MOTIONS, ScaleOptions
 from saunet.types import EvalBatch
 from saunet.weights.files import read_model
 from saunet.weights.locate import locate

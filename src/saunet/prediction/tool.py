@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from saunet.data.loading.options import MOTIONS
 from saunet.errors import ConfigError, DataError, checked, one_of, positive, usable_device
 from saunet.io.atomic import remove_partial_files
 from saunet.io.colormaps import COLORMAPS, RunningRange
@@ -25,7 +24,7 @@ from saunet.prediction.scaling import apply_scale
 from saunet.prediction.sinks import LAYOUTS, OUTPUTS, Sink, Style
 from saunet.prediction.sources import Frame, Input, Recording
 from saunet.registry import outputs as clip_outputs
-from saunet.scale.options import ScaleOptions
+from saunet.scale.options import MOTIONS, ScaleOptions
 from saunet.weights.locate import locate
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""How depth becomes meters: the options that evaluation and prediction share."""
+"""How depth becomes meters, and where motion comes from: the options that evaluation and prediction share."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ _USED_BY = {
     "partner": "stereo",
     "baseline": "stereo",
 }
+
+MOTIONS = ("auto", "tracked")
+"""Where the camera's motion comes from once a model is trained: a pose network if there is one, or tracked points."""
 
 
 @dataclass(frozen=True, kw_only=True)

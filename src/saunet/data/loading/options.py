@@ -11,9 +11,6 @@ from typing_extensions import TypedDict
 from saunet import schema
 from saunet.errors import ConfigError, in_range, one_of, positive
 
-MOTIONS = ("auto", "tracked")
-"""Where the camera's motion comes from once a model is trained: a pose network if there is one, or tracked points."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class LoadOptions:
