@@ -7,14 +7,14 @@ translation.
 
 from __future__ import annotations
 
-import io
-import os
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from saunet.io.atomic import replacing
 
 CANONICAL_FOCAL = 0.58
 """Focal length over image width of KITTI's color cameras."""
@@ -27,11 +27,8 @@ def save(path: Path, data: dict[str, Any]) -> None:
     """Write a scene's file whole or not at all."""
     sizes = np.array([len(x) for x in data["images"]])
     plain = {**data, "images": np.frombuffer(b"".join(data["images"]), np.uint8), "sizes": sizes}
-    buffer = io.BytesIO()
-    np.savez(buffer, **plain)
-    part = path.with_suffix(".part")
-    part.write_bytes(buffer.getvalue())
-    os.replace(part, path)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **plain)
 
 
 class Frames:

@@ -84,7 +84,7 @@ def forward(network: nn.Module, image: Tensor, finest: int) -> tuple[Tensor, ...
         level -= 1
         x = decoder.level(place, x, skips.get(level))
         if level < len(decoder.heads):
-            sigmoid = decoder.heads[level](x).float()
+            sigmoid = decoder.heads[level](x)
             depths.append(sigmoid_to_disparity(sigmoid, network.min_depth, network.max_depth).reciprocal())
     return tuple(reversed(depths))
 

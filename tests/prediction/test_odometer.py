@@ -164,3 +164,11 @@ def test_what_makes_no_path(tmp_path: Path):
     broken[1, 0, 3] = np.nan
     with pytest.raises(CheckpointError, match="not finite"):
         follow(Odometer(Oracle(broken, (1,)), 8, 16), NumberedDrive(3), progress=False)
+
+
+def test_every_clip_is_told_why_points_are_tracked():
+    """The odometer of another clip says what that of the first one said."""
+    for asked_for, why in ((True, "asked for with motion=tracked"), (False, "the model has no pose network")):
+        odometer = Odometer(TrackedPose(nn.Identity(), asked_for), 64, 96)
+        assert why in odometer.told
+        assert odometer.restart().told == odometer.told

@@ -61,8 +61,9 @@ def tool_help(tool: Tool, table: Table, values: Mapping[str, object], chosen: Ma
     if tool.aliases:
         lines += ["", "short forms:", *(f"  {short}=... is {key}=..." for short, key in tool.aliases.items())]
     for group, what in RECIPES.items() if tool.name == "train" else ():
-        width = max(len(name) for name, _ in recipes(group))
-        lines += ["", f"{group}=NAME, {what}:", *(f"  {name:{width}}  {told}" for name, told in recipes(group))]
+        found = list(recipes(group))
+        width = max(len(name) for name, _ in found)
+        lines += ["", f"{group}=NAME, {what}:", *(f"  {name:{width}}  {told}" for name, told in found)]
     lines += ["", "keys:", *described(_with_folder(node.keys, tool), "  ", values)]
     for group in groups(node):
         now = chosen.get(group)

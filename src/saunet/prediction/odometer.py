@@ -34,9 +34,10 @@ class TrackedPose(nn.Module):
 
     offsets = (1,)
 
-    def __init__(self, depth: nn.Module) -> None:
+    def __init__(self, depth: nn.Module, asked_for: bool = False) -> None:
         super().__init__()
         self.depth = depth
+        self.asked_for = asked_for  # though the model has a pose network
 
     def forward(
         self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b 1 3 h w"], K: Float[Tensor, "b 3 3"]
@@ -69,7 +70,6 @@ class Odometer:
         self.scale = scale
         self._pose, self._size, self._device = pose.to(device).eval(), (height, width), torch.device(device)
         self._batch_size = batch_size
-        self._asked_for = False  # to track points in the place of a pose network
         self._reach = max(abs(offset) for offset in self._offsets)
         self._stride = 2 if {-1, 1} <= set(self._offsets) else 1
         self._next = 1 if -1 in self._offsets else 0  # the first frame that has a neighbor on the side we look at
@@ -97,10 +97,8 @@ class Odometer:
         model = read_model(path)
         depth, pose = model.networks()
         size = model.record.height, model.record.width
-        followed = TrackedPose(depth) if pose is None or motion == "tracked" else pose
-        odometer = cls(followed, *size, scale or model.record.scale, device, batch_size)
-        odometer._asked_for = pose is not None
-        return odometer
+        followed = TrackedPose(depth, pose is not None) if pose is None or motion == "tracked" else pose
+        return cls(followed, *size, scale or model.record.scale, device, batch_size)
 
     def restart(self) -> Odometer:
         """Return an odometer with the same network that stands before the first frame of another clip."""
@@ -114,7 +112,8 @@ class Odometer:
     @property
     def told(self) -> str:
         """Where the motion comes from if `tracks`, in words."""
-        why = "asked for with motion=tracked" if self._asked_for else "the model has no pose network"
+        asked_for = isinstance(self._pose, TrackedPose) and self._pose.asked_for
+        why = "asked for with motion=tracked" if asked_for else "the model has no pose network"
         return f"from tracked points ({why}), with the length that the predicted depth gives it"
 
     def add(self, image: UInt8[np.ndarray, "h w 3"], K: Float[np.ndarray, "3 3"] | None = None) -> None:

@@ -17,7 +17,7 @@ from saunet.reporting.tables import Groups, explained_table, health_tables, loss
 from saunet.runs.folder import SUBJECTS, Run
 from saunet.runs.sweep import differing, settings, typed_names, values
 from saunet.tables import Column, Row, Table
-from saunet.weights.locate import BOX
+from saunet.weights.locate import is_shipped
 
 _OF_TRAINING = ("height", "width", "offsets", "batch_size", "workers", "crop_margin", "flip_prob", "color_jitter_prob")
 """Settings of the data that an evaluation takes from the checkpoint, or has no use for."""
@@ -152,7 +152,7 @@ def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
 
 def _remedy(first: Run, other: Run) -> str:
     """Say what to run so that two runs compare: both on the data of the first training, with results where we look."""
-    trained = [run for run in (first, other) if run.path.parent != BOX]
+    trained = [run for run in (first, other) if not is_shipped(run.path)]
     leading = next(iter(trained), first)
     data, choice = leading.config.get("data") or {}, leading.choices.get("data")
     if not choice or not all(run.path.is_dir() and run.checkpoint for run in (first, other)):
@@ -164,7 +164,7 @@ def _remedy(first: Run, other: Run) -> str:
         words.append("motion=tracked")  # which the training had: a young pose network would hide the depth
     commands = []
     for run in (first, other):  # what a shipped model scored is kept with the training that it is compared with
-        known = run.path.parent == BOX
+        known = is_shipped(run.path)
         place = run.name if known else _typed(run.path)
         folder = f"{_typed(leading.path)}/compared_{run.name}" if known else f"{place}/compared"
         commands.append(shlex.join(["saunet", "evaluate", place, f"data={choice}", *words, f"output_dir={folder}"]))

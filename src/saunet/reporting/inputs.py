@@ -26,7 +26,7 @@ from saunet.runs.folder import (
     split_overrides,
 )
 from saunet.runs.sweep import read_plan
-from saunet.weights.locate import BOX, locate, shipped
+from saunet.weights.locate import is_shipped, locate, shipped
 
 _KEPT = {"lr": "initial_lr", "weight_decay": "weight_decay"}
 """Settings of a recipe that live on in an optimizer's state, and what they are called there."""
@@ -213,7 +213,7 @@ class Evaluation:
     @property
     def shipped(self) -> bool:
         """Whether it is of a model that comes with saunet, wherever its results are."""
-        return self.checkpoint is not None and self.checkpoint.parent == BOX
+        return self.checkpoint is not None and is_shipped(self.checkpoint)
 
     @property
     def name(self) -> str:

@@ -13,7 +13,7 @@ from saunet.reporting.page import Missing
 from saunet.runs.folder import Detail, Explained, Run, Score
 from saunet.runs.sweep import RATIO, differing, ratio, values
 from saunet.tables import Cell, Column, Row, Table, columns
-from saunet.weights.locate import BOX
+from saunet.weights.locate import is_shipped
 
 _SHOWN = (ABS_REL, RMSE, A1)
 """The errors that a table of runs shows."""
@@ -235,7 +235,7 @@ def networks(run: Run) -> str:
 
 def status(run: Run) -> str:
     """Return how a run ended in one word, or ``shipped`` for a model that comes with saunet."""
-    return "shipped" if run.path.parent == BOX else run.status
+    return "shipped" if is_shipped(run.path) else run.status
 
 
 def with_pose(run: Run) -> str:

@@ -63,7 +63,7 @@ CALLBACKS: Mapping[str, tuple[str, dict[str, str]]] = {
 """The usual callbacks by name, with the folders that they are given, below the run's own."""
 LOGGERS = {"csv": "CSVLogger", "tensorboard": "TensorBoardLogger"}
 POINTS = 20
-"""Rows of the curves that a short training has at least, where nobody has said how often it logs."""
+"""A short training logs at least this many rows of its curves, unless it was told how often to log."""
 DRAWN_FROM = 10
 """Steps of a training from which its curves are worth a picture."""
 _TRUSTED = ("lightning.", "torch.", "saunet.")

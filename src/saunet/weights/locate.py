@@ -27,6 +27,11 @@ def shipped() -> list[str]:
     return sorted(path.parent.name for path in BOX.glob(f"*/{CONFIG}"))
 
 
+def is_shipped(path: Path) -> bool:
+    """Return whether a path is the folder of a model that comes with saunet."""
+    return path.parent == BOX
+
+
 def locate(source: str | Path) -> Path:
     """Return the local path of a model, fetched from the hub where ``source`` is a hub id.
 
