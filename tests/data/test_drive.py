@@ -49,6 +49,12 @@ def test_a_forgotten_member_is_an_error_at_once(missing):
         type("Broken", (Drive,), members)()
 
 
+@pytest.mark.parametrize("attribute", ["protocol", "ground_truth"])
+def test_how_to_evaluate_is_refused_in_a_drive_where_nothing_reads_it(attribute):
+    with pytest.raises(TypeError, match=rf"Mine has the attribute '{attribute}'.* DepthDataModule; move it there"):
+        type("Mine", (Bare,), {attribute: "none"})
+
+
 def test_what_follows_from_what_is_known():
     class Timed(NumberDrive):
         def time(self, index):

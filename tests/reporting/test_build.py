@@ -230,6 +230,20 @@ def test_two_runs_are_compared_image_by_image(tmp_path: Path) -> None:
     assert re.search(r"Abs Rel ↓\s+0\.2750\s+0\.3250\s+\+0\.0500\s+\+0\.0500\s+\+0\.0500\s+0%\s+–", text)
 
 
+def test_up_to_four_runs_are_compared_each_with_each_and_more_with_the_first(tmp_path: Path) -> None:
+    names = "abcde"
+    runs = [make_run(tmp_path / name, beta=0.1 + 0.1 * place) for place, name in enumerate(names)]
+    for folder in runs[:4]:
+        make_evaluation(folder / "test", "x", 0.25)
+    pairs = re.findall(r"second '(\w)' against first '(\w)'", _compared(*runs[:3]))
+    assert pairs == [("b", "a"), ("c", "a"), ("c", "b")]
+    text = _compared(*runs[:3], runs[4])
+    assert text.count("not evaluated") == 1  # with the first alone
+    assert len(re.findall(r"against first '[abc]'", text)) == 3
+    pairs = re.findall(r"second '(\w)' against first '(\w)'", _compared(*runs))
+    assert pairs == [("b", "a"), ("c", "a"), ("d", "a")]
+
+
 def test_what_cannot_be_paired_is_said(tmp_path: Path) -> None:
     runs = [make_run(tmp_path / name, beta=beta) for name, beta in (("a", 0.1), ("b", 0.2), ("c", 0.3))]
     make_evaluation(runs[0] / "test", "x")

@@ -31,6 +31,15 @@ class Drive(ABC):
         (True, 3)
     """
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for attribute in ("protocol", "ground_truth"):
+            if attribute in vars(cls):
+                raise TypeError(
+                    f"{cls.__name__} has the attribute '{attribute}', which nothing reads in a Drive: how a data set "
+                    "is evaluated is an attribute of its DepthDataModule; move it there"
+                )
+
     @property
     @abstractmethod
     def name(self) -> str:

@@ -19,6 +19,8 @@ from saunet.runs.sweep import differing, settings, typed_names, values
 from saunet.tables import Column, Row, Table
 from saunet.weights.locate import is_shipped
 
+_EACH_PAIR = 4
+"""Runs up to which each is compared with each; of more, each with the first."""
 _OF_TRAINING = ("height", "width", "offsets", "batch_size", "workers", "crop_margin", "flip_prob", "color_jitter_prob")
 """Settings of the data that an evaluation takes from the checkpoint, or has no use for."""
 
@@ -65,34 +67,39 @@ class Scored:
 
 
 def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
-    """Compare each run with the first one, image by image, wherever both were evaluated alike.
+    """Compare runs in pairs, image by image, wherever both were evaluated alike.
 
-    Among all evaluations of two runs under a protocol, those of the same images and settings are paired.
+    Up to four runs, each is compared with each; of more, each with the first. Among all evaluations of two runs under a
+    protocol, those of the same images and settings are paired.
     """
     names = list(runs)
     found = {name: _scored(run) for name, run in runs.items()}
     tables, left_out = [], []
-    for other in names[1:]:
-        both = [protocol for protocol in found[names[0]] if protocol in found[other]]
+    for first, other in itertools.combinations(names, 2):
+        if first != names[0] and len(names) > _EACH_PAIR:
+            break
+        both = [protocol for protocol in found[first] if protocol in found[other]]
         if not both:
-            without = [name for name in (names[0], other) if not found[name]]
+            without = [name for name in (first, other) if not found[name]]
+            if without and first != names[0]:
+                continue  # said with the first one already
             why = f"{' and '.join(without)} not evaluated" if without else "not evaluated under one protocol"
-            said = f"the scores of {names[0]} and {other} are not compared ({why}); "
-            left_out.append(said + _remedy(runs[names[0]], runs[other]))
+            said = f"the scores of {first} and {other} are not compared ({why}); "
+            left_out.append(said + _remedy(runs[first], runs[other]))
         for protocol in both:
-            ours, theirs = found[names[0]][protocol], found[other][protocol]
+            ours, theirs = found[first][protocol], found[other][protocol]
             pairs = [(one, two) for one, two in itertools.product(ours, theirs) if one.pairs(two)]
             alike = [(one, two) for one, two in pairs if one.of.motion == two.of.motion]
             try:
                 for one, two in alike or pairs:
-                    comparison = paired(one.rows, two.rows, names=(names[0], other))
-                    sizes = _sizes(runs[names[0]], runs[other], one)
+                    comparison = paired(one.rows, two.rows, names=(first, other))
+                    sizes = _sizes(runs[first], runs[other], one)
                     tables.append(comparison.table(_told(one.of, two.of), *_motions(one.of, two.of), *sizes))
                 if not pairs:
-                    why = f"{_apart(ours, theirs)}; {_remedy(runs[names[0]], runs[other])}"
-                    left_out.append(f"{names[0]} and {other} under {protocol}: {why}")
+                    why = f"{_apart(ours, theirs)}; {_remedy(runs[first], runs[other])}"
+                    left_out.append(f"{first} and {other} under {protocol}: {why}")
             except DataError as reason:
-                left_out.append(f"{names[0]} and {other} under {protocol}: {reason}")
+                left_out.append(f"{first} and {other} under {protocol}: {reason}")
     return tables, left_out
 
 
