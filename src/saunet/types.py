@@ -34,10 +34,10 @@ class _Sample(TypedDict):
     track_points: NotRequired[Float[Tensor, "b n p 3"]]
     """Column and row in the target of some of those points, and their depth in lengths of the way; NaN if none."""
     T_stereo_tgt: NotRequired[Float[Tensor, "b 4 4"]]
-    """Where the stereo partner is, from the calibration: a target point times it is a partner's point, in meters.
-    Where it is given, the partner's image is the last source."""
+    """Where the stereo view is, from the calibration: a target point times it is a point of that view, in meters.
+    Where it is given, its image is the last source."""
     distance: NotRequired[Float[Tensor, "b s"]]
-    """Meters the camera traveled between the target and each source; NaN where unknown and for the stereo partner."""
+    """Meters the camera traveled between the target and each source; NaN where unknown and for the stereo view."""
 
 
 class _Truth(TypedDict):
@@ -52,7 +52,7 @@ class FrameBatch(_Sample, _Truth):
 
     frames: UInt8[Tensor, "b 1+s 3 h w"]
     """RGB frames; index 0 is the target, then the sources in the order of the data module's ``offsets``, and last the
-    stereo partner, if ``T_stereo_tgt`` says that there is one."""
+    stereo view, if ``T_stereo_tgt`` says that there is one."""
     draws: NotRequired[Float[Tensor, "b n"]]
     """Uniform random numbers in [0, 1) that augmentation uses; training samples only."""
 
@@ -60,7 +60,7 @@ class FrameBatch(_Sample, _Truth):
 class TrainBatch(_Sample):
     """One training step's input, on the device, augmented; images are RGB in [0, 1].
 
-    All else follows their resize, crop and flip, which puts the stereo partner on the other side.
+    All else follows their resize, crop and flip, which puts the stereo view on the other side.
     """
 
     target: Float[Tensor, "b 3 h w"]

@@ -106,14 +106,14 @@ def test_the_height_in_a_camera_file_counts_unless_another_is_given(recording: P
     ("scale", "tolerance"),
     [
         ({"method": "camera_height", "camera_height": 1.65}, 0.03),
-        ({"method": "stereo", "partner": "right", "baseline": 0.54}, 0.08),
+        ({"method": "stereo", "stereo": "right", "baseline": 0.54}, 0.08),
     ],
 )
 def test_predict_finds_the_unknown_factor(
     recording: Path, street: SyntheticDrive, scale: dict[str, Any], tolerance: float, capsys: Any
 ) -> None:
-    if "partner" in scale:
-        scale = {**scale, "partner": str(recording / scale["partner"])}
+    if "stereo" in scale:
+        scale = {**scale, "stereo": str(recording / scale["stereo"])}
     predictor = TrueDepth(street)
     measure(recording, street, predictor, **scale)
     assert predictor.scale is not None
@@ -137,7 +137,7 @@ def test_predict_finds_the_unknown_factor(
     [
         ({"method": "hight"}, r"scale.method is 'hight'.*allowed: auto, none, stored, camera_height, speed, stereo"),
         ({"method": "camera_height"}, r"needs scale.camera_height"),
-        ({"method": "stereo"}, r"scale.method=stereo needs scale.partner: the other camera's images"),
+        ({"method": "stereo"}, r"scale.method=stereo needs scale.stereo: the other camera's images"),
         ({"method": "stored"}, r"the checkpoint stores no scale; measure one"),
         ({"method": "auto", "store": True}, r"scale.store=true stores what is measured and scale.method is 'auto'"),
         ({"method": "none", "frames": 0}, r"scale.frames is 0"),

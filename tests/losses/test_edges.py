@@ -75,7 +75,7 @@ def test_constant_images_and_zero_motion_together_teach_nothing(
 
 
 @pytest.mark.parametrize("key", ["distance", "T_src_tgt"])
-def test_velocity_leaves_a_stereo_partner_out(key: str, make_inputs: Make) -> None:
+def test_velocity_leaves_a_stereo_view_out(key: str, make_inputs: Make) -> None:
     inputs, distance = make_inputs(sources=3), torch.rand(2, 3)
     way = torch.stack([torch.zeros_like(distance), torch.zeros_like(distance), distance], -1)
     given = {"distance": distance, "T_src_tgt": pose_matrix(torch.zeros(2, 3, 3), way)}[key]
@@ -88,7 +88,7 @@ def test_velocity_leaves_a_stereo_partner_out(key: str, make_inputs: Make) -> No
 def test_velocity_of_stereo_alone_is_one_sentence(make_inputs: Make) -> None:
     inputs = make_inputs(sources=1)
     batch: Any = {"T_stereo_tgt": torch.eye(4).expand(2, 4, 4), "distance": torch.full((2, 1), torch.nan)}
-    with pytest.raises(ConfigError, match="the stereo partner is the only source; drop the term"):
+    with pytest.raises(ConfigError, match="the stereo view is the only source; drop the term"):
         Velocity()(batch, EMPTY, inputs.poses, ())
 
 
@@ -97,7 +97,7 @@ def test_velocity_of_stereo_alone_is_one_sentence(make_inputs: Make) -> None:
 
 @pytest.fixture(scope="module")
 def street() -> Any:
-    """A street with its true depth and motion: the neighbors in time and the stereo partner as sources."""
+    """A street with its true depth and motion: the neighbors in time and the stereo view as sources."""
     drive = SyntheticDrive(seed=21, frames=3, height=64, width=192)
     data = WindowDataset(
         [drive],
@@ -150,7 +150,7 @@ def test_loss_is_minimal_at_true_motion(street: Any, source: int) -> None:
                 assert loss(street, depth, nudge @ poses, chosen) > truth, (axis, sign, nudge)
 
 
-def test_only_the_stereo_partner_knows_meters(street: Any) -> None:
+def test_only_the_stereo_view_knows_meters(street: Any) -> None:
     depth, poses = street["depth"], street["T_src_tgt"]
     for factor in (0.8, 1.25):
         scaled = poses.clone()

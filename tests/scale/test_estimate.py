@@ -110,13 +110,13 @@ def test_few_frames_of_a_long_clip_are_evenly_spread() -> None:
 
 
 def test_pairs_of_a_stereo_clip() -> None:
-    batches = list(clip_batches(frames(2), 3, 4, partner=[f + 100 for f in frames(2)], baseline=0.5))
+    batches = list(clip_batches(frames(2), 3, 4, stereo=[f + 100 for f in frames(2)], baseline=0.5))
     assert round(255 * float(batches[1]["sources"].mean())) == 101
     assert batches[1]["T_stereo_tgt"][0, 0, 3] == -0.5
     with pytest.raises(DataError, match="different numbers of images \\(one ends after 2\\)"):
-        list(clip_batches(frames(2), 3, 4, partner=frames(3)))
+        list(clip_batches(frames(2), 3, 4, stereo=frames(3)))
     with pytest.raises(DataError, match="different numbers of images"):
-        list(clip_batches(frames(3), 3, 4, partner=frames(2)))
+        list(clip_batches(frames(3), 3, 4, stereo=frames(2)))
 
 
 # --- speeds ----------------------------------------------------------------------------------------------------------

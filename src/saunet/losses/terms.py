@@ -267,7 +267,7 @@ class Velocity(Term):
     """Difference between predicted and true distance traveled, | ||t|| - speed * dt |, in meters (PackNet).
 
     The distance comes from ``batch["distance"]`` (NaN where unknown) or, where that is missing, from the true motion
-    ``batch["T_src_tgt"]``. It makes depth metric; PackNet's weight is 0.1. A stereo partner, whose motion is known,
+    ``batch["T_src_tgt"]``. It makes depth metric; PackNet's weight is 0.1. A stereo view, whose motion is known,
     does not count.
     """
 
@@ -277,7 +277,7 @@ class Velocity(Term):
         predictions = poses.shape[1] - ("T_stereo_tgt" in batch)
         if predictions == 0:
             raise ConfigError(
-                "the velocity term compares predicted motion and the stereo partner is the only source; "
+                "the velocity term compares predicted motion and the stereo view is the only source; "
                 "drop the term, or set data.offsets=[-1,1]"
             )
         if "distance" not in batch and "T_src_tgt" in batch:

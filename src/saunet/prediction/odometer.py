@@ -135,7 +135,7 @@ class Odometer:
         for center in range(self._next, last + (1 not in self._offsets), self._stride):
             self._ask_at(center)
         self._answer()
-        if last - 1 not in self._motions:  # both neighbors are asked for in pairs; this motion has no partner
+        if last - 1 not in self._motions:  # both neighbors are asked for in pairs; this motion has no pair
             self._ask_at(last - 1)
             self._answer()
         motions = np.stack([self._motions[index] for index in range(last)])

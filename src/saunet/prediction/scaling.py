@@ -108,10 +108,10 @@ def _batches(
             fps = options.fps or recording.fps
             more["distance"] = functools.partial(table.distance, "", fps=fps, times=clock)
         if method == "stereo":
-            partner = _needed(method, "scale.partner", options.partner, "the other camera's images")
+            images = _needed(method, "scale.stereo", options.stereo, "the other camera's images")
             baseline = _needed(method, "scale.baseline", options.baseline, "meters to the right camera")
-            other = stack.enter_context(contextlib.closing(Recording(partner)))
-            more |= {"partner": (frame.read() for frame in other), "baseline": baseline}
+            other = stack.enter_context(contextlib.closing(Recording(images)))
+            more |= {"stereo": (frame.read() for frame in other), "baseline": baseline}
         yield clip_batches(pictures(), *size, offsets=offsets, most=options.frames, count=recording.declared, **more)
 
 

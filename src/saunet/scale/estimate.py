@@ -126,7 +126,7 @@ def estimate_scale(
 
     Args:
         method: ``camera_height`` needs the images' true intrinsics; ``speed`` needs sources and ``distance``;
-            ``stereo`` needs the partner as the last source and ``T_stereo_tgt``.
+            ``stereo`` needs the other view as the last source and ``T_stereo_tgt``.
         batches: The frames.
         depth: The depth network.
         motion: The pose network, for ``speed``.
@@ -202,7 +202,7 @@ def speed_factors(T_src_tgt: Float[Tensor, "b s 4 4"], distance: Float[Tensor, "
 def stereo_factors(
     depth: Float[Tensor, "b 1 h w"],
     image: Float[Tensor, "b 3 h w"],
-    partner: Float[Tensor, "b 3 h w"],
+    other: Float[Tensor, "b 3 h w"],
     K: Float[Tensor, "b 3 3"],
     T_stereo_tgt: Float[Tensor, "b 4 4"],
 ) -> Float[Tensor, " b"]:
@@ -210,7 +210,7 @@ def stereo_factors(
     factors = []
     for i in range(len(depth)):
         across = float(T_stereo_tgt[i, 0, 3])
-        disparity = _match(_gray(image[i]), _gray(partner[i]), partner_is_left=across > 0)
+        disparity = _match(_gray(image[i]), _gray(other[i]), other_is_left=across > 0)
         found = disparity >= _MIN_DISPARITY
         predicted = depth[i, 0].detach().double().cpu().numpy()
         ratios = (float(K[i, 0, 0]) * abs(across) / disparity[found]) / predicted[found]
@@ -218,16 +218,16 @@ def stereo_factors(
     return depth.new_tensor(factors)
 
 
-def _match(image: NDArray[np.uint8], partner: NDArray[np.uint8], partner_is_left: bool) -> NDArray[np.float64]:
+def _match(image: NDArray[np.uint8], other: NDArray[np.uint8], other_is_left: bool) -> NDArray[np.float64]:
     """Return the disparity of ``image`` by semi-global matching, pixels, 0 or less where unknown."""
-    if partner_is_left:  # matching goes from the left image to the right one
-        return _match(image[:, ::-1], partner[:, ::-1], False)[:, ::-1]
+    if other_is_left:  # matching goes from the left image to the right one
+        return _match(image[:, ::-1], other[:, ::-1], False)[:, ::-1]
     block = 3 if image.shape[1] < 400 else 5
     count = 16 * max(1, round(_LARGEST_DISPARITY * image.shape[1] / 16))
     smoothness = {"P1": 8 * block**2, "P2": 32 * block**2}
     checks = {"disp12MaxDiff": 1, "uniquenessRatio": 10, "speckleWindowSize": 50, "speckleRange": 2}
     matcher = cv2.StereoSGBM.create(0, count, block, mode=cv2.STEREO_SGBM_MODE_HH, **smoothness, **checks)
-    disparity = matcher.compute(np.ascontiguousarray(image), np.ascontiguousarray(partner))
+    disparity = matcher.compute(np.ascontiguousarray(image), np.ascontiguousarray(other))
     return np.asarray(disparity, np.float64) / 16
 
 

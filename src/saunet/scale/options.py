@@ -18,7 +18,7 @@ _USED_BY = {
     "camera_height": "camera_height",
     "speeds": "speed",
     "align": "speed",
-    "partner": "stereo",
+    "stereo": "stereo",
     "baseline": "stereo",
 }
 
@@ -37,7 +37,7 @@ class ScaleOptions:
         speeds: A CSV file with the columns ``time`` or ``frame``, ``speed`` and, of several drives, ``drive``.
         align: Find the clock of the speeds by the predicted motion, if it is not that of the frames.
         fps: Frames per second of the speeds.
-        partner: Images of the other camera of a stereo pair.
+        stereo: Images of the other camera of a stereo pair.
         baseline: Meters to the other camera.
         frames: Of more frames, only so many are measured, evenly spread.
         store: Write the measured factor into the checkpoint.
@@ -51,7 +51,7 @@ class ScaleOptions:
     speeds: str | None = None
     align: bool = False
     fps: float | None = None
-    partner: str | None = None
+    stereo: str | None = None
     baseline: float | None = None
     frames: int = 100
     store: bool = False

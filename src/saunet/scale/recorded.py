@@ -26,24 +26,24 @@ def clip_batches(
     offsets: Sequence[int] = (),
     distance: Callable[[int, int], float] | None = None,
     intrinsics: Callable[[int, int], NDArray[np.float64]] | None = None,
-    partner: Iterable[Image] | None = None,
+    stereo: Iterable[Image] | None = None,
     baseline: float = 0.0,
     count: int | None = None,
     most: int = 100,
 ) -> Iterator[TrainBatch]:
-    """Yield frames of a clip one by one as a network wants them, with neighbors, intrinsics and partner as asked for.
+    """Yield frames of a clip one by one as a network wants them, with neighbors, K and other view if asked for.
 
     ``distance`` gives meters between two frames by their numbers (NaN if unknown), ``intrinsics`` K of an image of a
-    (height, width), and ``baseline`` is the meters to the partner, positive if that is the right camera. Of more frames
-    than ``most``, only so many are used, evenly spread if ``count`` is known.
+    (height, width), and ``baseline`` is the meters to the other camera, positive if that is the right one. Of more
+    frames than ``most``, only so many are used, evenly spread if ``count`` is known.
     """
     before, after = -min(0, *offsets, 0), max(0, *offsets, 0)
     step = max(1, (count - before - after) // most) if count else 1
     window: deque[NDArray[np.float32]] = deque(maxlen=before + 1 + after)
     others: deque[Image | None] = deque(maxlen=after + 1)
     yielded = 0
-    for number, (frame, other) in enumerate(itertools.zip_longest(frames, () if partner is None else partner)):
-        if frame is None or (partner is not None and other is None):
+    for number, (frame, other) in enumerate(itertools.zip_longest(frames, () if stereo is None else stereo)):
+        if frame is None or (stereo is not None and other is None):
             raise DataError(
                 f"the two cameras have different numbers of images (one ends after {number}); give pairs of one moment"
             )

@@ -40,7 +40,7 @@ class SelfSupervisedDepth(LightningModule):
 
     Args:
         depth: Image -> `DepthPyramid`.
-        pose: (target, sources) -> ``T_src_tgt`` of the neighbors in time; None where the stereo partner is the only
+        pose: (target, sources) -> ``T_src_tgt`` of the neighbors in time; None where the stereo view is the only
             source.
         objective: (batch, pyramid, poses, views) -> `LossTerms`.
         recipe: Optimizer and schedule.
@@ -139,7 +139,7 @@ class SelfSupervisedDepth(LightningModule):
         return pyramid, poses, views, terms
 
     def motion(self, batch: TrainBatch) -> Float[Tensor, "b s 4 4"]:
-        """Return T_src_tgt of each source: predicted for neighbors in time, known for a stereo partner, the last."""
+        """Return T_src_tgt of each source: predicted for neighbors in time, known for a stereo view, the last."""
         sources = batch["sources"]
         known = [batch["T_stereo_tgt"][:, None]] if "T_stereo_tgt" in batch else []
         if known and sources.shape[1] == 1:
@@ -147,7 +147,7 @@ class SelfSupervisedDepth(LightningModule):
         if self.pose is None:
             raise ConfigError(
                 "the model has no pose network and the batch has neighbors in time; build one, or use data with a "
-                "stereo partner only"
+                "stereo view only"
             )
         predicted: Tensor = self.pose(batch["target"], sources[:, : sources.shape[1] - len(known)])
         return torch.cat([predicted, *known], 1) if known else predicted

@@ -116,7 +116,7 @@ def test_a_broken_frame_of_a_clip_stops_or_is_skipped(clips, tmp_path):
     assert (report.made, len(report.failures)) == (23, 1)
 
 
-def test_odometry_sequences_with_their_partners(sequences, tmp_path):
+def test_odometry_sequences_with_both_cameras(sequences, tmp_path):
     recordings = module_recordings(odometry(sequences, stereo=True))
     assert [drive.name for drive, _ in recordings] == ["odometry/00 l", "odometry/00 r"]
     build_cache(recordings, tmp_path / "small", CacheSettings(10, 30))

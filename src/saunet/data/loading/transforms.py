@@ -112,7 +112,7 @@ class Augment(nn.Module):
             points = batch["track_points"] - torch.stack([left, top, torch.zeros_like(top)], -1)[:, None, None]
             mirror = points.new_tensor([self.width - 1, 0, 0]) + points * points.new_tensor([-1, 1, 1])
             out["track_points"] = torch.where(mirrored[:, None, None, None], mirror, points)
-        if "T_stereo_tgt" in batch:  # the partner of a mirrored image is on the other side
+        if "T_stereo_tgt" in batch:  # the other view of a mirrored image is on the other side
             out["T_stereo_tgt"] = flip_motion(batch["T_stereo_tgt"][:, None], mirrored)[:, 0]
         if "distance" in batch:
             out["distance"] = batch["distance"]
