@@ -6,13 +6,13 @@ import contextlib
 import functools
 import hashlib
 import os
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
+from lightning.pytorch.utilities import rank_zero_warn
 from numpy import ndarray
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -268,13 +268,17 @@ def those_present(paths: Sequence[Path], there: Listing, what: str, fix: str) ->
     Raises:
         DataError: if none of them exists.
     """
-    missing = [path for path in paths if path not in there]
-    if missing:
-        message = f"{len(missing)} of {len(paths)} {what} are missing, such as {missing[0]}; {fix}"
-        if len(missing) == len(paths):
-            raise DataError(message)
-        warnings.warn(message, stacklevel=3)
+    report_missing([path for path in paths if path not in there], len(paths), what, fix)
     return [path for path in paths if path in there]
+
+
+def report_missing(missing: Sequence[Any], wanted: int, what: str, fix: str) -> None:
+    """Warn that some are missing, with their count and the first; raise if all are."""
+    if missing:
+        told = f"{len(missing)} of {wanted} {what} are missing, the first {missing[0]}; {fix}"
+        if len(missing) == wanted:
+            raise DataError(told)
+        rank_zero_warn(told)
 
 
 def associate(first: Float[ndarray, " n"], second: Float[ndarray, " m"], most: float) -> list[tuple[int, int]]:

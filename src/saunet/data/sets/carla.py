@@ -13,14 +13,8 @@ from typing_extensions import Unpack
 
 from saunet.data.checks import common_size
 from saunet.data.loading.options import Loading
-from saunet.data.sets.files import (
-    DepthFilesDrive,
-    RecordingsDataModule,
-    numbered,
-    read_rows,
-    read_words,
-    report_missing,
-)
+from saunet.data.sets.base import report_missing
+from saunet.data.sets.files import DepthFilesDrive, RecordingsDataModule, numbered, read_rows, read_words
 from saunet.errors import DataError, positive
 from saunet.io.images import read_unchanged
 from saunet.registry import datamodules

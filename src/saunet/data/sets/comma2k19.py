@@ -12,8 +12,8 @@ from typing_extensions import Unpack
 from saunet.data.drive import Drive
 from saunet.data.loading.options import Loading
 from saunet.data.loading.windows import measured_distance
-from saunet.data.sets.base import FilesDrive, transform
-from saunet.data.sets.files import RecordingsDataModule, report_missing
+from saunet.data.sets.base import FilesDrive, report_missing, transform
+from saunet.data.sets.files import RecordingsDataModule
 from saunet.data.video.camera import CameraFile
 from saunet.data.video.clips import Clip, default_cache, read_clip
 from saunet.errors import DataError, positive

@@ -8,10 +8,8 @@ import re
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from lightning.pytorch.utilities import rank_zero_warn
 from numpy.typing import NDArray
 
 from saunet.data.drive import Drive
@@ -29,13 +27,13 @@ class DepthFilesDrive(FilesDrive):
 
     Attributes:
         depths: Frame number -> file of its depth map.
-        partner: The other camera, if there is one.
-        T_partner_cam: This camera's pose in the other's frame, 4 x 4, meters.
+        other: The other camera, if there is one.
+        T_other_cam: This camera's pose in the other's frame, 4 x 4, meters.
     """
 
     depths: Mapping[int, Path] = {}
-    partner: DepthFilesDrive | None = None
-    T_partner_cam: Array | None = None
+    other: DepthFilesDrive | None = None
+    T_other_cam: Array | None = None
 
     @staticmethod
     @abstractmethod
@@ -49,18 +47,18 @@ class DepthFilesDrive(FilesDrive):
         return self.read(self.depths[index]) if index in self.depths else None
 
     def stereo(self) -> DepthFilesDrive | None:
-        return self.partner
+        return self.other
 
     @property
     def T_stereo_cam(self) -> Array | None:  # noqa: N802 (frames in names)
-        return self.T_partner_cam
+        return self.T_other_cam
 
 
 def pair_up(left: DepthFilesDrive, right: DepthFilesDrive, T_right_left: Array) -> None:
     """Make two recordings the two sides of a pair."""
-    left.partner, right.partner = right, left
+    left.other, right.other = right, left
     T_left_right: Array = np.asarray(np.linalg.inv(T_right_left), np.float64)
-    left.T_partner_cam, right.T_partner_cam = T_right_left, T_left_right
+    left.T_other_cam, right.T_other_cam = T_right_left, T_left_right
 
 
 class RecordingsDataModule(FilesDataModule):
@@ -156,12 +154,3 @@ def read_words(path: Path, fix: str = "copy it again") -> list[tuple[int, list[s
         for number, line in enumerate(lines, 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
-
-
-def report_missing(missing: Sequence[Any], wanted: int, what: str, fix: str) -> None:
-    """Warn that some are missing, with their count and the first; raise if all are."""
-    if missing:
-        told = f"{len(missing)} of {wanted} {what} are missing, the first {missing[0]}; {fix}"
-        if len(missing) == wanted:
-            raise DataError(told)
-        rank_zero_warn(told)

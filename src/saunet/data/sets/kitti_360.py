@@ -18,7 +18,8 @@ from saunet.data.kitti.files import read_matrices, read_timestamps
 from saunet.data.kitti.raw import frame_files
 from saunet.data.lidar import read_scan
 from saunet.data.loading.options import Loading
-from saunet.data.sets.base import FilesDataModule, Listing, ScannedDrive, chosen, find_root, reading, those_present
+from saunet.data.sets.base import FilesDataModule, Listing, ScannedDrive, chosen, find_root, those_present
+from saunet.data.sets.files import read_rows
 from saunet.data.video.camera import Lens, read_camera
 from saunet.errors import DataError
 from saunet.io.images import read_image
@@ -28,6 +29,8 @@ CAMERAS = {"perspective_left": 0, "perspective_right": 1, "fisheye_left": 2, "fi
 """Camera -> its number on disk."""
 TRAIN, VAL, TEST = ("0000", "0002", "0003", "0004", "0005", "0007", "0010"), ("0006",), ("0009",)
 """The sequences with poses as SSCBench divides them."""
+_MOTION = tuple(f"T[{row},{column}]" for row in range(3) for column in range(4))
+"""What the numbers of a line are: the upper rows of a rigid motion."""
 
 Array = NDArray[np.float64]
 
@@ -49,12 +52,12 @@ class Kitti360Drive(ScannedDrive):
             K, size = read[P][:, :3], (int(read[S][1]), int(read[S][0]))
             self.shift = np.linalg.solve(K, read[P][:, 3])  # of rectified camera 0 in this one
             self.T_car_cam[:3, :3] = self.T_car_cam[:3, :3] @ read[R].T
-        T_velo_cam0 = _rigid(_table(home / "calib_cam_to_velo.txt", 12).reshape(3, 4))
+        T_velo_cam0 = _rigid(read_rows(home / "calib_cam_to_velo.txt", _MOTION).reshape(3, 4))
         T_car_velo = _rigid(cam_to_car["image_00"]) @ np.linalg.inv(T_velo_cam0)
         # Scans and images of one number belong to one moment, so that depth needs no pose.
         self._T: Array = np.asarray(np.linalg.inv(self.T_car_cam) @ T_car_velo, np.float64)
         poses, times = root / "data_poses" / sequence / "poses.txt", read_timestamps(images / "timestamps.txt")
-        rows = _table(poses, 13) if poses.is_file() else np.empty((0, 13))
+        rows = read_rows(poses, ("frame", *_MOTION)) if poses.is_file() else np.empty((0, 13))
         folder = images / ("data_rgb" if fisheye else "data_rect")
         files, scans = frame_files(folder), root / "data_3d_raw" / sequence / "velodyne_points" / "data"
         super().__init__(
@@ -174,11 +177,3 @@ def _rigid(matrix: Array) -> Array:
     T = np.eye(4)
     T[:3] = matrix
     return T
-
-
-def _table(path: Path, columns: int) -> Array:
-    with reading(path, f"a table of {columns} numbers a line"):
-        rows: Array = np.loadtxt(path, ndmin=2)
-        if rows.shape[1] != columns or not np.isfinite(rows).all():
-            raise ValueError(f"lines of {rows.shape[1]} numbers")
-    return rows

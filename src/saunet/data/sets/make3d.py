@@ -16,8 +16,8 @@ from typing_extensions import Unpack
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
 from saunet.data.loading.windows import Selection
-from saunet.data.sets.base import find_root
-from saunet.data.sets.files import DepthFilesDrive, report_missing
+from saunet.data.sets.base import find_root, report_missing
+from saunet.data.sets.files import DepthFilesDrive
 from saunet.errors import ConfigError, DataError
 from saunet.geometry.camera import crop_intrinsics
 from saunet.io.images import natural_order, read_image

@@ -16,7 +16,7 @@ from typing_extensions import Unpack
 from saunet.data.drive import Drive
 from saunet.data.loading.options import Loading
 from saunet.data.sets.files import RecordingsDataModule
-from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera
+from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera, unknown_camera
 from saunet.errors import DataError, positive
 from saunet.io.images import IMAGE_SUFFIXES, frame_order, image_size, read_depth, read_image
 from saunet.io.plain import read_array
@@ -25,7 +25,7 @@ from saunet.registry import datamodules
 IMAGES, DEPTHS = frozenset({"images", "image", "rgb", "color"}), frozenset({"depth", "depths"})
 """Names of folders that stand beside each other and hold the images and their depth maps."""
 VIEW = 60.0
-"""Horizontal field of view in degrees, assumed without a camera file; only losses and metrics of 3D shape use it."""
+"""Horizontal field of view in degrees of `unknown_camera`; only losses and metrics of 3D shape use it."""
 _SPLITS = {"train": "train", "training": "train", "val": "val", "valid": "val", "validation": "val", "test": "test"}
 _WORD = r"(?:(?:sync_)?depth|rgb|colou?r|image|img)s?"
 _WORDS = re.compile(rf"^{_WORD}[_-]?|[_-]?{_WORD}$", re.IGNORECASE)
@@ -45,7 +45,7 @@ class PairsDrive(Drive):
         images: Mapping[int, Path],
         depths: Mapping[int, Path],
         depth_scale: float,
-        camera: CameraFile | None,
+        camera: CameraFile,
     ) -> None:
         self._name, self.images, self.depths = name, images, depths
         self.depth_scale, self.camera = depth_scale, camera
@@ -66,14 +66,14 @@ class PairsDrive(Drive):
 
     @property
     def camera_height(self) -> float | None:
-        return None if self.camera is None else self.camera.camera_height
+        return self.camera.camera_height
 
     @property
     def condition(self) -> str | None:
-        return None if self.camera is None else self.camera.condition
+        return self.camera.condition
 
     def time(self, index: int) -> float | None:
-        return index / self.camera.fps if self.camera and self.camera.fps else None
+        return index / self.camera.fps if self.camera.fps else None
 
     def path(self, index: int) -> Path:
         return self.images[index]
@@ -84,8 +84,7 @@ class PairsDrive(Drive):
     def intrinsics(self, index: int) -> NDArray[np.float64]:
         size = image_size(self.path(index))
         if size not in self._known_K:
-            camera, name = self.camera, str(self.path(index))
-            self._known_K[size] = _assumed(*size) if camera is None else camera.intrinsics(*size, name)
+            self._known_K[size] = self.camera.intrinsics(*size, str(self.path(index)))
         return self._known_K[size].copy()
 
     def has_depth(self, index: int) -> bool:
@@ -170,7 +169,8 @@ class PairsDataModule(RecordingsDataModule):
             camera = given or _nearest_camera(folder, root)
             if camera is None:
                 assumed.append(folder)
-            elif not camera.is_straight:
+                camera = unknown_camera(folder / FILE_NAME)
+            if not camera.is_straight:
                 raise DataError(
                     f"{camera.path} describes bent images, whose depth maps are not undistorted; do so first"
                 )
@@ -237,8 +237,3 @@ def _nearest_camera(folder: Path, root: Path) -> CameraFile | None:
     above = [folder, *folder.parents]
     path = next((p / FILE_NAME for p in above[: above.index(root) + 1] if (p / FILE_NAME).is_file()), None)
     return None if path is None else read_camera(path)
-
-
-def _assumed(height: int, width: int) -> NDArray[np.float64]:
-    f = 0.5 * width / np.tan(np.radians(VIEW) / 2)
-    return np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]])

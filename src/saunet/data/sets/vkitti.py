@@ -13,8 +13,8 @@ from typing_extensions import Unpack
 
 from saunet.data.checks import check_rotation
 from saunet.data.loading.options import Loading
-from saunet.data.sets.base import FilesDataModule, find_root
-from saunet.data.sets.files import DepthFilesDrive, numbered, pair_up, read_rows, report_missing
+from saunet.data.sets.base import FilesDataModule, find_root, report_missing
+from saunet.data.sets.files import DepthFilesDrive, numbered, pair_up, read_rows
 from saunet.errors import ConfigError, DataError, one_of
 from saunet.io.images import read_depth
 from saunet.registry import datamodules
