@@ -81,6 +81,10 @@ class UnreadableError(DataError):
     """A file that is there and cannot be read: empty, truncated, or not what its name says."""
 
 
+class CameraError(DataError):
+    """A camera that cannot belong to its images, whatever is in their files."""
+
+
 class CheckpointError(SaunetError, ValueError):
     """A checkpoint that cannot be read or does not belong to the model at hand.
 

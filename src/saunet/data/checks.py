@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from saunet.data.drive import Drive
-from saunet.errors import DataError
+from saunet.errors import CameraError, DataError
 from saunet.geometry.camera import scale_intrinsics
 from saunet.io.images import image_size
 
@@ -37,23 +37,23 @@ def check_intrinsics(
     Without a size only what needs none is checked. ``where`` (file and key) and ``fix`` are for the message.
     """
     if not np.isfinite(K).all() or not np.allclose(K[2], [0, 0, 1]) or K[1, 0] != 0:
-        raise DataError(f"{where} has K {K.tolist()}; expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
+        raise CameraError(f"{where} has K {K.tolist()}; expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     size = f" for an image of {height}x{width} (height x width)" if height and width else ""
     told = f"{where} has focal lengths {fx:g}, {fy:g} and center {cx:g}, {cy:g}{size}"
     if not (fx > 0 and fy > 0):
-        raise DataError(f"{told}; the lengths must be positive: {fix}")
+        raise CameraError(f"{told}; the lengths must be positive: {fix}")
     if not height or not width:
         return
     low, high = FOCAL
     if not (low * width < fx < high * width and low * height < fy < high * max(height, width)):
-        raise DataError(f"{told}; a focal length is some 0.3 to 3 image widths: {fix}")
+        raise CameraError(f"{told}; a focal length is some 0.3 to 3 image widths: {fix}")
     right, down = (cx + 0.5) / width, (cy + 0.5) / height
     if not (0 < down < 1 and CENTER[0] < right < CENTER[1]):
-        raise DataError(f"{told}; the center must lie inside, not near the left or right edge: {fix}")
+        raise CameraError(f"{told}; the center must lie inside, not near the left or right edge: {fix}")
     if max(right, down) < SHRUNK or min(right, down) > 1 - SHRUNK:
         why = "near a corner it is that of images of another size"
-        raise DataError(f"{told}; the center must lie inside, and {why}: {fix}")
+        raise CameraError(f"{told}; the center must lie inside, and {why}: {fix}")
 
 
 def common_size(paths: Sequence[Path]) -> tuple[Path, tuple[int, int]]:

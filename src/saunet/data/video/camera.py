@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from saunet.data.checks import check_intrinsics
 from saunet.data.video.calibrations import find_camera, split_name
 from saunet.data.video.lens_models import COEFFICIENTS, WIDEST, Maps, straight_intrinsics, straightening_maps
-from saunet.errors import DataError, SaunetError, suggest
+from saunet.errors import CameraError, DataError, SaunetError, suggest
 from saunet.geometry.camera import GUESS, crop_intrinsics, scale_intrinsics
 from saunet.io.atomic import write_bytes
 
@@ -91,7 +91,7 @@ class CameraFile:
                         "the sides are swapped: image_size is [width, height], and for a video that its tag rotates, "
                         "it and K are those of the picture as players show it"
                     )
-                raise DataError(
+                raise CameraError(
                     f"{what} are {width}x{height} (width x height) but {self.path} is for {columns}x{rows}; {fix}"
                 )
             scaled = scale_intrinsics(given, width / columns, height / rows)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from saunet.errors import DataError
+from saunet.errors import CameraError
 
 COEFFICIENTS = {
     "pinhole": (0, 4, 5, 8, 12, 14),
@@ -139,7 +139,7 @@ def straight_intrinsics(
         where: File, for messages.
 
     Raises:
-        DataError: if the model folds back inside the part of the picture that is used, or ``fov`` is too wide.
+        CameraError: if the model folds back inside the part of the picture that is used, or ``fov`` is too wide.
     """
     limit, radius = fold(model, coefficients, K, height, width)
 
@@ -163,13 +163,13 @@ def straight_intrinsics(
         widest, high = (middle, high) if fits(straight(middle)) else (widest, middle)
     if fov is not None:
         if fov > widest + 0.05:
-            raise DataError(
+            raise CameraError(
                 f"{where}: fov is {fov:g} and the straight picture of this lens is at most {widest:.0f} degrees wide; "
                 "choose less"
             )
         return straight(fov)
     if limit < np.inf and (model == "pinhole" or (widest < WIDEST and fits(straight(widest + 1), np.inf))):
-        raise DataError(
+        raise CameraError(
             f"{where}: this lens model folds back {radius:.0f} pixels from the center, inside the picture, and means "
             f"nothing beyond; calibrate with the board held into the corners too, or set fov to at most {widest:.0f} "
             "degrees in camera.yaml to use only the middle (saunet calibrate converts other files)"

@@ -92,7 +92,7 @@ def _unreadable(survey: Survey) -> Iterator[Finding]:
     if lost:
         text = f"{lost} frames that videos claim to hold cannot be decoded and are left out"
         yield Finding("warning", text, "the end of a video is cut off or damaged: copy it again")
-    broken = [each for each in survey.frames if each.problem and each.problem not in survey.camera_problems]
+    broken = [each for each in survey.frames if each.problem and not each.of_camera]
     if broken:
         text = f"{len(broken)} of {len(survey.frames)} frames cannot be read; the first: {broken[0].problem}"
         yield Finding("error", text, f"copy them again, or {_USE_MANIFEST} or data.on_error=skip")

@@ -22,7 +22,7 @@ from saunet.data.loading.selecting import optical_flow
 from saunet.data.loading.windows import WindowDataset
 from saunet.data.video.focal import WINDOW, FocalEstimate, drive_windows, estimate_focal
 from saunet.data.video.motion import SAME_PICTURE, relative_change, shrink
-from saunet.errors import DataError, SaunetError
+from saunet.errors import CameraError, DataError, SaunetError
 
 SPLITS = ("train", "val", "test")
 ABSENT = "in absent recordings"
@@ -61,6 +61,8 @@ class FrameFacts:
     """Mean motion of each horizontal band, from top to bottom."""
     problem: str | None = None
     """Why it cannot be read."""
+    of_camera: bool = False
+    """Whether that lies in the camera, which is said once for all frames."""
     damage: str | None = None
     """What its decoder made up for, where it says so."""
 
@@ -293,7 +295,7 @@ def _read_frames(
                 image = drive.image(index)
                 seconds = time.perf_counter() - start
         except DataError as error:
-            found.frames.append(FrameFacts(name, index, problem=str(error)))
+            found.frames.append(FrameFacts(name, index, problem=str(error), of_camera=isinstance(error, CameraError)))
             continue
         small, size, path = shrink(image), None, drive.path(index)
         with suppress(OSError):
@@ -355,7 +357,9 @@ def _look_at_camera(found: Survey, name: str, drive: Drive, index: int) -> None:
     try:
         K = np.asarray(drive.intrinsics(index), dtype=np.float64)
     except DataError as error:
-        found.camera_problems.append(str(error))
+        broken = any(frame.drive == name and frame.problem and not frame.of_camera for frame in found.frames)
+        if isinstance(error, CameraError) or not broken:  # else its size could not be read: the frames say why
+            found.camera_problems.append(str(error))
         return
     if sizes:
         found.cameras.append(CameraFacts(name, K, sizes.most_common(1)[0][0], drive.fps, drive.camera_height))
