@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 SOURCE = Path(__file__).parents[1] / "src" / "saunet"
+PAGE = SOURCE.parents[1] / "docs" / "architecture.md"
 
 # room -> the rooms of saunet that it may import, beside itself
 ALLOWED: dict[str, set[str]] = {
@@ -153,6 +155,20 @@ def test_imports_follow_the_plan() -> None:
             if package in THIRD_PARTY and room not in THIRD_PARTY[package]:
                 wrong.append(f"{path.relative_to(SOURCE)} must not import {package}")
     assert not wrong
+
+
+def test_the_page_lists_the_packages_from_the_bottom_up() -> None:
+    (table,) = re.findall(r"^\| package .*\n\|-.*\n((?:\|.*\n)+)", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    rows = [re.findall(r"`(\w+)/?`", row.split("|")[1]) for row in table.splitlines()]
+    floor = {name: number for number, names in enumerate(rows) for name in names}
+    folders = {path.parent.name for path in SOURCE.glob("*/__init__.py")}
+    assert folders <= floor.keys()
+    upwards = {
+        (own, other) for own, others in ALLOWED.items() for other in others if floor.get(other, 0) > floor.get(own, 0)
+    }
+    assert upwards == {("data", "synthetic")}  # the data set that is rendered; the renderer knows `Drive` alone
+    known = {name for path in (SOURCE / "synthetic").glob("*.py") for name in _imports(path) if "saunet.data" in name}
+    assert known == {"saunet.data.drive.Drive"}
 
 
 def test_importing_saunet_costs_torch_but_not_lightning() -> None:
