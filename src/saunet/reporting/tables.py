@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
@@ -241,8 +242,14 @@ def status(run: Run) -> str:
 def with_pose(run: Run) -> str:
     """Return a run's networks in words, with the pose network where it is not the whole model's own."""
     pose, system = run.component("model/pose"), _system(run)
-    own = Spec.of("model", system).get("pose") if system else None
+    own = _own_parts(system).get("pose") if system else None
     return networks(run) + (f", pose {pose}" if pose and pose != own else "")
+
+
+@functools.cache
+def _own_parts(system: str) -> Spec:
+    """Return the parts of a whole model by kind; asked for by each row of each table."""
+    return Spec.of("model", system)
 
 
 def _system(run: Run) -> str:
@@ -250,7 +257,7 @@ def _system(run: Run) -> str:
     name = run.choices.get("model", "")
     if name not in models.names():
         return ""
-    own = Spec.of("model", name)
+    own = _own_parts(name)
     alike = all(run.component(f"model/{part}") == own.get(part) for part in ("encoder", "decoder"))
     return name if alike else ""
 

@@ -95,7 +95,7 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
         if unknown:  # what a file says beside K and the lens holds all the same
             return forgotten(found) if found else unknown_camera(Path(UNKNOWN))
         if found is None:
-            place = (base.parent if path == base else base) / FILE_NAME
+            place = _highest(path, base) / FILE_NAME
             raise DataError(
                 f"no {FILE_NAME} for {path}: put one beside it or at {place}, or set data.camera; saunet "
                 "calibrate makes one, and data.camera=unknown estimates the focal length from turns (see "
@@ -300,11 +300,15 @@ def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
         yield from _clip_paths(link, seen)
 
 
+def _highest(path: Path, base: Path) -> Path:
+    """Return the highest folder whose camera file a clip may have: the root, or the one around a clip that is it."""
+    return base.parent if path == base else base
+
+
 def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraFile | None:
     """Return the nearest camera file of a clip, or None without one."""
     folders = [path, *path.parents] if path.is_dir() else list(path.parents)
-    highest = base.parent if path == base else base  # the root may be a clip itself, with the file beside it
-    for folder in folders[: folders.index(highest) + 1]:
+    for folder in folders[: folders.index(_highest(path, base)) + 1]:
         file = folder / FILE_NAME
         if file not in known and file.is_file():
             known[file] = read_camera(file, may_be_unknown=True)
