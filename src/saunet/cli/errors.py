@@ -22,7 +22,7 @@ def sentence(error: BaseException, table: Table | None = None) -> str | None:
     if "Config group override must be a string or a list" in text:
         return "a group of the config cannot be null; choose logger=none, or set single members to null"
     spawned = re.search(r"^saunet\.errors\.\w+: (.*)", str(error), re.MULTILINE)
-    if spawned:  # raised in a process that was spawned: only its traceback's text arrives here
+    if spawned:  # raised in another process, as of a launcher of sweeps: only its traceback's text arrives here
         return spawned[1]
     for each in (error, cause):
         if type(each).__name__ == "MisconfigurationException":  # Lightning's word for a user's error
@@ -30,8 +30,6 @@ def sentence(error: BaseException, table: Table | None = None) -> str | None:
     missing = re.search(r"\b(wandb|mlflow)\b", text) if isinstance(error, ModuleNotFoundError) else None
     if missing:
         return f"logger={missing[1]} needs a package that is not installed; run `pip install 'saunet[track]'`"
-    if kind == "ProcessExitedException":  # a process that was spawned is gone
-        return f"{_line(str(error))}, so the run ends; resume with resume= and the run's last.ckpt"
     if type(error).__module__.partition(".")[0] in ("hydra", "omegaconf"):
         return _of_hydra(str(getattr(error, "override", "")) if kind == "OverrideParseException" else "", text, table)
     if isinstance(error, OSError):

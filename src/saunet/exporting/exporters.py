@@ -57,7 +57,7 @@ def export_onnx(
     for package in ("onnx", "onnxscript"):
         if importlib.util.find_spec(package) is None:
             raise ConfigError(f"ONNX export needs the package {package}; run: pip install 'saunet[export]'")
-    # Attention in its plain form: what the fused kernel returns has strides that the exporter's own run of it has not.
+    # Attention in its plain form: what the fused kernel returns has other strides in the exporter's own run of it.
     with sdpa_kernel(SDPBackend.MATH):
         program, takes = depth_program(network, record, batch)
     try:

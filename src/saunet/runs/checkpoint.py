@@ -142,7 +142,7 @@ def load_weights(module: nn.Module, state: Mapping[str, Tensor], what: str) -> N
     if missing:
         differences.append(f"it lacks '{missing[0]}'{_more(missing)}")
     if extra:
-        differences.append(f"it has '{extra[0]}'{_more(extra)}, which the model has not")
+        differences.append(f"it has '{extra[0]}'{_more(extra)}, which the model does not have")
     shapes = [key for key in expected if key in state and expected[key].shape != state[key].shape]
     if shapes:
         got, wanted = (tuple(tensors[shapes[0]].shape) for tensors in (state, expected))

@@ -28,7 +28,7 @@ def health(
     """Return what to watch of one step, detached and without waiting for the device.
 
     ``disparity_spread``: standard deviation of an image's disparity over its mean, 0 for a flat picture;
-    ``holes``: fraction of pixels near the far limit with something nearer above them, which sky has not;
+    ``holes``: fraction of pixels near the far limit with something nearer above them, as sky never has;
     ``translation``: mean length of the motion, in units of depth; ``rotation``: mean angle, radians;
     ``automask``: fraction of pixels that teach, where the objective has such a mask.
     """

@@ -271,7 +271,7 @@ def sentence(loading: Loading, trainer: Trainer) -> str:
     each = " on this process" if trainer.world_size > 1 else ""
     data = getattr(trainer, "datamodule", None)
     advice = [f"raise data.workers (now {workers}, there are {cores} cores)"] if workers < cores else []
-    if getattr(data, "cacheable", False) and data.copies is None:  # type: ignore[union-attr]
+    if isinstance(data, DepthDataModule) and data.cacheable and data.copies is None:
         advice.append("load smaller copies made once with saunet prepare cache")
     return (
         f"the loader is the bottleneck: {loading.reached:.0f} images/s arrive{each} and the model could use "

@@ -285,7 +285,7 @@ def train(
                 rank_zero_info(model.intrinsics.told(found))
     if resume and trainer.global_step == steps:
         more = "trainer.max_steps=N" if 0 <= trainer.max_steps <= steps else "epochs=N"
-        print(f"nothing was left to train: it was complete after step {steps}; {more} goes on to a later end")
+        print(f"nothing was left to train: it was complete after step {steps}; {more} continues to a later end")
     elif told := _ended_early(trainer):
         rank_zero_info(told)
     if trainer.is_global_zero:

@@ -117,7 +117,7 @@ def processes(wanted: int) -> dict[str, Any]:
 
 
 def _prepare(worker: int) -> None:
-    """Compute with one thread, and go on for a while if the process group is told to end: the first process saves.
+    """Compute with one thread, and continue for a while if the process group is told to end: the first process saves.
 
     It may be in the middle of an epoch or of a validation, and needs what is under way.
     """
