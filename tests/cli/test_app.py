@@ -237,6 +237,20 @@ def test_a_sweep_keeps_text_and_writes_its_plan(echo: Said) -> None:
     assert "\"input='0001'\"" in Path("sweep/sweep.json").read_text()
 
 
+def test_a_sweep_over_choices_knows_the_keys_that_they_bring(echo: Said) -> None:
+    code, out, err = echo("-m", "data=kitti,kitti_odometry", "data.root=/data", "hydra.sweep.dir=sweep")
+    assert code == 0, err
+    assert [each.data and (each.data.name, each.data.get("root")) for each in ECHOED] == [
+        ("kitti", "/data"),
+        ("kitti_odometry", "/data"),
+    ]
+    assert "2 jobs finished" in out
+    code, _, err = echo("-m", "data=kitti,kitti_odometry", "data.rot=/data", "hydra.sweep.dir=other")
+    assert code == 1
+    assert "unknown key 'data.rot'; did you mean 'root'" in err
+    assert not Path("other").exists()
+
+
 def test_a_failed_job_is_named_and_costs_no_other(echo: Said) -> None:
     code, _, err = echo("-m", "count=-1,2", "hydra.sweep.dir=sweep")
     assert code == 1

@@ -49,6 +49,27 @@ PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "
 _CONVERTED = (tuple, Sequence, Mapping, typing.Literal)
 
 
+class _Hydra(Hydra):
+    """Hydra that looks at a sweep with the first of its choices, for ``experiment=a,b`` brings the keys of others."""
+
+    def compose_config(
+        self, config_name: str | None, overrides: list[str], run_mode: RunMode, *args: bool, **kwargs: bool
+    ) -> DictConfig:
+        swept: dict[str, str] = {}
+        if run_mode is RunMode.MULTIRUN:
+            for each in OverridesParser.create(self.config_loader).parse_overrides(overrides):
+                if each.is_sweep_override() and self.config_loader.get_group_options(each.key_or_group):
+                    swept[str(each.input_line)] = f"{each.get_key_element()}={next(each.sweep_string_iterator())}"
+        with_first = [swept.get(word, word) for word in overrides]
+        cfg: DictConfig = super().compose_config(config_name, with_first, run_mode, *args, **kwargs)
+        if swept:
+            given = {first: word for word, first in swept.items()}
+            task = OmegaConf.to_container(cfg.hydra.overrides.task, resolve=False)  # some refer to a job
+            assert isinstance(task, list)
+            cfg.hydra.overrides.task = [given.get(str(word), word) for word in task]
+        return cfg
+
+
 @contextmanager
 def hydra(tool: Tool, table: Table, extra: str | None = None) -> Iterator[Hydra]:
     """Give Hydra, knowing the keys of a tool and of all components; an extra folder of YAML files comes first."""
@@ -68,7 +89,7 @@ def hydra(tool: Tool, table: Table, extra: str | None = None) -> Iterator[Hydra]
     usual = sources["file"]
     sources["file"] = _source(tool.name, table)
     try:
-        yield Hydra.create_main_hydra2(task_name=tool.name, config_search_path=path)
+        yield _Hydra.create_main_hydra2(task_name=tool.name, config_search_path=path)
     finally:
         sources["file"] = usual
         GlobalHydra.instance().clear()
