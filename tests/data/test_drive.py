@@ -37,9 +37,11 @@ def test_four_members_are_enough_and_the_rest_is_unknown():
     unknown = {drive.depth(0), drive.pose(0), drive.time(0), drive.timestamps, drive.fps, drive.speed(0)}
     unknown |= {drive.distance(0, 2), drive.stereo(), drive.T_stereo_cam, drive.path(0), drive.folder}
     unknown |= {drive.frame_size, drive.camera_height, drive.condition, drive.depth_key(0), drive.scene_mask}
+    unknown |= {drive.lens}
     assert unknown == {None}
     assert (drive.has_depth(0), drive.recorded(2), drive.numbering, drive.origin) == (False, 2, "", "")
     assert not drive.has_scene_mask
+    np.testing.assert_array_equal(drive.recorded_image(2), drive.image(2))
 
 
 @pytest.mark.parametrize("missing", ["name", "indices", "image", "intrinsics"])

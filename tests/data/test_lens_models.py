@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from saunet.data.video.camera import CameraFile, Lens, read_camera
-from saunet.data.video.lens_models import fold, pixels, project, straight_intrinsics, straightening_maps
+from saunet.data.video.lens_models import fold, pixels, project, seen_rays, straight_intrinsics, straightening_maps
 from saunet.errors import DataError
 
 RAYS = np.array([[0, 0, 1], [0.3, -0.2, 1], [-0.5, 0.4, 1], [0.9, 0.6, 1], [2.0, -0.5, 1.0]])
@@ -190,3 +190,35 @@ def test_a_strongly_bent_lens_is_not_cut_to_its_middle():
     assert (recorded > -1).all()
     assert (recorded < [640, 480]).all()
     assert straight[0, 0] < 600
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        ("pinhole", ()),
+        ("pinhole", (-0.1, 0.02, 0.001, -0.002)),
+        ("pinhole", (0.3, 0.05, 0.001, -0.002, 0.01, 0.35, 0.08, 0.02)),
+        ("fisheye", (0.05, -0.01, 0.004, -0.001)),
+        ("omni", (2.2, 0.01, 0.02, 0.001, 0.0005)),
+        ("division", (-0.2,)),
+        ("fov", (0.9,)),
+        ("double_sphere", (-0.2, 0.6)),
+    ],
+)
+def test_the_rays_of_pixels_are_those_that_the_lens_shows_there(model: str, coefficients: tuple[float, ...]) -> None:
+    K = np.array([[500, 2.0, 321], [0, 510, 239], [0, 0, 1]])
+    rays = np.stack([*np.meshgrid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.7, 0.7, 9)), np.ones((9, 13))], -1)
+    found = seen_rays(model, coefficients, K, pixels(model, coefficients, K, rays))
+    np.testing.assert_allclose(found, rays, atol=2e-5)
+    assert seen_rays(model, coefficients, K, np.empty((0, 12, 2))).shape == (0, 12, 3)
+
+
+def test_pixels_beyond_a_fold_have_no_ray() -> None:
+    K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    fold_at = np.sqrt(1 / 3 / 0.35)  # of r (1 - 0.35 r^2)
+    radius = 500 * fold_at * (1 - 0.35 * fold_at**2)
+    at = np.array([[320 + radius - 1, 240], [320 + radius + 1, 240], [320, 240]], np.float64)
+    rays = seen_rays("pinhole", (-0.35, 0.0, 0.0, 0.0), K, at)
+    assert rays[0, 0] == pytest.approx(fold_at, rel=0.1)
+    assert np.isnan(rays[1]).all()
+    np.testing.assert_allclose(rays[2], [0, 0, 1], atol=1e-9)

@@ -373,6 +373,20 @@ def test_an_unknown_camera_is_estimated_once_from_all_its_clips(tmp_path, monkey
     assert "known to 0.40% from 5 windows" in caplog.text
 
 
+def test_a_frame_can_be_had_as_the_lens_showed_it(tmp_path):
+    camera = "K: [300, 300, 160, 100]\nimage_size: [320, 200]\nfps: 10\ncrop: [0, 0.1, 0.1, 0]\n"
+    make_clip(tmp_path / "bent", "a", frames(3), camera=f"{camera}distortion: [-0.1, 0, 0, 0]\n")
+    make_clip(tmp_path / "straight", "a", frames(3), camera=camera)
+    (drive,), (plain,) = (module(tmp_path / each, static="keep").drives() for each in ("bent", "straight"))
+    np.testing.assert_array_equal(drive.recorded_image(1), plain.image(1))
+    np.testing.assert_array_equal(plain.recorded_image(1), plain.image(1))
+    assert (np.asarray(drive.image(1)) != plain.image(1)).any()
+    assert plain.lens is None
+    assert (drive.lens.model, drive.lens.coefficients) == ("pinhole", (-0.1, 0, 0, 0))
+    np.testing.assert_allclose(drive.lens.K, plain.intrinsics(1))
+    assert not np.allclose(drive.intrinsics(1), drive.lens.K)
+
+
 def test_a_camera_called_unknown_keeps_what_its_file_says_beside_the_lens(tmp_path):
     lens = "K: [900, 900, 160, 100]\nimage_size: [320, 200]\ndistortion: [-0.1, 0, 0, 0]\n"
     camera = f"{lens}fps: 12\ncrop: [0, 0.1, 0.1, 0]\n"

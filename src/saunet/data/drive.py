@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,18 @@ from numpy.typing import NDArray
 
 GAP = 1.5
 """Steps of time over this many median ones are gaps."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensModel:
+    """The lens of a recorded picture that is undistorted as it is read (see docs/cameras.md)."""
+
+    model: str
+    """Such as ``pinhole`` or ``fisheye``."""
+    coefficients: tuple[float, ...]
+    """Of its distortion."""
+    K: NDArray[np.float64]
+    """3 x 3, pixels of the recorded picture."""
 
 
 class Drive(ABC):
@@ -159,6 +172,15 @@ class Drive(ABC):
     def numbering(self) -> str:
         """Settings that decide which frame an index stands for; empty if none do."""
         return ""
+
+    @property
+    def lens(self) -> LensModel | None:
+        """The lens that `recorded_image` shows and `image` does not; None if images are as recorded."""
+        return None
+
+    def recorded_image(self, index: int) -> NDArray[np.uint8]:
+        """Return the frame before it is undistorted, h x w x 3, RGB; `image` if `lens` is None."""
+        return self.image(index)
 
     @property
     def scene_mask(self) -> NDArray[np.bool_] | None:

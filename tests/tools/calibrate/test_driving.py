@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,8 +15,10 @@ from rendered import Winding
 from videos import write_video
 
 import saunet
+from saunet.data.drive import LensModel
 from saunet.data.video.camera import read_camera
 from saunet.data.video.focal import WINDOW, FocalEstimate, WindowFocal, combined, solve_window, with_lens
+from saunet.data.video.focal_check import settled
 from saunet.errors import ConfigError, DataError
 from saunet.io.images import write_image
 from saunet.synthetic.world import turn
@@ -131,6 +134,35 @@ def test_a_straight_lens_stays_straight() -> None:
     assert "no distortion found" in found.assumed
 
 
+@pytest.mark.parametrize(
+    ("factor", "named", "degrees"),
+    [(1.0, False, 2), (1.2, True, 2), (0.8, True, 2), (1.0, False, 0), (1.2, False, 0)],
+)
+def test_a_focal_length_is_checked_through_the_lens_that_is_given(factor: float, named: bool, degrees: float) -> None:
+    """A wrong one straightens wrongly, and what bend it leaves must not hide it; a straight road tells nothing."""
+    turns = (degrees, 1.25 * degrees, -degrees)
+    tracked = [(*made(0.58, turn, seed, k1=-0.1), SIZE) for seed, turn in enumerate(turns)]
+    f, (height, width) = 0.58 * factor * 1240, SIZE
+    K = np.array([[f, 0, width - 0.5], [0, f, height - 0.5], [0, 0, 1]])  # of pictures twice as large
+    found = settled(tracked, LensModel("pinhole", (-0.1, 0.0, 0.0, 0.0), K), 1240)
+    assert (found is not None and found.contradicts(0.58 * factor)) == named
+    assert (found is not None and found.tells) == (degrees > 0)
+    if degrees and found is not None:
+        assert found.focal == pytest.approx(0.58, rel=0.03)
+
+
+def test_pixels_that_are_not_square_are_checked_as_such() -> None:
+    tracked = []
+    for seed, degrees in enumerate((2, 2.5, -2)):
+        found, known = made(0.58, degrees, seed)
+        tracked.append((found * (1, 0.8) - (0, 0.1), known, SIZE))
+    f, width = 0.58 * SIZE[1], SIZE[1]
+    said = settled(tracked, LensModel("pinhole", (), np.array([[f, 0, 309.5], [0, 0.8 * f, 74.7], [0, 0, 1]])), width)
+    assert said is not None
+    assert said.focal == pytest.approx(0.58, rel=0.01)
+    assert said.bend == 0
+
+
 def test_windows_are_weighted_and_a_wrong_one_is_left_out() -> None:
     said = [WindowFocal(0.58, 0.01, 0.2), WindowFocal(0.585, 0.01, 0.2), WindowFocal(0.578, 0.02, 0.2)]
     both = combined([*said, WindowFocal(2.0, 3.0, 0.2), WindowFocal(0.9, 0.01, 0.2)])
@@ -183,6 +215,55 @@ def test_rendered_turns(seed: int, focal: float, tmp_path: Path) -> None:
         )
         findings = diagnose(survey(data, ("train",), 3000))
         assert any("contradicts the pictures" in each.text for each in findings) == named, findings
+
+
+@pytest.mark.slow
+def test_rendered_turns_through_a_bent_lens(tmp_path: Path) -> None:
+    """The doctor names a K that is 20 % off in either direction, and not the right one."""
+    (height, width), k1 = (180, 480), -0.1
+    drive = Winding(seed=7, frames=70, height=232, width=592, focal=0.7 * width / 592)
+    K, center = drive.intrinsics(0), np.array([(width - 1) / 2, (height - 1) / 2])
+    seen = (np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1) - center) / K[0, 0]
+    flat = seen
+    for _ in range(50):  # from where the lens shows it to where it is
+        flat = seen / (1 + k1 * (flat**2).sum(-1, keepdims=True))
+    maps = (flat * K[0, 0] + K[:2, 2]).astype(np.float32)
+    for index in drive.indices:
+        bent = cv2.remap(drive.image(index), maps[..., 0], maps[..., 1], cv2.INTER_CUBIC)
+        write_image(tmp_path / "clips" / "a" / f"{index:06d}.png", np.asarray(bent))
+    for factor, named in ((1.0, False), (1.2, True), (0.8, True)):
+        f = K[0, 0] * factor
+        text = f"image_size: [480, 180]\nK: [{f}, {f}, 239.5, 89.5]\ndistortion: [{k1}, 0, 0, 0]\nfps: 10\n"
+        (tmp_path / "clips" / "camera.yaml").write_text(text)
+        data = saunet.build(
+            "data", "video", root=str(tmp_path / "clips"), fps=None, workers=0, frames_cache=str(tmp_path / "cache")
+        )
+        found = survey(data, ("train",), 3000)
+        said = [each.text for each in diagnose(found) if "focal length" in each.text or "K was not" in each.text]
+        print(factor, said)
+        assert any("contradicts the pictures" in each for each in said) == named, said
+        assert any("1 of 1 drives, which agrees with K in 1" in each for each in said) != named, said
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("factor", [1.0, 1.2, 0.8])
+def test_no_focal_length_is_named_on_real_straight_drives(factor: float, kitti_mini: Path, tmp_path: Path) -> None:
+    """They do not tell a right one from a wrong one, and the doctor says that K was not checked."""
+    images = kitti_mini / "raw/2011_09_26/2011_09_26_drive_9005_sync/image_02/data"
+    f = 721.5377 * factor
+    (tmp_path / "camera.yaml").write_text(f"image_size: [1242, 375]\nK: [{f}, {f}, 608.56, 171.854]\nfps: 10\n")
+    data = saunet.build(
+        "data",
+        "video",
+        root=str(images),
+        camera=str(tmp_path / "camera.yaml"),
+        fps=None,
+        workers=0,
+        frames_cache=str(tmp_path),
+    )
+    said = [each.text for each in diagnose(survey(data, ("train",)))]
+    assert not any("contradicts" in each for each in said)
+    assert any("K was not checked, as no examined drive tells the focal length" in each for each in said)
 
 
 @pytest.mark.data

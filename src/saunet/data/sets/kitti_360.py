@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
-from saunet.data.drive import Drive
+from saunet.data.drive import Drive, LensModel
 from saunet.data.kitti.files import read_matrices, read_timestamps
 from saunet.data.kitti.raw import frame_files
 from saunet.data.lidar import read_scan
@@ -83,6 +83,13 @@ class Kitti360Drive(ScannedDrive):
     def image(self, index: int) -> NDArray[np.uint8]:
         image, path = read_image(self.path(index)), str(self.path(index))
         return self._lens(image, path) if self._lens else image
+
+    @property
+    def lens(self) -> LensModel | None:
+        return self._lens.model if self._lens else None
+
+    def recorded_image(self, index: int) -> NDArray[np.uint8]:
+        return read_image(self.path(index))
 
     def intrinsics(self, index: int) -> Array:
         return self._lens.K.copy() if self._lens else super().intrinsics(index)

@@ -34,6 +34,7 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from saunet.data.checks import check_intrinsics
+from saunet.data.drive import LensModel
 from saunet.data.video.calibrations import find_camera, split_name
 from saunet.data.video.lens_models import COEFFICIENTS, WIDEST, Maps, straight_intrinsics, straightening_maps
 from saunet.errors import CameraError, DataError, SaunetError, suggest
@@ -277,9 +278,10 @@ class Lens:
     ) -> None:
         self.recorded = (height, width)
         K = camera.intrinsics(height, width, what)
+        recorded = K
         self._maps: Maps | None = None
         if not camera.is_straight:
-            lens = camera.model, camera.distortion, K
+            lens = camera.model, camera.distortion, recorded
             K = straight_intrinsics(*lens, height, width, camera.fov, str(camera.path))
             self._maps = straightening_maps(*lens, K, height, width)
             check_intrinsics(K, height, width, f"{camera.path}: K after undistortion", FIX)
@@ -288,16 +290,24 @@ class Lens:
         self._rows = slice(round(shares[0] * height), height - round(shares[1] * height))
         self._columns = slice(round(shares[2] * width), width - round(shares[3] * width))
         self.height, self.width = self._rows.stop - self._rows.start, self._columns.stop - self._columns.start
-        self.K = crop_intrinsics(torch.from_numpy(K), self._columns.start, self._rows.start).numpy()
+        corner = self._columns.start, self._rows.start
+        self.K = crop_intrinsics(torch.from_numpy(K), *corner).numpy()
+        self.model: LensModel | None = None
+        """What is undistorted; None if nothing is."""
+        if self._maps is not None:
+            recorded = crop_intrinsics(torch.from_numpy(recorded), *corner).numpy()
+            self.model = LensModel(camera.model, camera.distortion, recorded)
 
-    def __call__(self, image: UInt8[np.ndarray, "_ _ 3"], name: str = "a frame") -> UInt8[np.ndarray, "_ _ 3"]:
+    def __call__(
+        self, image: UInt8[np.ndarray, "_ _ 3"], name: str = "a frame", *, undistort: bool = True
+    ) -> UInt8[np.ndarray, "_ _ 3"]:
         if image.shape[:2] != self.recorded:
             height, width = self.recorded
             raise DataError(
                 f"{name} is {image.shape[1]}x{image.shape[0]} (width x height) where other frames of its clip are "
                 f"{width}x{height}; frames of a clip share one size"
             )
-        if self._maps is not None:
+        if undistort and self._maps is not None:
             image = np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
         return np.ascontiguousarray(image[self._rows, self._columns])
 

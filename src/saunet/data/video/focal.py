@@ -31,6 +31,8 @@ from saunet.errors import DataError
 from saunet.geometry.tracks import follow
 
 F64 = NDArray[np.float64]
+Tracked = tuple[F64, NDArray[np.bool_], tuple[int, int]]
+"""What `track` returns of a window, and the size of its pictures, (height, width)."""
 WINDOW = 12
 """Frames that are solved together, about a second of them."""
 STEP = 0.1
@@ -39,6 +41,8 @@ WIDTH = 620
 """Pictures are made this narrow."""
 KNOWN = 0.015
 """Relative standard deviation up to which a focal length counts as known."""
+_TELLING = 0.04
+"""Up to which it is enough to tell a wrong one by."""
 _VAGUE = 2 * KNOWN
 """A straight road: no lens makes up for turns."""
 _AXES = ("bend", "right", "down")
@@ -103,17 +107,35 @@ def solve_window(
     right: float = 0.0,
     down: float = 0.0,
 ) -> WindowFocal | None:
+    """Bundle-adjust a window of tracked pixels (n, frames, 2) of pictures of a size (height, width).
+
+    ``center`` is where the principal point is expected, in pixels, by default in the picture's middle.
+    """
+    height, width = size
+    middle = np.array(center or ((width - 1) / 2, (height - 1) / 2))
+    return solve_points((pixels - middle) / width, known, width, bend, right, down)
+
+
+def solve_points(
+    x: F64, known: NDArray[np.bool_], width: int, bend: float = 0.0, right: float = 0.0, down: float = 0.0
+) -> WindowFocal | None:
     """Bundle-adjust a window: poses, inverse depths along the rays of the first view, and one focal length.
 
-    ``center`` is where the principal point is expected, in pixels, by default in the picture's middle; ``bend``,
-    ``right`` and ``down`` are those of `FocalEstimate`. None if too few points are tracked.
+    Args:
+        x: Points (n, frames, 2) from where the center is expected, in picture widths.
+        known: Where they are known (n, frames).
+        width: Of the pictures in pixels, for the error.
+        bend: That of `FocalEstimate`.
+        right: That of `FocalEstimate`.
+        down: That of `FocalEstimate`.
+
+    Returns:
+        None if too few points are tracked, or no focal length fits.
     """
     use = known.sum(1) >= 5
     if use.sum() < _FEWEST:
         return None
-    height, width = size
-    middle = np.array(center or ((width - 1) / 2, (height - 1) / 2))
-    x = (pixels[use] - middle) / width - np.array([right, down])
+    x = x[use] - np.array([right, down])
     fit = _adjust(x / (1 + bend * (x**2).sum(-1, keepdims=True)), known[use], _START)
     return fit and WindowFocal(fit[0], fit[1], fit[2] * width)
 
@@ -157,9 +179,14 @@ class FocalEstimate:
     def is_known(self) -> bool:
         return self.windows >= 3 and self.uncertainty <= KNOWN
 
+    @property
+    def tells(self) -> bool:
+        """Whether a focal length 20 % off can be told from the right one: four deviations are less than that."""
+        return self.windows >= 3 and self.uncertainty <= _TELLING and self.bend is not None
+
     def contradicts(self, focal: float) -> bool:
         """Return whether a given focal length, in picture widths, cannot be the one of the pictures."""
-        return self.is_known and abs(math.log(focal / self.focal)) > max(4 * self.uncertainty, 0.08)
+        return self.tells and abs(math.log(focal / self.focal)) > max(4 * self.uncertainty, 0.08)
 
 
 def combined(found: Sequence[WindowFocal]) -> FocalEstimate | None:
@@ -190,7 +217,7 @@ def refusal(found: FocalEstimate | None, source: str) -> str:
 
 
 def drive_windows(drives: Sequence[Drive], most: int) -> Iterator[list[NDArray[np.uint8]]]:
-    """Yield windows of gray frames about `STEP` apart, evenly spread over recordings."""
+    """Yield windows of gray frames as recorded, about `STEP` apart, evenly spread over recordings."""
     starts = []
     for drive in drives:
         every = max(1, round(STEP * (drive.fps or 0) / _median_step(drive)))
@@ -202,7 +229,7 @@ def drive_windows(drives: Sequence[Drive], most: int) -> Iterator[list[NDArray[n
     for place in evenly(len(starts), most):
         drive, chosen = starts[place]
         with suppress(DataError):  # broken frames are reported elsewhere
-            yield [small_gray(drive.image(each)) for each in chosen]
+            yield [small_gray(drive.recorded_image(each)) for each in chosen]
 
 
 def _median_step(drive: Drive) -> float:
@@ -238,28 +265,45 @@ def estimate_focal(
     ``seconds`` of processor time no window is begun but the three that are needed, and the lens is not looked at. None
     if no window has enough points to follow.
     """
-    began = time.process_time()
-    best: list[tuple[float, int, Any]] = []
+    until = time.process_time() + seconds
+    solvers = []
+    for pixels, known, size in turning_most(windows, most, until - seconds / 2):
+        at = None if center is None else (center[0] * size[1], center[1] * size[1])
+        solvers.append(functools.partial(solve_window, pixels, known, size, at))
+    return solve_together(solvers, until, free_center)
+
+
+def turning_most(windows: Iterable[Sequence[NDArray[np.uint8]]], most: int, until: float) -> list[Tracked]:
+    """Track windows of gray frames, and return the ``most`` that turn most, the ones that do first.
+
+    Once the processor time is ``until`` and three windows were looked at, no other is.
+    """
+    best: list[tuple[float, int, Tracked]] = []
     for number, frames in enumerate(windows):
         pixels, known = track(frames)
-        heapq.heappush(best, (turning(pixels, known), number, (pixels, known, frames[0].shape[:2])))
+        size = frames[0].shape[0], frames[0].shape[1]
+        heapq.heappush(best, (turning(pixels, known), number, (pixels, known, size)))
         if len(best) > most:
             heapq.heappop(best)
-        if number >= 2 and time.process_time() - began > seconds / 2:
+        if number >= 2 and time.process_time() > until:
             break
-    solved: list[WindowFocal] = []
-    solvers: list[Solver] = []
-    for number, (_, _, (pixels, known, size)) in enumerate(sorted(best, reverse=True, key=itemgetter(0))):
-        if number >= 3 and time.process_time() - began > seconds:
+    return [tracked for _, _, tracked in sorted(best, reverse=True, key=itemgetter(0))]
+
+
+def solve_together(
+    solvers: Sequence[Solver], until: float = math.inf, free_center: bool = True
+) -> FocalEstimate | None:
+    """Solve windows, and return what they say together, with the lens; see `estimate_focal`."""
+    solved: list[tuple[Solver, WindowFocal]] = []
+    for number, solver in enumerate(solvers):
+        if number >= 3 and time.process_time() > until:
             break
-        at = None if center is None else (center[0] * size[1], center[1] * size[1])
-        solver = functools.partial(solve_window, pixels, known, size, at)
         if found := solver():
-            solved.append(found)
-            solvers.append(solver)
-    if time.process_time() - began < seconds:
-        return with_lens(solvers, solved, free_center)
-    together = combined(solved)
+            solved.append((solver, found))
+    straight = [found for _, found in solved]
+    if time.process_time() < until:
+        return with_lens([solver for solver, _ in solved], straight, free_center)
+    together = combined(straight)
     return together and replace(together, bend=None)
 
 
@@ -278,7 +322,7 @@ def with_lens(
     together = combined(straight)
     sharpest = sorted(range(len(straight)), key=lambda index: straight[index].uncertainty)[:_SHARPEST]
     if together is None or len(sharpest) < 3 or together.uncertainty > _VAGUE:
-        return together
+        return together and replace(together, bend=None)
     unknown = replace(together, uncertainty=math.inf)
 
     @functools.cache

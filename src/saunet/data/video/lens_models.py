@@ -188,6 +188,46 @@ def rays_of(K: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float
     return np.concatenate([(at - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones((len(at), 1))], axis=1)
 
 
+def seen_rays(
+    model: str, coefficients: Sequence[float], K: NDArray[np.float64], at: Float[np.ndarray, "*n 2"]
+) -> Float[np.ndarray, "*n 3"]:
+    """Return the rays of pixels of a recorded picture, z = 1; NaN beyond a fold, and half of `WIDEST` off the axis.
+
+    Newton's method in angles, from the mean radius of each angle; the inverse of `pixels`.
+    """
+    target = np.linalg.solve(K[:2, :2], (at - K[:2, 2]).reshape(-1, 2).T).T
+    if not len(target):
+        return np.empty((*at.shape[:-1], 3))
+    around = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    angles = np.linspace(0, np.radians(WIDEST / 2), 1000)
+
+    def shown(flat: NDArray[np.float64]) -> NDArray[np.float64]:
+        angle = np.linalg.norm(flat, axis=-1)
+        across = np.sinc(angle / np.pi)[:, None] * flat
+        return project(model, coefficients, np.concatenate([across, np.cos(angle)[:, None]], axis=-1))
+
+    circle = np.stack([np.cos(around), np.sin(around)], -1)
+    spokes = shown((angles[:, None, None] * circle).reshape(-1, 2))
+    radii = np.linalg.norm(spokes, axis=-1).reshape(len(angles), -1).mean(1)
+    grows = np.append(np.diff(radii) > 0, False)  # NaN does not grow
+    last = int(grows.argmin())
+    length = np.linalg.norm(target, axis=-1)
+    inside = length <= radii[last]
+    angle = np.interp(length, radii[: last + 1], angles[: last + 1])
+    flat = target * (angle / np.where(length > 0, length, 1))[:, None]
+    step = 1e-6
+    for _ in range(6):
+        now = shown(flat)
+        columns = [(shown(flat + step * np.eye(2)[axis]) - now) / step for axis in range(2)]
+        J = np.where(np.isfinite(columns).all((0, 2))[:, None, None], np.stack(columns, -1), np.eye(2))
+        J = np.where((np.abs(np.linalg.det(J)) > 1e-3)[:, None, None], J, np.eye(2))
+        flat = flat - np.linalg.solve(J, np.nan_to_num(now - target)[..., None])[..., 0]
+    angle = np.linalg.norm(flat, axis=-1)
+    inside &= (np.linalg.norm(shown(flat) - target, axis=-1) < 1e-6) & (angle <= angles[last])
+    across = np.where(inside[:, None], flat * (np.tan(angle) / np.where(angle > 0, angle, 1))[:, None], np.nan)
+    return np.concatenate([across, np.where(inside, 1.0, np.nan)[:, None]], axis=-1).reshape(*at.shape[:-1], 3)
+
+
 def straightening_maps(
     model: str,
     coefficients: Sequence[float],

@@ -21,7 +21,7 @@ from rich.progress import Progress
 from typing_extensions import Unpack
 
 from saunet.data.checks import common_size
-from saunet.data.drive import GAP, Drive
+from saunet.data.drive import GAP, Drive, LensModel
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
 from saunet.data.loading.selecting import BETWEEN, Division, divide
@@ -210,6 +210,14 @@ class ClipDrive(Drive):
     def image(self, index: int) -> NDArray[np.uint8]:
         path = self.path(index)
         return self._lens(read_image(path), str(path))
+
+    @property
+    def lens(self) -> LensModel | None:
+        return self._lens.model
+
+    def recorded_image(self, index: int) -> NDArray[np.uint8]:
+        path = self.path(index)
+        return self._lens(read_image(path), str(path), undistort=False)
 
     def intrinsics(self, index: int) -> NDArray[np.float64]:
         return self._lens.K.copy()

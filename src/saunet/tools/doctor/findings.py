@@ -126,10 +126,10 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
         low, high = min(views), max(views)
         view = f"{low}{f' to {high}' if high > low else ''} degrees"
         yield Finding("note", f"horizontal field of view {view}")
-    known = [camera for camera in survey.cameras if camera.estimate is not None and camera.estimate.is_known]
+    known = [camera for camera in survey.cameras if camera.estimate is not None and camera.estimate.tells]
     looked, cameras = survey.focals
     if known:
-        agree = sum(not each.estimate.contradicts(each.K[0, 0] / each.size[1]) for each in known if each.estimate)
+        agree = sum(not each.estimate.contradicts(each.recorded) for each in known if each.estimate)
         told = f"turns tell the focal length of {len(known)} of {len(survey.cameras)} drives"
         text = f"{told}, which agrees with K in {agree}"
         yield Finding("note", text)
@@ -160,10 +160,12 @@ def _camera(camera: CameraFacts) -> Iterator[Finding]:
     elif abs(fx / fy - 1) > 0.1:
         yield Finding("warning", f"{told}: the focal lengths differ", "were images stretched after calibration?")
     found = camera.estimate
-    if found is not None and found.contradicts(fx / width):
+    if found is not None and found.contradicts(camera.recorded):
+        given = camera.recorded * width
+        before = f" ({given:.1f} before undistortion)" if abs(given - fx) > 0.05 else ""
         text = (
-            f"{told} contradicts the pictures: turns in them say a focal length of {found.focal * width:.0f}, known to "
-            f"{found.uncertainty:.1%}"
+            f"{told}{before} contradicts the pictures: turns in them say a focal length of {found.focal * width:.0f}, "
+            f"{found.focal / camera.recorded:.2f} times the given one, known to {found.uncertainty:.1%}"
         )
         fix = (
             "give the K and the distortion of this camera and this mode, calibrate (saunet calibrate with a board, or "

@@ -15,12 +15,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.data.drive import Drive
+from saunet.data.drive import Drive, LensModel
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.sampling import evenly
 from saunet.data.loading.selecting import optical_flow
 from saunet.data.loading.windows import WindowDataset
-from saunet.data.video.focal import WINDOW, FocalEstimate, drive_windows, estimate_focal
+from saunet.data.video.focal import WINDOW, FocalEstimate, drive_windows
+from saunet.data.video.focal_check import check_focal
 from saunet.data.video.motion import SAME_PICTURE, relative_change, shrink
 from saunet.errors import CameraError, DataError, SaunetError
 
@@ -77,8 +78,10 @@ class CameraFacts:
     fps: float | None
     height: float | None
     """Meters above the road."""
+    recorded: float = 0.0
+    """The given focal length, in widths of the pictures before they are undistorted."""
     estimate: FocalEstimate | None = None
-    """The focal length that the pictures themselves tell; None if it was not looked for or nothing tells it."""
+    """The one that those pictures tell; None if it was not looked for or nothing tells it."""
 
     @property
     def view(self) -> float:
@@ -362,7 +365,10 @@ def _look_at_camera(found: Survey, name: str, drive: Drive, index: int) -> None:
             found.camera_problems.append(str(error))
         return
     if sizes:
-        found.cameras.append(CameraFacts(name, K, sizes.most_common(1)[0][0], drive.fps, drive.camera_height))
+        size, lens = sizes.most_common(1)[0][0], drive.lens
+        # the picture before undistortion has the same size as after
+        recorded = float((K if lens is None else lens.K)[0, 0]) / size[1]
+        found.cameras.append(CameraFacts(name, K, size, drive.fps, drive.camera_height, recorded))
 
 
 def _estimate_focal(found: Survey, drives: Mapping[str, Drive], frames: int) -> None:
@@ -373,10 +379,10 @@ def _estimate_focal(found: Survey, drives: Mapping[str, Drive], frames: int) -> 
     chosen, began = list(groups.values())[:_FOCALS], time.process_time()
     for number, places in enumerate(chosen):
         camera, several = found.cameras[places[0]], [drives[found.cameras[place].drive] for place in places]
-        center = (camera.K[0, 2] + 0.5) / camera.size[1], (camera.K[1, 2] + 0.5) / camera.size[1]
+        lens = several[0].lens or LensModel("pinhole", (), camera.K)
         left = (FOCAL_SECONDS - (time.process_time() - began)) / (len(chosen) - number)
-        windows = drive_windows(several, min(20, frames // WINDOW))
-        estimate = estimate_focal(windows, most=6, center=center, seconds=left, free_center=False)
+        windows = drive_windows(several, min(20, 2 * frames // WINDOW))  # which overlap by half
+        estimate = check_focal(windows, lens, camera.size[1], most=12, seconds=left)
         for place in places:
             found.cameras[place] = replace(found.cameras[place], estimate=estimate)
     found.focals = len(chosen), len(groups)
