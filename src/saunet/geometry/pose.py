@@ -44,7 +44,7 @@ def axisangle_to_matrix(axisangle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3
 def pose_matrix(
     axisangle: Float[Tensor, "*b 3"], translation: Float[Tensor, "*b 3"], invert: bool = False
 ) -> Float[Tensor, "*b 4 4"]:
-    """Rigid motion that rotates, then translates.
+    """Rigid motion that rotates, by Rodrigues' formula, then translates.
 
     Args:
         axisangle: Axis times angle, radians.

@@ -15,7 +15,7 @@ from saunet.metrics.protocols import protocol as named_protocol
 
 @checked
 class DepthMetrics(Metric):
-    """Mean over images of the seven depth errors under a protocol.
+    """Mean over images of the seven depth errors (Eigen et al., 2014) under a protocol.
 
     An image whose ground truth has no pixel to compare is counted (``images_without_truth``) and leaves the means
     alone.
