@@ -10,8 +10,9 @@ from hydra import compose
 from plain import plain
 from training_options import train_options
 
-from saunet.cli import app, table
+from saunet.cli import table
 from saunet.cli.table import TOOLS, config_dir
+from saunet.cli.words import read_words
 from saunet.errors import ConfigError
 from saunet.tools.benchmark.tool import PAPER_METHODS
 
@@ -78,7 +79,7 @@ def test_rows_of_table_3_differ_in_the_depth_network_only() -> None:
 
 
 def read(*given: str, folder: Path | None = None) -> tuple[str, ...]:
-    return tuple(app.read_words(given, TOOLS["train"], table.read(), folder)[1])
+    return tuple(read_words(given, TOOLS["train"], table.read(), folder)[1])
 
 
 def test_a_glob_over_a_table_becomes_its_rows() -> None:

@@ -17,6 +17,7 @@ from echo_tool import ECHOED, EchoOptions
 
 from saunet.cli import app, table
 from saunet.cli.table import Tool
+from saunet.cli.words import read_words
 from saunet.errors import ConfigError
 
 ECHO = Tool(
@@ -212,7 +213,7 @@ def test_what_may_be_a_list_or_text_says_how_they_are_written(capsys: pytest.Cap
 
 def test_a_model_behind_the_input_is_told_its_key() -> None:
     with pytest.raises(ConfigError, match=r"'runs/first' is not KEY=VALUE; .* write checkpoint=runs/first"):
-        app.read_words(["road.png", "runs/first"], app.TOOLS["predict"], table.read())
+        read_words(["road.png", "runs/first"], app.TOOLS["predict"], table.read())
 
 
 def test_an_address_is_an_input_whatever_is_in_it(echo: Said) -> None:
@@ -343,7 +344,7 @@ def test_a_key_of_the_data_is_suggested_by_its_short_name(capsys: pytest.Capture
     with pytest.raises(SystemExit):
         app.main(["doctor", "workers=2"])
     assert "did you mean 'data.workers'?" in capsys.readouterr().err
-    assert app.read_words(["batch=2"], table.TOOLS["doctor"], table.read())[1] == ["data.batch_size=2"]
+    assert read_words(["batch=2"], table.TOOLS["doctor"], table.read())[1] == ["data.batch_size=2"]
 
 
 def test_resume_is_listed_and_has_help(capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,6 +13,7 @@ from processes import python
 
 from saunet.cli import app, table
 from saunet.cli.table import TOOLS
+from saunet.cli.words import read_words
 from saunet.errors import ConfigError
 from saunet.reporting import collect
 
@@ -90,7 +91,7 @@ def test_scenes_that_are_no_images(tmp_path: Path) -> None:
 
 def test_plain_folders_become_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def read(*given: str) -> tuple[str, ...]:
-        return tuple(app.read_words(given, TOOLS["report"], table.read())[1])
+        return tuple(read_words(given, TOOLS["report"], table.read())[1])
 
     monkeypatch.chdir(tmp_path)
     odd = tmp_path / "it's=odd"

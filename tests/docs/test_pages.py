@@ -25,6 +25,7 @@ import saunet
 from saunet.cli import app, table
 from saunet.cli.compose import register_configs
 from saunet.cli.table import config_dir
+from saunet.cli.words import read_words
 from saunet.registry import REGISTRIES
 
 NOT_CONFIGURED = {"components", "resume", "demo"}  # takes names, no configuration
@@ -36,7 +37,7 @@ def _overrides(command: str) -> list[str]:
     _, tool, *given = shlex.split(command)
     kept = [word for word in given if "=" in word and not word.startswith(NOT_INSTALLED)]
     if app.TOOLS[tool].options is not None:
-        kept = app.read_words(kept, app.TOOLS[tool], table.read())[1]
+        kept = read_words(kept, app.TOOLS[tool], table.read())[1]
     single = []
     for override in OverridesParser.create().parse_overrides(kept):
         if override.is_sweep_override():

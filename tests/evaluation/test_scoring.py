@@ -18,7 +18,7 @@ from saunet.metrics.functional import ERROR_NAMES, flip_blend
 from saunet.metrics.protocols import protocol
 from saunet.reporting.inputs import read_evaluation
 from saunet.reporting.tables import detail_tables
-from saunet.runs.folder import Run
+from saunet.runs.run import Run
 from saunet.types import DepthPyramid
 
 PROTOCOLS = [protocol("eigen_camera_z"), protocol("metric")]

@@ -39,7 +39,7 @@ from saunet.io.plain import read_array, read_arrays, read_json, read_yaml
 from saunet.io.speeds import read_speeds
 from saunet.io.trajectories import read_kitti
 from saunet.runs.checkpoint import read_checkpoint
-from saunet.runs.folder import read_run
+from saunet.runs.run import read_run
 from saunet.weights.files import read_model
 
 SLOW = 2.0

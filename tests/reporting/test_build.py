@@ -30,7 +30,7 @@ from saunet.reporting.page import Document, Section, as_html, as_markdown, write
 from saunet.reporting.scenes import Seen, look
 from saunet.reporting.tables import networks, with_pose
 from saunet.reporting.tool import build
-from saunet.runs.folder import read_run
+from saunet.runs.run import read_run
 from saunet.tables import Column, Row, Table, show
 
 

@@ -13,7 +13,7 @@ from saunet.errors import ConfigError, DataError
 from saunet.reporting import ReportOptions
 from saunet.reporting.figures import curve, plot_curves
 from saunet.reporting.scenes import View, edge_boxes, read_views, scene
-from saunet.runs.folder import Run
+from saunet.runs.run import Run
 from saunet.tables.drawing import new_figure
 
 

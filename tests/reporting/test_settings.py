@@ -8,7 +8,7 @@ from pathlib import Path
 from made_runs import make_run
 
 from saunet.reporting.inputs import collect
-from saunet.runs.folder import read_run
+from saunet.runs.run import read_run
 from saunet.runs.sweep import differing, labels, ratio, sweeps_ratio, values, write_plan
 
 

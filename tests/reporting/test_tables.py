@@ -11,7 +11,7 @@ from made_runs import ERRORS, make_evaluation, make_run
 from saunet.reporting.figures import draw_ratio
 from saunet.reporting.inputs import collect
 from saunet.reporting.tables import comparable, explained_table, runs_table, table1, table2, table3
-from saunet.runs.folder import Run
+from saunet.runs.run import Run
 from saunet.runs.sweep import labels
 
 

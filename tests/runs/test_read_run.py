@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 from made_runs import ERRORS, make_run
 
-from saunet.runs.folder import SIGN_OF_LIFE, read_run
+from saunet.runs.folder import SIGN_OF_LIFE
+from saunet.runs.run import read_run
 
 
 def test_a_finished_run_tells_what_it_was(tmp_path: Path) -> None:

@@ -37,8 +37,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf._utils import get_yaml_loader
 
 from saunet import schema
-from saunet.cli.app import unknown
 from saunet.cli.table import PLUGINS, TOOLS, TRAINER, Table, Tool, config_dir, read
+from saunet.cli.words import unknown
 from saunet.errors import ConfigError, one_of
 from saunet.registry import Spec
 from saunet.weights.locate import of_run

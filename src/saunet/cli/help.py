@@ -12,8 +12,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 from saunet import plugins, schema
-from saunet.cli.app import choices, is_plugins, named_plugins
 from saunet.cli.table import PLUGINS, TOOLS, TRAINER, Table, Tool, config_dir, read
+from saunet.cli.words import choices, is_plugins, named_plugins
 from saunet.errors import ConfigError, one_of
 from saunet.registry import REGISTRIES, registry
 

@@ -14,7 +14,7 @@ from saunet.evaluation.rows import ERROR_COLUMNS, ImageRow, ViewRow
 from saunet.evaluation.statistics import compare as paired
 from saunet.reporting.inputs import Evaluation, Inputs, read_evaluation
 from saunet.reporting.tables import Groups, explained_table, health_tables, losses_table
-from saunet.runs.folder import SUBJECTS, Run
+from saunet.runs.run import SUBJECTS, Run
 from saunet.runs.sweep import differing, settings, typed_names, values
 from saunet.tables import Column, Row, Table
 from saunet.weights.locate import is_shipped

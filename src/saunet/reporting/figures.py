@@ -12,7 +12,8 @@ from saunet.published import published
 from saunet.reporting.page import Missing
 from saunet.reporting.scenes import Seen
 from saunet.reporting.tables import Groups, chosen, comparable
-from saunet.runs.folder import Run, read_mapping
+from saunet.runs.folder import read_mapping
+from saunet.runs.run import Run
 from saunet.runs.sweep import RATIO, ratio
 from saunet.tables import Row, Table, columns
 from saunet.tables.drawing import COLORS, Point, colors, new_figure, stacked_figure, svg

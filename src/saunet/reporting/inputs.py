@@ -12,19 +12,8 @@ from typing import Any, Literal
 from saunet.errors import CheckpointError, DataError
 from saunet.io.plain import read_torch
 from saunet.metrics.functional import ERROR_NAMES
-from saunet.runs.folder import (
-    Detail,
-    Explained,
-    Run,
-    Score,
-    Status,
-    began,
-    home,
-    read_hydra,
-    read_mapping,
-    read_run,
-    split_overrides,
-)
+from saunet.runs.folder import Status, began, read_mapping
+from saunet.runs.run import Detail, Explained, Run, Score, home, read_hydra, read_run, split_overrides
 from saunet.runs.sweep import read_plan
 from saunet.weights.locate import is_shipped, locate, shipped
 

@@ -17,8 +17,8 @@ from saunet.reporting.figures import draw_curves, draw_results
 from saunet.reporting.inputs import collect
 from saunet.reporting.page import Document, Figure, Missing, Picture, Section, as_html
 from saunet.reporting.tables import last_mean, runs_table
-from saunet.runs import folder
 from saunet.runs.folder import read_mapping
+from saunet.runs.run import Run as FolderRun
 from saunet.runs.sweep import labels
 from saunet.tables import Column, Row, Table, columns
 from saunet.tables.drawing import Drawing, save
@@ -40,7 +40,7 @@ _HEALTH = {
 
 
 @checked
-class Run(folder.Run):
+class Run(FolderRun):
     """A training's folder, read as it is now: while it runs, or after; a notebook shows its table and curves.
 
     What it lacks is empty. `history` has the rows of its log, `checkpoint` its best checkpoint, `config` its settings.
@@ -64,7 +64,7 @@ class Run(folder.Run):
         runs = collect([path]).all_runs
         if len(runs) != 1:
             raise DataError(f"{path} holds {len(runs)} runs; name one of them, such as {runs[0].path}")
-        super().__init__(**{each.name: getattr(runs[0], each.name) for each in fields(folder.Run)})
+        super().__init__(**{each.name: getattr(runs[0], each.name) for each in fields(FolderRun)})
 
     @property
     def table(self) -> Table:
@@ -144,11 +144,11 @@ def page_of(path: str | Path) -> Document:
     return Document(title, facts, tuple(sections), tuple(missing))
 
 
-def _named(runs: tuple[folder.Run, ...]) -> dict[str, folder.Run]:
+def _named(runs: tuple[FolderRun, ...]) -> dict[str, FolderRun]:
     return dict(zip(labels([runs])[0], runs, strict=True))
 
 
-def _overview(name: str, title: str, runs: Mapping[str, folder.Run], *, swept: bool, draw: bool) -> Section:
+def _overview(name: str, title: str, runs: Mapping[str, FolderRun], *, swept: bool, draw: bool) -> Section:
     """Return how runs stand, and their curves."""
     ended = sum(run.status not in ("running", "unfinished") for run in runs.values())
     heading = f"{ended} of {len(runs)} jobs have ended" if swept else "Current state"
@@ -160,7 +160,7 @@ def _overview(name: str, title: str, runs: Mapping[str, folder.Run], *, swept: b
     return Section(title[0].upper() + title[1:] if len(runs) > 1 else "Progress", tuple(blocks))
 
 
-def _last_picture(run: folder.Run) -> Path | None:
+def _last_picture(run: FolderRun) -> Path | None:
     found = sorted((run.path / "pictures").glob("*.png"), key=natural_order)
     return found[-1] if found else None
 
@@ -169,7 +169,7 @@ def _health_panels() -> list[tuple[str, str]]:
     return [(f"health/{name}", what.split(",")[0]) for name, what in list(_HEALTH.items())[:3]]
 
 
-def _pictures(run: folder.Run) -> Section:
+def _pictures(run: FolderRun) -> Section:
     """Return the last picture of the validation; what its tiles are is written above each."""
     file, blocks = _last_picture(run), []
     if file is not None:
@@ -180,7 +180,7 @@ def _pictures(run: folder.Run) -> Section:
     return Section("Last pictures", tuple(blocks), "" if blocks else "they are drawn after each validation")
 
 
-def _health(run: folder.Run, draw: bool) -> Section:
+def _health(run: FolderRun, draw: bool) -> Section:
     """Return the figures that show a training that goes wrong, and what was said about them."""
     said: Mapping[str, Any] = run.record.get("health") or {}
     latest = {key: value for row in run.history for key, value in row.items() if key.startswith("health/")}
@@ -200,7 +200,7 @@ def _health(run: folder.Run, draw: bool) -> Section:
     return Section("Health", tuple(blocks))
 
 
-def _data(run: folder.Run) -> Section:
+def _data(run: FolderRun) -> Section:
     """Return which frames are used, and what `saunet doctor` found where its manifest is used."""
     blocks = []
     if used := run.record.get("samples"):

@@ -16,7 +16,7 @@ from saunet.io.images import as_rgb_bytes, read_image, resize
 from saunet.prediction.predictor import Predictor
 from saunet.prediction.sources import find_sources
 from saunet.reporting.page import Picture, Scene, Tile
-from saunet.runs.folder import Run
+from saunet.runs.run import Run
 from saunet.tools.benchmark.measure import count_parameters
 from saunet.weights.files import read_model
 

@@ -11,7 +11,7 @@ from saunet.metrics.functional import A1, ABS_REL, RMSE
 from saunet.published import published
 from saunet.registry import Spec, models
 from saunet.reporting.page import Missing
-from saunet.runs.folder import Detail, Explained, Run, Score
+from saunet.runs.run import Detail, Explained, Run, Score
 from saunet.runs.sweep import RATIO, differing, ratio, values
 from saunet.tables import Cell, Column, Row, Table, columns
 from saunet.weights.locate import is_shipped

@@ -23,7 +23,7 @@ from saunet.reporting.inputs import Inputs, collect
 from saunet.reporting.page import Document, Figure, Gallery, Missing, Picture, Scene, Section, write
 from saunet.reporting.scenes import Seen, View, look, read_views, scene
 from saunet.reporting.tables import Groups, comparable
-from saunet.runs.folder import Run
+from saunet.runs.run import Run
 from saunet.runs.sweep import differing, labels, sweeps_ratio
 from saunet.tables import Table, notebook_html, show
 from saunet.tables.drawing import Point, draw_speed, svg

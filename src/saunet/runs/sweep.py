@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from saunet.io.atomic import write_json
-from saunet.runs.folder import FILE, Run, alive_elsewhere, mark_lost, read, read_file, read_mapping
+from saunet.runs.folder import FILE, alive_elsewhere, mark_lost, read, read_file, read_mapping
+from saunet.runs.run import Run
 
 PLAN = "sweep.json"
 """In a sweep's folder: the jobs that it was to have."""
