@@ -80,11 +80,8 @@ class Objective(nn.Module):
         if not self.weights:
             raise ConfigError(f"all loss weights are 0 ({', '.join(weights)}); set at least one above 0")
         self.terms = nn.ModuleDict({name: terms[name] for name in self.weights})
-
-    @property
-    def needs_source_depth(self) -> bool:
+        self.needs_source_depth = any(terms[name].needs_source_depth for name in self.weights)
         """Whether a term compares depth between frames, so that the training step adds ``batch["source_depth"]``."""
-        return any(getattr(term, "needs_source_depth", False) for term in self.terms.values())
 
     def forward(
         self, batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"], views: Sequence[View]
