@@ -13,28 +13,34 @@ from saunet.data.loading.windows import fingerprint
 from saunet.registry import datamodules
 
 
-@pytest.fixture
-def full_tree(tmp_path, monkeypatch):
-    """All 61 drives as folders; their images appear in listings, the ground truth of test frames as empty files."""
-    frames = {}
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """All 61 drives as folders, with the ground truth of test frames as empty files."""
+    root = tmp_path_factory.mktemp("kitti")
     for rows in splits.eigen_table().values():
         for row in rows:
-            folder = tmp_path / row.drive
+            folder = root / row.drive
             folder.mkdir(parents=True)
-            frames[row.drive] = row.frames
             (folder.parent / "calib_cam_to_cam.txt").write_text(CALIBRATION)
             (folder.parent / "calib_velo_to_cam.txt").write_text(SCANNER)
     for frame in splits.eigen_test():
-        _touch(tmp_path / frame.drive / "velodyne_points" / "data" / f"{frame.number:010d}.bin")
+        _touch(root / frame.drive / "velodyne_points" / "data" / f"{frame.number:010d}.bin")
     for frame in splits.eigen_benchmark_test():
-        _touch(tmp_path / frame.drive / "proj_depth" / "groundtruth" / "image_02" / f"{frame.number:010d}.png")
+        _touch(root / frame.drive / "proj_depth" / "groundtruth" / "image_02" / f"{frame.number:010d}.png")
+    return root
+
+
+@pytest.fixture
+def full_tree(written, monkeypatch):
+    """The drives, whose images appear in listings."""
+    frames = {row.drive: row.frames for rows in splits.eigen_table().values() for row in rows}
 
     def listed(folder: Path) -> dict[int, str]:
         drive = folder.parents[1]
         return {number: f"{number:010d}.png" for number in range(frames[f"{drive.parent.name}/{drive.name}"])}
 
     monkeypatch.setattr(raw, "frame_files", listed)
-    return tmp_path
+    return written
 
 
 def _touch(path: Path) -> None:
@@ -81,11 +87,12 @@ def test_frames_without_improved_truth_are_left_out_and_counted(full_tree):
     assert "left out: 45 without ground truth" in data.summary("test")
 
 
-def test_a_missing_side_and_missing_drives_are_counted(full_tree, monkeypatch):
+def test_a_missing_side_and_missing_drives_are_counted(full_tree, monkeypatch, request):
     whole = raw.frame_files
     monkeypatch.setattr(raw, "frame_files", lambda folder: {} if "image_03" in str(folder) else whole(folder))
-    gone = "2011_09_26/2011_09_26_drive_0001_sync"
-    (full_tree / gone).rmdir()
+    gone = full_tree / "2011_09_26/2011_09_26_drive_0001_sync"
+    gone.rmdir()
+    request.addfinalizer(gone.mkdir)  # the tree is everybody's
     data = module(full_tree)
     data.setup("fit")
     zhou = splits.eigen_zhou()
