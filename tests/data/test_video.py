@@ -14,6 +14,7 @@ from clip_tree import CAMERA, frames, make_clip, make_video
 from jaxtyping import TypeCheckError
 from videos import write_video
 
+from saunet.data.video.camera import Undistorter, read_camera
 from saunet.data.video.clips import every, find_clips, frame_paths, read_clip
 from saunet.data.video.focal import FocalEstimate
 from saunet.data.video.motion import CUT, cuts, relative_change
@@ -358,7 +359,7 @@ def test_an_unknown_camera_is_estimated_once_from_all_its_clips(tmp_path, monkey
 
     def estimate(windows, center):
         asked.append((len(list(windows)), center))
-        return FocalEstimate(0.7, 0.004, 5)
+        return FocalEstimate(0.7, 0.004, 5, bend=-0.2)
 
     monkeypatch.setattr("saunet.data.video.module.estimate_focal", estimate)
     for name in ("a", "b"):
@@ -367,10 +368,16 @@ def test_an_unknown_camera_is_estimated_once_from_all_its_clips(tmp_path, monkey
         data = module(tmp_path / "clips", frames_cache=str(tmp_path / "cache"))
         with caplog.at_level("INFO"):
             data.setup("fit")
-        K = data.datasets["train"].drives[0].intrinsics(0)
-        np.testing.assert_allclose(K, [[0.7 * 288, 0, 159.5 - 32], [0, 0.7 * 288, 99.5], [0, 0, 1]])
+        drive = data.datasets["train"].drives[0]
+        np.testing.assert_allclose(drive.lens.K, [[0.7 * 288, 0, 159.5 - 32], [0, 0.7 * 288, 99.5], [0, 0, 1]])
+        assert (drive.lens.model, drive.lens.coefficients) == ("division", (pytest.approx(-0.2 * 0.7**2),))
     assert asked == [(2, (128 / 288, 100 / 288))]  # a window a clip; the second time it is known
     assert "known to 0.40% from 5 windows" in caplog.text
+    (kept,) = (tmp_path / "cache").glob("camera-*.yaml")  # for prediction, which takes no unknown camera
+    assert f"{kept}, which saunet predict takes as undistort=" in caplog.text
+    lens = Undistorter(read_camera(kept)).lens(200, 320)
+    np.testing.assert_allclose(lens.K, drive.intrinsics(0), rtol=1e-6)
+    np.testing.assert_array_equal(lens(frames(14)[3]), drive.image(3))
 
 
 def test_a_frame_can_be_had_as_the_lens_showed_it(tmp_path):

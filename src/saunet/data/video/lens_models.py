@@ -219,8 +219,8 @@ def seen_rays(
     for _ in range(6):
         now = shown(flat)
         columns = [(shown(flat + step * np.eye(2)[axis]) - now) / step for axis in range(2)]
-        J = np.where(np.isfinite(columns).all((0, 2))[:, None, None], np.stack(columns, -1), np.eye(2))
-        J = np.where((np.abs(np.linalg.det(J)) > 1e-3)[:, None, None], J, np.eye(2))
+        J = np.stack(columns, -1)
+        J[~(np.abs(np.linalg.det(J)) > 1e-3)] = np.eye(2)  # beyond what the lens shows, where it may be NaN too
         flat = flat - np.linalg.solve(J, np.nan_to_num(now - target)[..., None])[..., 0]
     angle = np.linalg.norm(flat, axis=-1)
     inside &= (np.linalg.norm(shown(flat) - target, axis=-1) < 1e-6) & (angle <= angles[last])

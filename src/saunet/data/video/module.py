@@ -26,7 +26,7 @@ from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
 from saunet.data.loading.selecting import BETWEEN, Division, divide
 from saunet.data.loading.windows import Selection, measured_distance, reach
-from saunet.data.video.camera import FILE_NAME, CameraFile, Lens, check_crop
+from saunet.data.video.camera import FILE_NAME, CameraFile, Lens, check_crop, write_camera
 from saunet.data.video.clips import (
     Clip,
     FramesCacheError,
@@ -414,13 +414,18 @@ class VideoDataModule(DepthDataModule):
             K = found.intrinsics(height, width, several[0].frame_size[1])
             focal = float(K[0, 0])
             view = math.degrees(2 * math.atan(width / 2 / focal))
-            rank_zero_info(
-                f"focal length of {what}: {focal:.1f} px of {width} ({view:.0f} degrees), known to "
-                f"{found.uncertainty:.2%} from {found.windows} windows of {WINDOW} frames; {found.assumed}"
-            )
             lens: dict[str, Any] = {"model": "division", "distortion": (found.distortion,)} if found.bend else {}
             for drive in several:
                 known[drive.name] = replace(drive.clip.camera, K=K, image_size=(height, width), is_known=True, **lens)
+            said = f"known to {found.uncertainty:.2%} from {found.windows} windows of {WINDOW} frames; {found.assumed}"
+            camera = known[several[0].name]
+            file = self.frames_cache / f"camera-{short_hash(repr((K.tolist(), camera)))}.yaml"
+            if not file.is_file():
+                write_camera(file, camera, f"estimated from {what}: {said}")
+            rank_zero_info(
+                f"focal length of {what}: {focal:.1f} px of {width} ({view:.0f} degrees), {said}; this camera is kept "
+                f"in {file}, which saunet predict takes as undistort="
+            )
         return [drive.seen_by(known[drive.name]) if drive.name in known else drive for drive in drives]
 
     def _focal(self, drives: Sequence[ClipDrive]) -> FocalEstimate | None:

@@ -43,8 +43,8 @@ class CalibrateOptions:
     """A video, a folder or a pattern (``photos/*.jpg``) of pictures of the board held in many places and tilts; or a
     calibration ``FILE[:camera]`` of another tool, to convert."""
     video: str | None = None
-    """In place of ``input``: a driving video with turns, or a folder of its frames. Gives the focal length, if it can
-    be known; the center is taken to be the middle, and the lens to have no distortion, which would make it wrong."""
+    """In place of ``input``: a driving video with turns, or a folder of its frames. Gives the focal length, the center
+    and the distortion (division model), if they can be known."""
     output: str = "camera.yaml"
     """The camera file to write; a picture to check it by is written beside it."""
     rig: Sequence[str] = ()
