@@ -146,8 +146,8 @@ def read_camera(path: str | Path, *, may_be_unknown: bool = False) -> CameraFile
             )
         if not may_be_unknown:
             raise DataError(
-                f"{path} says camera: unknown, which only data=video can estimate; give K, or make the file with "
-                "saunet calibrate video=drive.mp4"
+                f"{path} says camera: unknown, which only data=video can estimate; give K, the file that its training "
+                "kept, or one made with saunet calibrate video=drive.mp4"
             )
     return _camera(path, plain)
 
