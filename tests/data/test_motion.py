@@ -10,9 +10,9 @@ import pytest
 from clip_tree import texture
 
 from saunet.data.video.clips import frame_paths
-from saunet.data.video.motion import CLEAR_FLOW, cuts, measure
+from saunet.data.video.motion import QUICK, cuts, measure
 from saunet.errors import DataError
-from saunet.io.images import quick_look, read_image
+from saunet.io.images import quick_look, read_image, read_jpeg
 
 
 def write(folder, pictures, suffix=".jpg", quality=90):
@@ -161,12 +161,17 @@ def test_frames_of_another_size_are_no_neighbors(tmp_path):
 def test_a_quick_look_is_the_picture_made_smaller(tmp_path):
     path = tmp_path / "a.jpg"
     cv2.imwrite(str(path), view(texture(), 7))
-    small, size = quick_look(path, 320)
-    assert small.shape == (96, 320)
+    jpeg, size = read_jpeg(path)
+    assert jpeg == path.read_bytes()
     assert size == b"\x00\xc0\x02\x80"
-    full = cv2.resize(cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY), (320, 96), interpolation=cv2.INTER_AREA)
-    assert np.abs(small.astype(int) - full).mean() < 1.5
-    assert quick_look(path, 321) == (None, b"")  # narrower than twice that
+    full = cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY)
+    for width in (320, 160):
+        small = quick_look(jpeg, 640, width)
+        assert small.shape == (width * 3 // 10, width)
+        expected = cv2.resize(full, small.shape[::-1], interpolation=cv2.INTER_AREA)
+        assert np.abs(small.astype(int) - expected).mean() < 1.5
+    assert quick_look(jpeg, 640, 321) is None  # narrower than twice that
     cv2.imwrite(str(tmp_path / "a.png"), view(texture(), 7))
-    assert quick_look(tmp_path / "a.png", 320) == (None, b"")
-    assert min(CLEAR_FLOW.values()) >= 1.0
+    for other in ("a.png", "none.jpg"):
+        assert read_jpeg(tmp_path / other) == (b"", b"")
+    assert min(flow for _, _, flow in QUICK.values()) >= 1.0

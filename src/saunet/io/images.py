@@ -129,22 +129,28 @@ def image_size(path: str | Path) -> tuple[int, int]:
     return shape[0], shape[1]
 
 
-def quick_look(path: str | Path, width: int) -> tuple[UInt8[np.ndarray, "h w"] | None, bytes]:
-    """Return a JPEG as a gray picture at 1/8, 1/4 or 1/2 of its size, at least so wide, and its size as stored.
+def read_jpeg(path: str | Path) -> tuple[bytes, bytes]:
+    """Return the content of a whole JPEG, and the four bytes of its height and width as stored.
 
-    The codec leaves out the fine half of its frequencies, which takes a third of the time. None and nothing for a file
-    of another kind, a narrower one and one that `read_image` does not read.
+    Nothing and nothing for a file of another kind and one that `read_image` does not read.
     """
-    with contextlib.suppress(DataError):
-        data = read_bytes(path)
-        size = _jpeg_size(data[: 1 << 16].tobytes())
-        stored = int.from_bytes(size[2:])
-        fitting = [flag for shrink, flag in _REDUCED.items() if stored >= shrink * width]
-        if fitting and _complete(data.tobytes()):
-            image = cv2.imdecode(data, fitting[0])
-            if image is not None:
-                return image, size
-    return None, b""
+    try:
+        with open(path, "rb", buffering=0) as stream:
+            data = stream.read()
+    except OSError:
+        return b"", b""
+    size = _jpeg_size(data)
+    return (data, size) if size and _complete(data) else (b"", b"")
+
+
+def quick_look(jpeg: bytes, stored: int, width: int) -> UInt8[np.ndarray, "h w"] | None:
+    """Return a JPEG, ``stored`` pixels wide, as a gray picture at 1/8, 1/4 or 1/2 of its size, at least ``width`` wide.
+
+    The codec leaves out the fine frequencies, which takes half of the time or less. None for a narrower one and one
+    that `read_image` does not read.
+    """
+    fitting = [flag for shrink, flag in _REDUCED.items() if stored >= shrink * width]
+    return cv2.imdecode(np.frombuffer(jpeg, np.uint8), fitting[0]) if fitting else None
 
 
 _REDUCED = {
@@ -154,13 +160,13 @@ _REDUCED = {
 }
 
 
-def _jpeg_size(head: bytes) -> bytes:
-    """Return the four bytes of height and width of a JPEG; none if the head is not that of one."""
+def _jpeg_size(data: bytes) -> bytes:
+    """Return the four bytes of height and width of a JPEG; none if the content does not begin as that of one."""
     at = 2
-    while head[:2] == b"\xff\xd8" and head[at : at + 1] == b"\xff" and at + 9 <= len(head):
-        if 0xC0 <= head[at + 1] <= 0xCF and head[at + 1] not in (0xC4, 0xC8, 0xCC):
-            return head[at + 5 : at + 9]
-        at += 2 + int.from_bytes(head[at + 2 : at + 4])
+    while data[:2] == b"\xff\xd8" and data[at : at + 1] == b"\xff" and at + 9 <= len(data):
+        if 0xC0 <= data[at + 1] <= 0xCF and data[at + 1] not in (0xC4, 0xC8, 0xCC):
+            return data[at + 5 : at + 9]
+        at += 2 + int.from_bytes(data[at + 2 : at + 4])
     return b""
 
 

@@ -289,7 +289,8 @@ def median_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
     x, y = cv2.split(optical_flow(first, second))
     squares = (x * x + y * y).ravel()
     low, high = (squares.size - 1) // 2, squares.size // 2
-    return float(np.sqrt(np.partition(squares, [low, high])[low : high + 1]).mean())
+    middle = np.sqrt(np.partition(squares, [low, high])[[low, high]])
+    return float((middle[0] + middle[1]) / 2)
 
 
 def optical_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:

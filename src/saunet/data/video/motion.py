@@ -1,7 +1,7 @@
 """How much the picture moves between the frames of a clip: which are doubled, static, or begin another scene.
 
-Most frames of a clip are far from every limit, and half of a JPEG's resolution is enough to see that; those that are
-not are measured at the full resolution, so that the frames chosen do not depend on the shortcut.
+Most frames of a clip are far from every limit, and a fourth or half of a JPEG's resolution is enough to see that; those
+that are not are measured at the full resolution, so that the frames chosen do not depend on the shortcut.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from saunet.data.loading.selecting import FLOW_WIDTH, MIN_FLOW, gray, median_flo
 from saunet.data.video.clips import FramePaths, FramesCacheError, short_hash
 from saunet.errors import DataError, UnreadableError
 from saunet.io.atomic import remove_partial_files, write_bytes
-from saunet.io.images import quick_look, read_image, resize
+from saunet.io.images import decode_image, quick_look, read_image, read_jpeg, resize
 from saunet.io.plain import read_array
 from saunet.threads import available_cores
 
@@ -33,10 +33,11 @@ CUT = 0.75
 """The same measure from which two frames may be of different scenes (1.13 if nothing matches): KITTI's neighbors differ
 by up to 0.5, frames of different recordings by 0.88 to 1.0."""
 PEAK = 1.3  # times the changes around it that a cut exceeds: fast motion lasts, a cut does not
-CLEAR_CHANGE = (4 * SAME_PICTURE, 0.6 * CUT)
-"""Change between which a gray picture of a JPEG's reduced decoding is trusted."""
-CLEAR_FLOW = {160: 4 * MIN_FLOW, 320: 2 * MIN_FLOW}
-"""Width of such pictures -> flow from which they are trusted: parts that move by themselves mislead small ones."""
+QUICK = {160: (4 * SAME_PICTURE, 0.6 * CUT, 4 * MIN_FLOW), FLOW_WIDTH: (2 * SAME_PICTURE, 0.75 * CUT, 2 * MIN_FLOW)}
+"""Width of a gray picture of a JPEG's reduced decoding -> least and largest change, and least flow, for which it is
+trusted: small pictures show less noise and less detail, and parts that move by themselves mislead them."""
+_SAME, _STATIC = SAME_PICTURE / 4, MIN_FLOW / 4
+"""Change and flow up to which such pictures are trusted, the change that of the wider ones."""
 _BLOCK = 64  # frames that a thread measures at a time
 
 
@@ -92,14 +93,30 @@ class _Picture:
 
     def __init__(self, path: Path, crop: Sequence[float | int], exact: bool) -> None:
         self._path, self._crop = path, crop
-        quick, self.size = (None, b"") if exact else quick_look(path, FLOW_WIDTH)
-        self.quick = {} if quick is None else {width: shrink(quick, crop, width) for width in CLEAR_FLOW}
-        if not self.quick:
+        self._jpeg, self.size = (b"", b"") if exact else read_jpeg(path)
+        self._stored = int.from_bytes(self.size[2:])
+        if self._stored < 2 * FLOW_WIDTH or self.small is None:
+            self._jpeg = b""
             _ = self.full  # what cannot be decoded is known at once
 
     @functools.cached_property
+    def small(self) -> NDArray[np.uint8] | None:
+        """A gray picture of the narrower width of `QUICK`; None if it has to be decoded in full."""
+        return self._look(min(QUICK))
+
+    @functools.cached_property
+    def medium(self) -> NDArray[np.uint8] | None:
+        """Likewise, of the wider."""
+        return self._look(max(QUICK))
+
+    def _look(self, width: int) -> NDArray[np.uint8] | None:
+        quick = quick_look(self._jpeg, self._stored, width) if self._jpeg else None
+        return None if quick is None else shrink(quick, self._crop, width)
+
+    @functools.cached_property
     def full(self) -> NDArray[np.uint8]:
-        return shrink(read_image(self._path), self._crop)
+        image = decode_image(self._jpeg, str(self._path)) if self._jpeg else read_image(self._path)
+        return shrink(image, self._crop)
 
     @functools.cached_property
     def gray(self) -> NDArray[np.uint8]:
@@ -108,17 +125,36 @@ class _Picture:
 
 def _compare(before: _Picture, after: _Picture) -> tuple[float, float]:
     """Return flow and change, NaN for pictures of different sizes."""
-    if before.quick and after.quick and before.size == after.size:
-        smallest = min(CLEAR_FLOW)
-        change = relative_change(before.quick[smallest], after.quick[smallest])
-        if CLEAR_CHANGE[0] <= change <= CLEAR_CHANGE[1]:
-            for width, clear in CLEAR_FLOW.items():
-                flow = median_flow(before.quick[width], after.quick[width]) * FLOW_WIDTH / width
-                if flow >= clear:
-                    return flow, change
+    if before.size == after.size:
+        found = _compare_quickly(before, after)
+        if found is not None:
+            return found
     if before.full.shape != after.full.shape:
         return np.nan, np.nan
     return median_flow(before.gray, after.gray), relative_change(before.full, after.full)
+
+
+def _compare_quickly(before: _Picture, after: _Picture) -> tuple[float, float] | None:
+    """Return flow and change by pictures of reduced decodings; None where these may not decide as the full ones."""
+    if before.small is None or after.small is None:
+        return None
+    small, wide = QUICK
+    low, high, moving = QUICK[small]
+    change = relative_change(before.small, after.small)
+    flow = median_flow(before.small, after.small) * FLOW_WIDTH / small
+    if low <= change <= high and flow >= moving:
+        return flow, change
+    if before.medium is None or after.medium is None:
+        return None
+    low, high, moving_wide = QUICK[wide]
+    change = relative_change(before.medium, after.medium)
+    if not (change <= _SAME or low <= change <= high):
+        return None
+    if _STATIC < flow < moving:
+        flow = median_flow(before.medium, after.medium)
+        if _STATIC < flow < moving_wide:
+            return None
+    return flow, change
 
 
 def _measure_block(
@@ -150,8 +186,10 @@ def _settle_cuts(paths: FramePaths, crop: Sequence[float | int], found: NDArray[
     """Measure exactly what lies around a possible cut: it is judged by the changes beside it."""
     readable = np.flatnonzero(found[2])
     near = np.convolve(found[1, readable] >= CUT, np.ones(5), "full")[2:-2] > 0
-    for before, after in itertools.compress(itertools.pairwise(readable.tolist()), near[1:]):
-        found[:2, after] = _compare(*(_Picture(paths[place], crop, exact=True) for place in (before, after)))
+    pictures: dict[int, _Picture] = {}
+    for pair in itertools.compress(itertools.pairwise(readable.tolist()), near[1:]):
+        pictures = {place: pictures.get(place) or _Picture(paths[place], crop, exact=True) for place in pair}
+        found[:2, pair[1]] = _compare(*pictures.values())
 
 
 def measure(
