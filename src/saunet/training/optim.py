@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -42,7 +43,7 @@ class Recipe:
         freeze_statistics: Parts that are trained while their batch normalization keeps its running statistics, by name.
         ema: Decay of the moving average of the weights, such as 0.999; the average is what is validated and saved. 0
             keeps none.
-        fused: One kernel for the whole optimizer step.
+        fused: One kernel for the whole optimizer step; by default on a CPU, where it takes a quarter of the time.
     """
 
     optimizer: Literal["adam", "adamw"] = "adam"
@@ -57,7 +58,7 @@ class Recipe:
     freeze: Sequence[str] = ()
     freeze_statistics: Sequence[str] = ()
     ema: float = 0.0
-    fused: bool = False
+    fused: bool | None = None
 
     def __post_init__(self) -> None:
         one_of("optim.optimizer", self.optimizer, ("adam", "adamw"))
@@ -129,7 +130,11 @@ class Recipe:
         groups: list[Any] = list(parameters)
         kind = torch.optim.AdamW if self.optimizer == "adamw" else torch.optim.Adam
         betas = (self.betas[0], self.betas[1])
-        optimizer = kind(groups, self.lr, betas, weight_decay=self.weight_decay, fused=self.fused or None)
+        tensors = itertools.chain.from_iterable(each["params"] if isinstance(each, dict) else [each] for each in groups)
+        on_cpu = self.fused is None and all(each.device.type == "cpu" for each in tensors)
+        optimizer = kind(groups, self.lr, betas, weight_decay=self.weight_decay, fused=self.fused or on_cpu or None)
+        if on_cpu:  # there is no scaler on a CPU, and with one the kernel would have to know it before clipping
+            vars(optimizer)["_step_supports_amp_scaling"] = False
         scheduler = RecipeSchedule(optimizer, self, max(total_steps, 1))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 

@@ -24,7 +24,10 @@ class Conv3x3(nn.Conv2d):
 
     def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co h w"]:
         mode = "reflect" if min(x.shape[-2:]) > 1 else "replicate"  # one pixel has nothing to reflect
-        return F.conv2d(F.pad(x, (1, 1, 1, 1), mode=mode), self.weight, self.bias)
+        # Autocast on a CPU would pad in float32, and the convolution cast it back: two copies of the map for nothing.
+        with torch.autocast(device_type=x.device.type, enabled=False):
+            padded = F.pad(x, (1, 1, 1, 1), mode=mode)
+        return F.conv2d(padded, self.weight, self.bias)
 
 
 class ConvELU(nn.Sequential):
