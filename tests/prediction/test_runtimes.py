@@ -148,6 +148,34 @@ def test_converted_once_with_the_same_depth(
     assert "converting" in capsys.readouterr().out
 
 
+def test_bfloat16_is_used_where_it_is_asked_for(
+    pretend: Callable[[float, float], Predictor],
+    checkpoint: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    original = pretend(1.0, 0.5)
+    eager = exporters.run_eager(original.network)
+    monkeypatch.setattr(runtimes, "_PACKAGES", {"openvino": ("numpy",)})
+    monkeypatch.setattr(runtimes, "_open", lambda *_: ("bf16", lambda image: 1.01 * eager(image)))
+    monkeypatch.setattr(runtimes, "run_openvino", lambda *_: eager)
+    chosen = runtimes.choose_runtime(original, checkpoint, "openvino-bf16")
+    assert "openvino bf16, 0.50 of torch's time, depth changes by 0.01" in capsys.readouterr().out
+    np.testing.assert_allclose(1.01 * chosen.predict(image()).depth, original.predict(image()).depth, rtol=1e-5)
+    for usual in ("openvino", "auto"):
+        same = runtimes.choose_runtime(original, checkpoint, usual)
+        told = capsys.readouterr().out
+        assert "openvino f32" in told
+        assert "bf16 would change it by 0.01 (runtime=openvino-bf16)" in told
+        np.testing.assert_allclose(same.predict(image()).depth, original.predict(image()).depth, rtol=1e-6)
+    monkeypatch.setattr(runtimes, "_open", lambda *_: ("bf16", lambda image: 1.1 * eager(image)))
+    with pytest.raises(ConfigError, match=r"changes depth by 0.09.*allowed is 0.05"):
+        runtimes.choose_runtime(original, checkpoint, "openvino-bf16")
+    monkeypatch.setattr(runtimes, "_open", lambda *_: ("f32", eager))
+    with pytest.raises(ConfigError, match="needs a processor that computes in bfloat16"):
+        runtimes.choose_runtime(original, checkpoint, "openvino-bf16")
+
+
 def test_openvino_refuses_weights_that_are_not_finite(checkpoint: Path) -> None:
     pytest.importorskip("openvino", reason="needs the extra openvino")
     original = Predictor.from_checkpoint(checkpoint)

@@ -32,7 +32,7 @@ def frame_times(folder: Path, names: Sequence[str]) -> list[float] | None:
     """
     if (folder / TIMES).is_file():
         return _table_times(folder / TIMES, names)
-    return name_times([os.path.splitext(name)[0] for name in names]) or _exif_times(folder, names)
+    return name_times([name.rpartition(".")[0] for name in names]) or _exif_times(folder, names)
 
 
 def _table_times(path: Path, names: Sequence[str]) -> list[float]:

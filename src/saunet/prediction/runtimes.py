@@ -46,6 +46,10 @@ class Change(NamedTuple):
 
 LIMITS = {"f32": Change(1e-4, 1e-2), "bf16": Change(2e-3, 0.1)}
 """Largest change, by precision, with which a runtime is used."""
+ASKED = Change(5e-2, math.inf)
+"""The same where bfloat16 is asked for: it moves edges by a pixel, so that one pixel's depth says nothing."""
+_BF16 = "-bf16"
+"""How the name of a runtime ends that is to compute in bfloat16."""
 WORTH_FRAMES = 200
 """Frames that are worth a conversion, which takes as long as about so many frames."""
 _PACKAGES = {"openvino": ("openvino",), "onnx": ("onnxruntime", "onnx", "onnxscript")}
@@ -101,8 +105,9 @@ def choose_runtime(
     Args:
         predictor: A loaded model.
         checkpoint: Where it came from.
-        runtime: ``torch``, ``openvino``, ``onnx``; or ``auto``, the first of the installed ones that is faster than
-            torch, if ``frames`` are worth a conversion or there has been one.
+        runtime: ``torch``, ``openvino``, ``onnx``; ``openvino-bf16``, which may change depth by as much as `ASKED`; or
+            ``auto``, the first of the installed ones that is faster than torch, if ``frames`` are worth a conversion
+            or there has been one.
         frames: How many frames will be predicted, at most.
 
     Raises:
@@ -116,11 +121,12 @@ def choose_runtime(
         if auto:
             return predictor
         raise ConfigError(f"runtime={runtime} {wrong}; leave runtime out")
-    found = [name for name in (_PACKAGES if auto else [runtime]) if all(map(importlib.util.find_spec, _PACKAGES[name]))]
+    plain = runtime.removesuffix(_BF16)
+    found = [name for name in (_PACKAGES if auto else [plain]) if all(map(importlib.util.find_spec, _PACKAGES[name]))]
     if not found:
         if auto:
             return predictor
-        raise ConfigError(f"runtime={runtime} is not installed; run: pip install 'saunet[{_EXTRAS[runtime]}]'")
+        raise ConfigError(f"runtime={runtime} is not installed; run: pip install 'saunet[{_EXTRAS[plain]}]'")
     name = found[0]
     path = _cached(predictor, name)
     if auto and frames < WORTH_FRAMES and not path.is_file():
@@ -132,25 +138,32 @@ def choose_runtime(
             print(f"runtime: torch ({name} cannot be used: {reason})")
             return predictor
         raise
-    images = random_images(predictor.height, predictor.width)
+    if plain != runtime and precision != "bf16":
+        raise ConfigError(
+            f"runtime={runtime} needs a processor that computes in bfloat16, and this one does not; set runtime={plain}"
+        )
+    images, limit, hint = random_images(predictor.height, predictor.width), LIMITS[precision], ""
+    if plain != runtime:
+        limit = ASKED
     eager = exporters.run_eager(predictor.network)
     change = _largest_change(eager, run, images)
-    if not change.within(LIMITS[precision]) and precision != "f32":
-        precision, run = "f32", run_openvino(path, path.with_suffix(".bin"))
+    if not change.within(limit) and precision != "f32" and plain == runtime:
+        hint = f"; bf16 would change it by {change.mean:.1g} (runtime={name}{_BF16})"
+        precision, limit, run = "f32", LIMITS["f32"], run_openvino(path, path.with_suffix(".bin"))
         change = _largest_change(eager, run, images)
-    if not change.within(LIMITS[precision]):
-        found_it = f"{name} changes depth by {change}, and allowed is {LIMITS[precision]}"
+    if not change.within(limit):
+        found_it = f"{name} changes depth by {change}, and allowed is {limit}"
         if not auto:
             raise ConfigError(f"{found_it}; set runtime=torch")
         print(f"runtime: torch ({found_it})")
         return predictor
     before, after = milliseconds([eager, run], images[0], repeats=3)
-    about = f"{name} {precision}, {after / before:.2f} of torch's time, depth changes by {change}"
+    about = f"{name} {precision}, {after / before:.2f} of torch's time, depth changes by {change}{hint}"
     if auto and after >= before:
         print(f"runtime: torch ({about})")
         return predictor
     print(f"runtime: {about}")
-    return ConvertedPredictor(predictor, run, LIMITS[precision])
+    return ConvertedPredictor(predictor, run, limit)
 
 
 def _largest_change(eager: Run, converted: Run, images: Sequence[Float32[np.ndarray, "1 3 h w"]]) -> Change:

@@ -30,7 +30,7 @@ from saunet.weights.locate import locate
 if TYPE_CHECKING:
     from saunet.prediction.odometer import Odometer
 
-RUNTIMES: tuple[str, ...] = ("auto", "torch", "openvino", "onnx")
+RUNTIMES: tuple[str, ...] = ("auto", "torch", "openvino", "openvino-bf16", "onnx")
 
 
 @checked
@@ -76,6 +76,7 @@ class PredictOptions:
         runtime: What runs the network on a CPU: ``torch``, ``openvino`` (extra ``openvino``), ``onnx`` (extra
             ``export``); ``auto`` is the first installed one that is faster than torch and changes depth by at most
             1e-4 (2e-3 in bfloat16), where the number of frames is worth a conversion or there has been one.
+            ``openvino-bf16`` computes in bfloat16 although depth changes more.
 
     Raises:
         ConfigError: if an option cannot work, or not beside another one.
