@@ -24,6 +24,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 import train_step
@@ -74,8 +75,8 @@ class ResNet(nn.Module):
         return nn.Sequential(first, *(block(planes, planes) for _ in range(1, count)))
 
 
-def trainer(folder: Path, batch: int) -> Any:
-    """Return Monodepth2's trainer with its default networks, ready for `process_batch`."""
+def put_on_path(folder: Path) -> None:
+    """Make Monodepth2's modules importable, with empty ones for the packages that are not needed."""
     resnet = types.ModuleType("resnet")
     vars(resnet).update(BasicBlock=Block, Bottleneck=None, ResNet=ResNet)
     small = functools.partial(ResNet, Block, [2, 2, 2, 2])
@@ -86,7 +87,10 @@ def trainer(folder: Path, batch: int) -> Any:
     models = types.ModuleType("torchvision.models")
     names = {f"resnet{depth}": resnet18 for depth in (18, 34, 50, 101, 152)}
     vars(models).update(ResNet=ResNet, resnet=resnet, **names)
-    empty = {"torchvision": {"models": models}, "torchvision.models": vars(models), "datasets": {}}
+    transforms = types.ModuleType("torchvision.transforms")
+    vars(transforms).update(ToTensor=lambda: to_tensor)
+    inside = {"models": models, "transforms": transforms, "datasets": None}
+    empty = {"torchvision": inside, "torchvision.models": vars(models), "datasets": {}}
     empty |= {
         "tensorboardX": {"SummaryWriter": None},
         "IPython": {"embed": None},
@@ -97,6 +101,16 @@ def trainer(folder: Path, batch: int) -> Any:
         sys.modules[name] = types.ModuleType(name)
         vars(sys.modules[name]).update(content)
     sys.path.insert(0, str(folder))
+
+
+def to_tensor(picture: Any) -> Tensor:
+    """Return a PIL image as torchvision's `ToTensor` does."""
+    return torch.from_numpy(np.array(picture, np.uint8)).permute(2, 0, 1).contiguous().float().div(255)
+
+
+def trainer(folder: Path, batch: int) -> Any:
+    """Return Monodepth2's trainer with its default networks, ready for `process_batch`."""
+    put_on_path(folder)
     import layers
     import networks
     from trainer import Trainer
