@@ -8,7 +8,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from clip_tree import CAMERA, frames, make_clip, texture
+from clip_tree import CAMERA, frames, make_clip, make_video, texture
 from drives import NumberDrive
 from kitti_tree import make_drive, name
 from PIL import Image
@@ -22,6 +22,7 @@ from saunet.data.video.module import ClipDrive
 from saunet.errors import DataError
 from saunet.io.images import name_times
 from saunet.io.times import frame_times
+from saunet.io.video import VideoReader
 from saunet.prediction.sources import Recording
 
 
@@ -219,3 +220,43 @@ def test_a_damaged_exif_block_means_no_time(tmp_path, damage):
     data[start + damage.start : start + damage.stop] = b"\xff" * (damage.stop - damage.start)
     (tmp_path / "a.jpg").write_bytes(data)
     assert frame_times(tmp_path, ["a.jpg"]) is None
+
+
+SECONDS = [100.0, 100.1, 100.3, 100.4, 100.5, 100.9]
+"""Of the frames of a video that states 10 frames per second."""
+
+
+def timed_video(root, rows):
+    make_video(root / "a.mp4", frames(6))
+    (root / "a.times.csv").write_text("\n".join(["frame, time", *rows]) + "\n")
+    return root / "a.mp4"
+
+
+def test_a_table_beside_a_video_goes_before_its_own_times(tmp_path):
+    (clip,) = find_clips(timed_video(tmp_path, [f"{number}, {each}" for number, each in enumerate(SECONDS)][::-1]))
+    taken = read_clip(clip, None, tmp_path / "cache", 1280)
+    np.testing.assert_allclose(taken.times, np.array(SECONDS) - 100)
+    assert taken.fps == pytest.approx(5 / 0.9)
+    assert read_clip(clip, 5.0, tmp_path / "cache", 1280).numbers == (0, 2, 3, 4, 5)  # (0, 2, 4) by its own
+    with VideoReader(clip.path) as reader:
+        assert [frame.time for frame in reader.frames()] == pytest.approx([each - 100 for each in SECONDS])
+        assert reader.declared == 6
+    (tmp_path / "a.times.csv").unlink()
+    assert read_clip(clip, None, tmp_path / "cache", 1280).times == pytest.approx(np.arange(6) / 10)  # decoded anew
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (["0, 1", "1, 2"], "has the times of 2 frames, and .*a.mp4 has more"),
+        ([f"{each}, {each}" for each in range(8)], "of 8 frames, and .*a.mp4 only 6; is it the table of another"),
+        (["0, 1", "2, 2"], "has 2 frames, but none of them is 1; number them all from 0"),
+        (["0, 1", "1, 1"], "has frame 1 at 1 s, not after 1 s; times must ascend"),
+        (["0, soon"], "line 2: 'soon' is no time; expected the columns 'frame'"),
+        ([], "contains no time"),
+    ],
+)
+def test_a_table_that_does_not_fit_its_video_is_refused(rows, message, tmp_path):
+    video = timed_video(tmp_path, rows)
+    with pytest.raises(DataError, match=message), VideoReader(video) as reader:
+        list(reader)

@@ -1,8 +1,9 @@
-"""When the images of a folder were taken: by a table beside them, by stamps in their names, or by EXIF."""
+"""When frames were taken: by a table beside them; images of a folder also by stamps in their names, or by EXIF."""
 
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import os
 import re
@@ -16,7 +17,8 @@ from saunet.errors import DataError
 from saunet.io.images import name_times
 
 TIMES = "times.csv"
-"""A folder's table of times."""
+"""A folder's table of times; that of a video is ``NAME.times.csv`` beside it."""
+_VIDEO_FORMAT = "expected the columns 'frame' (its number, from 0) and 'time' (seconds)"
 _FORMAT = "expected the columns 'file' (name of the image) and 'time' (seconds)"
 _HEAD = 1 << 16
 """Bytes of a JPEG that hold its EXIF block: a segment is no longer."""
@@ -35,25 +37,57 @@ def frame_times(folder: Path, names: Sequence[str]) -> list[float] | None:
     return name_times([name.rpartition(".")[0] for name in names]) or _exif_times(folder, names)
 
 
-def _table_times(path: Path, names: Sequence[str]) -> list[float]:
+def times_file(video: Path) -> Path:
+    """Return where the table of a video's times is, if there is one."""
+    return video.with_suffix(f".{TIMES}")
+
+
+def video_times(video: Path) -> list[float] | None:
+    """Return the seconds of all frames of a video since its first one, by the table beside it; None without one.
+
+    Raises:
+        DataError: if it leaves a frame out, or its times do not ascend.
+    """
+    path = times_file(video)
+    if not path.is_file():
+        return None
+    found = _table(path, "frame", _VIDEO_FORMAT)
+    times = [found.get(str(number), math.nan) for number in range(len(found))]
+    for number, (before, after) in enumerate(itertools.pairwise([-math.inf, *times])):
+        if math.isnan(after):
+            raise DataError(f"{path} has {len(times)} frames, but none of them is {number}; number them all from 0")
+        if after <= before:
+            raise DataError(f"{path} has frame {number} at {after:g} s, not after {before:g} s; times must ascend")
+    if not times:
+        raise DataError(f"{path} contains no time; {_VIDEO_FORMAT}")
+    return [seconds - times[0] for seconds in times]
+
+
+def _table(path: Path, key: str, expected: str) -> dict[str, float]:
+    """Return the seconds in a table by what stands in another column."""
     found: dict[str, float] = {}
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             table = csv.DictReader(file, skipinitialspace=True)
             table.fieldnames = columns = [name.strip() for name in table.fieldnames or ()]
-            if not {"file", "time"} <= set(columns):
-                raise DataError(f"{path} has the columns {', '.join(columns)[:100] or 'none'}; {_FORMAT}")
+            if not {key, "time"} <= set(columns):
+                raise DataError(f"{path} has the columns {', '.join(columns)[:100] or 'none'}; {expected}")
             for number, row in enumerate(table, 2):
                 seconds = math.nan
                 with suppress(ValueError):
                     seconds = float(row["time"] or "")
                 if not math.isfinite(seconds):
-                    raise DataError(f"{path}, line {number}: '{(row['time'] or '')[:40]}' is no time; {_FORMAT}")
-                found[os.path.basename((row["file"] or "").strip())] = seconds
+                    raise DataError(f"{path}, line {number}: '{(row['time'] or '')[:40]}' is no time; {expected}")
+                found[(row[key] or "").strip()] = seconds
     except OSError as reason:
         raise DataError(f"cannot read {path}: {reason.strerror or reason}") from reason
     except (UnicodeDecodeError, csv.Error) as reason:
-        raise DataError(f"{path} is not a CSV file of text ({reason}); {_FORMAT}") from reason
+        raise DataError(f"{path} is not a CSV file of text ({reason}); {expected}") from reason
+    return found
+
+
+def _table_times(path: Path, names: Sequence[str]) -> list[float]:
+    found = {os.path.basename(name): seconds for name, seconds in _table(path, "file", _FORMAT).items()}
     times = [found.get(name, found.get(os.path.splitext(name)[0])) for name in names]
     without = [name for name, seconds in zip(names, times, strict=True) if seconds is None]
     if without:

@@ -19,6 +19,7 @@ from jaxtyping import UInt8
 
 from saunet.errors import ConfigError, DataError, UnreadableError, one_of, positive
 from saunet.io.atomic import Session, replacing
+from saunet.io.times import times_file, video_times
 
 _CONTAINERS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ts", ".mts", ".m2ts", ".3gp")
 _OTHERS = (".3g2", ".flv", ".vob", ".lrv", ".ogv")
@@ -59,6 +60,8 @@ class VideoFrame:
 class VideoReader(Session):
     """Frames of a video file as RGB bytes, as a player shows them: in order, rotated, deinterlaced, in true colors.
 
+    Their times are those of ``NAME.times.csv`` beside the file, if there is one, else its own.
+
     Iterating reads from the start each time; one frame is in memory at a time. ``rate`` is for a bare stream
     (``.hevc``, ``.h264``) that does not contain its own. Frames wider than ``max_width`` shrink to it while their
     colors are converted, which takes half the time of shrinking them after.
@@ -95,6 +98,9 @@ class VideoReader(Session):
             mean, usual = self._rates(container, stream)
             self.fps, self._pace = mean or rate, usual or rate
             self.declared = self._count(container, stream)
+        self._times = video_times(self.path)
+        if self._times is not None and len(self._times) > 1:
+            self.fps, self._pace = (float(1 / of(np.diff(self._times))) for of in (np.mean, np.median))
 
     def __iter__(self) -> Iterator[Picture]:
         return (frame.image for frame in self.frames())
@@ -102,7 +108,7 @@ class VideoReader(Session):
     @property
     def timed(self) -> bool:
         """Whether frames have times."""
-        return self._timed or self.fps is not None
+        return self._timed or self._times is not None or self.fps is not None
 
     def frames(self, fps: float | int | None = None) -> Iterator[VideoFrame]:
         """Yield frames with their times: all, or those nearest to equal steps of time, ``fps`` of them per second."""
@@ -173,6 +179,14 @@ class VideoReader(Session):
         with self._opened() as (container, stream):
             for number, frame in enumerate(self._decoded(container, stream)):
                 self.count = number + 1
+                if self._times is not None:
+                    if number >= len(self._times):
+                        raise DataError(
+                            f"{times_file(self.path)} has the times of {len(self._times)} frames, and {self.name} has "
+                            "more; add the others"
+                        )
+                    yield number, self._times[number], frame
+                    continue
                 if not self._timed:
                     yield number, number / self.fps if self.fps else None, frame
                     continue
@@ -188,6 +202,11 @@ class VideoReader(Session):
             )
         if self._broken or _truncated(self.path):
             self.missing = max(1, (self.declared or 0) - self.count)
+        elif self._times is not None and self.count < len(self._times):
+            raise DataError(
+                f"{times_file(self.path)} has the times of {len(self._times)} frames, and {self.name} only "
+                f"{self.count}; is it the table of another video?"
+            )
 
     def _rates(self, container: Any, stream: Any) -> tuple[float | None, float | None]:
         """Return the mean rate, and the usual one: that of the median step between the first frames."""

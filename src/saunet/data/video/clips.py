@@ -24,7 +24,7 @@ from saunet.errors import DataError
 from saunet.io.atomic import partial_name, remove_partial_files, write_json
 from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, natural_order
 from saunet.io.plain import read_json
-from saunet.io.times import frame_times
+from saunet.io.times import frame_times, times_file
 from saunet.io.video import BARE_SUFFIXES, VIDEO_SUFFIXES, VideoReader, nearest_steps
 
 _NO_CLIPS = frozenset({"@eaDir", "__MACOSX"})
@@ -258,8 +258,9 @@ def _decode(
 
 
 def _key(path: Path, fps: float | None, max_width: int) -> str:
-    state = path.stat()
-    return short_hash(f"{path.resolve()}|{state.st_size}|{state.st_mtime_ns}|{fps}|{max_width}|{QUALITY}|times")
+    state, table = path.stat(), times_file(path)
+    clock = (table.stat().st_size, table.stat().st_mtime_ns) if table.is_file() else "times"
+    return short_hash(f"{path.resolve()}|{state.st_size}|{state.st_mtime_ns}|{fps}|{max_width}|{QUALITY}|{clock}")
 
 
 def short_hash(text: str) -> str:
