@@ -220,7 +220,8 @@ def seen_rays(
         now = shown(flat)
         columns = [(shown(flat + step * np.eye(2)[axis]) - now) / step for axis in range(2)]
         J = np.stack(columns, -1)
-        J[~(np.abs(np.linalg.det(J)) > 1e-3)] = np.eye(2)  # beyond what the lens shows, where it may be NaN too
+        J[~np.isfinite(J).all((1, 2))] = np.eye(2)  # beyond what the lens shows
+        J[np.abs(np.linalg.det(J)) < 1e-3] = np.eye(2)
         flat = flat - np.linalg.solve(J, np.nan_to_num(now - target)[..., None])[..., 0]
     angle = np.linalg.norm(flat, axis=-1)
     inside &= (np.linalg.norm(shown(flat) - target, axis=-1) < 1e-6) & (angle <= angles[last])
