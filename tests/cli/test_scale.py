@@ -158,7 +158,7 @@ def test_what_is_missing_is_one_sentence(
 
 
 def test_camera_height_needs_the_camera(recording: Path, street: SyntheticDrive) -> None:
-    with pytest.raises(ConfigError, match="needs camera: fx,fy,cx,cy in pixels of the images"):
+    with pytest.raises(ConfigError, match=r"needs camera: camera\.yaml, or \[fx,fy,cx,cy\] in pixels of the images"):
         measure(recording, street, TrueDepth(street), camera=None, method="camera_height", camera_height=1.65)
 
 

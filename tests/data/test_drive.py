@@ -70,6 +70,20 @@ def test_what_follows_from_what_is_known():
     assert drive.distance(1, 4) == pytest.approx(np.hypot(0.3, 3))
 
 
+def test_without_poses_the_distance_follows_from_speeds_and_times():
+    class Driven(Bare):
+        def time(self, index):
+            return {0: 10.0, 2: 10.5, 3: 10.7}[index]
+
+        def speed(self, index):
+            return {0: 4.0, 2: 6.0, 3: None}[index]
+
+    drive = Driven()
+    assert drive.distance(0, 2) == drive.distance(2, 0) == pytest.approx(2.5)
+    assert drive.distance(2, 2) == 0
+    assert drive.distance(0, 3) is None
+
+
 def test_a_proxy_forwards_every_member():
     assert vars(DriveProxy).keys() >= MEMBERS
 

@@ -287,7 +287,7 @@ class TestRefused:
     ) -> None:
         run(predictor, folder, tmp_path / "out")
         other = Predictor(network, 32, 64, flip=True)
-        with pytest.raises(ConfigError, match="made with another model; choose another output folder"):
+        with pytest.raises(ConfigError, match="made with another model or scale; choose another output folder"):
             run(other, folder, tmp_path / "out")
         with pytest.raises(ConfigError, match="made with another colormap"):
             run(predictor, folder, tmp_path / "out", colormap="turbo")

@@ -145,6 +145,10 @@ def test_fingerprint_follows_weights_and_settings(network: DepthNet) -> None:
     assert Predictor(network, 32, 64).fingerprint == one
     assert Predictor(network, 32, 64, flip=True).fingerprint != one
     assert Predictor(network, 32, 72).fingerprint != one
+    measured = Predictor(network, 32, 64)
+    assert measured.fingerprint == one  # asked for before the scale is known, as by the choice of the runtime
+    measured.scale = Scale(1.2, "speed")
+    assert measured.fingerprint == Predictor(network, 32, 64, scale=Scale(1.2, "speed")).fingerprint != one
     torch.nn.init.constant_(network.decoder.gain, 0.25)  # type: ignore[union-attr, arg-type]
     assert Predictor(network, 32, 64).fingerprint != one
 

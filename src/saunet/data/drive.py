@@ -130,12 +130,19 @@ class Drive(ABC):
     def distance(self, first: int, second: int) -> float | None:
         """Return the meters traveled between two frames, at least 0; None if unknown.
 
-        By default the straight line between their poses.
+        By default the straight line between their poses; without poses, the speed summed over the time of the frames
+        between.
         """
         T_world_first, T_world_second = self.pose(first), self.pose(second)
-        if T_world_first is None or T_world_second is None:
+        if T_world_first is not None and T_world_second is not None:
+            return float(np.linalg.norm(T_world_second[:3, 3] - T_world_first[:3, 3]))
+        between = [index for index in self.indices if min(first, second) <= index <= max(first, second)]
+        known = [(self.time(index), self.speed(index)) for index in between]
+        pairs = [(time, speed) for time, speed in known if time is not None and speed is not None]
+        if len(pairs) < len(known):
             return None
-        return float(np.linalg.norm(T_world_second[:3, 3] - T_world_first[:3, 3]))
+        times, speeds = np.reshape(pairs, (-1, 2)).T
+        return float((np.diff(times) * np.abs(speeds[1:] + speeds[:-1]) / 2).sum())
 
     def stereo(self) -> Drive | None:
         """Return the recording of the other camera of a rectified pair, which shares K and indices; None without one.

@@ -82,12 +82,17 @@ class Predictor(ImagePredictor):
             return np.asarray(disparity[:, 0].cpu().numpy())
 
     @functools.cached_property
-    def fingerprint(self) -> str:
-        """A short hash of the weights and of the settings that change results."""
+    def weights_hash(self) -> str:
+        """The SHA-256 of the weights."""
         digest = hashlib.sha256()
         for name, value in sorted(self.network.state_dict().items()):
             digest.update(name.encode())
             digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+        return digest.hexdigest()
+
+    @property
+    def fingerprint(self) -> str:
+        """A short hash of the weights and of the settings that change results, the scale among them."""
         factor = self.scale.factor if self.scale else None
-        digest.update(repr((self.height, self.width, self.flip, self.keep_aspect, factor)).encode())
-        return digest.hexdigest()[:16]
+        settings = (self.weights_hash, self.height, self.width, self.flip, self.keep_aspect, factor)
+        return hashlib.sha256(repr(settings).encode()).hexdigest()[:16]

@@ -184,7 +184,7 @@ def _why_not(predictor: ImagePredictor) -> str:
 def _cached(predictor: Predictor, name: str) -> Path:
     """Return where a conversion of exactly these weights at this size by these versions is kept."""
     versions = [f"{package} {version(package)}" for package in ("torch", *_PACKAGES[name])]
-    text = repr((predictor.fingerprint, predictor.height, predictor.width, versions))
+    text = repr((predictor.weights_hash, predictor.height, predictor.width, versions))
     key = hashlib.sha256(text.encode()).hexdigest()[:24]
     return Path(torch.hub.get_dir()) / "saunet" / f"{key}{'.xml' if name == 'openvino' else '.onnx'}"
 

@@ -83,7 +83,7 @@ def _batches(
             "measure with scale.store=true on recorded frames, then leave scale.method out"
         )
     if method != "speed":
-        K = _needed(method, "camera", camera, "fx,fy,cx,cy in pixels of the images")
+        K = _needed(method, "camera", camera, "camera.yaml, or [fx,fy,cx,cy] in pixels of the images")
         more["intrinsics"] = lambda height, width: K.resized(height, width).K
     with contextlib.ExitStack() as stack:
         recording, times = stack.enter_context(contextlib.closing(Recording(source))), list[float | None]()

@@ -104,8 +104,9 @@ class Manifest:
         current = json.loads(json.dumps(self.settings))
         changed = [key for key in current if not isinstance(previous, dict) or previous.get(key) != current[key]]
         if changed:
+            told = ["model or scale" if key == "model" else key for key in changed]
             raise ConfigError(
-                f"{folder} holds predictions made with another {', '.join(changed)}; "
+                f"{folder} holds predictions made with another {', '.join(told)}; "
                 "choose another output folder, or set overwrite=true"
             )
         clips = previous.get("clips")

@@ -71,7 +71,7 @@ def test_cuts_are_counted_whoever_reads_the_frames(tmp_path):
     images = make_drive(tmp_path / "k", 1, frames=range(20), sides=(2,)) / "image_02" / "data"
     for number, picture in enumerate([*one, *other]):
         cv2.imwrite(str(images / f"{number:010d}.png"), cv2.resize(picture, (60, 20)))
-    assert "warning: 1 frames hardly resemble their neighbor, such as 10 of" in look(kitti(tmp_path / "k"))[2]
+    assert "warning: frames that hardly resemble their neighbor: 1, such as 10 of" in look(kitti(tmp_path / "k"))[2]
 
 
 def test_bad_frames_are_found_and_left_out(tmp_path):

@@ -147,7 +147,7 @@ class Division(NamedTuple):
             fix.append(f"{val}=[NAME]")
         if self.val and {*self.val} == {*self.test}:
             told.append(f"validation and test are the same {len(self.val)} frames, on which best.ckpt is chosen")
-            fix.append(f"{test}=[NAME]")
+            fix.append(f"{test}=[{'ANOTHER' if fix else 'NAME'}]")
         if not told:
             return None
         whole = f"hold out whole recordings with {' and '.join(fix)}"

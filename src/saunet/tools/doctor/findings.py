@@ -162,10 +162,10 @@ def _camera(camera: CameraFacts) -> Iterator[Finding]:
     found = camera.estimate
     if found is not None and found.contradicts(camera.recorded):
         given = camera.recorded * width
-        before = f" ({given:.1f} before undistortion)" if abs(given - fx) > 0.05 else ""
         text = (
-            f"{told}{before} contradicts the pictures: turns in them say a focal length of {found.focal * width:.0f}, "
-            f"{found.focal / camera.recorded:.2f} times the given one, known to {found.uncertainty:.1%}"
+            f"'{camera.drive}': the given focal length, {given:.1f} pixels, contradicts the pictures: their turns say "
+            f"{found.focal * width:.1f}, {found.focal / camera.recorded:.2f} times the given one, known to "
+            f"{found.uncertainty:.1%} (both before any undistortion, as in camera.yaml)"
         )
         fix = (
             "give the K and the distortion of this camera and this mode, calibrate (saunet calibrate with a board, or "
@@ -257,8 +257,11 @@ def _cuts(survey: Survey) -> Iterator[Finding]:
     usual = float(np.median([frame.change or 0 for frame in survey.compared()] or [0]))
     apart = [frame for frame in survey.compared() if (frame.change or 0) >= max(CUT, PEAK * usual)]
     if apart:
-        text = f"{len(apart)} frames hardly resemble their neighbor, such as {apart[0].index} of '{apart[0].drive}'"
-        yield Finding("warning", text, "is there a cut, or do several recordings share a folder? Put each into its own")
+        text = (
+            f"frames that hardly resemble their neighbor: {len(apart)}, such as {apart[0].index} of '{apart[0].drive}'"
+        )
+        fix = "if there is a cut, or recordings share a folder, put each into its own; a fast turn can look so too"
+        yield Finding("warning", text, fix)
 
 
 def _doubled(survey: Survey) -> Iterator[Finding]:
