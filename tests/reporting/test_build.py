@@ -363,6 +363,17 @@ def test_other_systems_are_compared_under_their_names(tmp_path: Path) -> None:
     assert "predictions" not in text
 
 
+def test_jobs_that_were_evaluated_without_ground_truth_are_not_asked_to_be(sweep: Path) -> None:
+    def left_out() -> set[str]:
+        return {one.what for one in build(collect([sweep]), ReportOptions(figures=False)).missing}
+
+    assert "Errors and accuracy of the jobs of sweeps" in left_out()
+    for job in sweep.iterdir():
+        if job.is_dir():
+            _explained(job / "evaluation", 0.1)
+    assert "Errors and accuracy of the jobs of sweeps" not in left_out()
+
+
 def test_figure_10_has_a_point_where_a_run_was_timed_at_its_own_size(everything: list[Path], tmp_path: Path) -> None:
     place = tmp_path / "bench" / "benchmark.json"
     row = {**json.loads(place.read_text())["results"][0], "batch_size": 1, "median": 0.01}

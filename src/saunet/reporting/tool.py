@@ -199,7 +199,7 @@ def build(
         sections.append(Section("Accuracy and time", [*(_speed(points) if points and draw else ()), table10]))
     missing += [*_no_pictures(views, galleries), *no_rows, *no_sizes, *no_ablation, *no_speed]
     missing.append(Missing("Published curves and pictures", "the paper prints them as images only"))
-    if len(shown) < len(everyone):
+    if any(name not in shown and not run.explained for name, run in everyone.items()):
         why = "they are in the tables of their sweeps; evaluate their checkpoints to have them here too"
         missing.append(Missing("Errors and accuracy of the jobs of sweeps", why))
     return Document(options.title, _facts(everyone), tuple(sections), tuple(missing))
