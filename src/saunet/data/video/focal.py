@@ -53,8 +53,8 @@ _FINE = (0.05, 0.01, 0.01)
 """Steps around the best ones: two to each side, whose residuals a parabola averages."""
 _LEAST = (0.05, 0.005, 0.005)
 """What is smaller counts as nothing."""
-_SHARPEST = 6
-"""Windows that are solved for each lens; three are needed."""
+_SHARPEST = 10
+"""Windows that are solved for each lens; three are needed, and of six the doubt is mostly chance."""
 _MODEL = 0.2
 """Doubt about the form of the lens, as a share of what its bend changes the focal length by, where half a picture is as
 wide as a focal length; it falls with the fourth power."""
