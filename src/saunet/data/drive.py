@@ -136,6 +136,8 @@ class Drive(ABC):
         T_world_first, T_world_second = self.pose(first), self.pose(second)
         if T_world_first is not None and T_world_second is not None:
             return float(np.linalg.norm(T_world_second[:3, 3] - T_world_first[:3, 3]))
+        if self.speed(first) is None:  # before every index is listed, which may read a folder
+            return None
         between = [index for index in self.indices if min(first, second) <= index <= max(first, second)]
         known = [(self.time(index), self.speed(index)) for index in between]
         pairs = [(time, speed) for time, speed in known if time is not None and speed is not None]

@@ -40,8 +40,8 @@ def check_focal(
         lens: Its center and the shape of its pixels are taken as they are.
         width: Of the pictures of its K, pixels.
         most: How many windows to solve: those that turn most.
-        seconds: Processor time after which no more is done than is needed. A contradiction is looked at again all the
-            same.
+        seconds: Processor time after which only the windows that are needed are solved; a contradiction is checked
+            again even then.
 
     Returns:
         To be compared with ``lens.K[0, 0] / width``; None if no window has enough points to follow.
