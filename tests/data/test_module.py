@@ -50,6 +50,21 @@ def test_batches_are_the_same_whatever_the_workers(workers):
         assert torch.equal(a["K"], b["K"])
 
 
+def test_any_data_set_gives_the_way_traveled():
+    data = module(with_speed=True)
+    data.setup("fit")
+    batch = batches(data, data.train_dataloader())[0]
+    torch.testing.assert_close(batch["distance"], torch.full((4, 2), 1.01**0.5))  # frames are (0.1, 0, 1) m apart
+
+
+def test_the_way_traveled_is_refused_where_nothing_knows_it(monkeypatch):
+    data = module(with_speed=True)
+    monkeypatch.setattr(NumberDrive, "pose", lambda self, index: None)
+    with pytest.raises(DataError, match=r"with_speed is true but no training frame of Drives has a speed .*set data"):
+        data.setup("fit")
+    module().setup("fit")
+
+
 def test_another_seed_gives_other_batches():
     names = []
     for seed in (0, 1):

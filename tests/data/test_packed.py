@@ -99,6 +99,14 @@ def test_depth_poses_and_pairs(tmp_path, stereo):
     assert {"distance", "T_src_tgt", "target_depth"} <= batches(again, "train")[0].keys()
 
 
+def test_distances_can_be_asked_for_afterwards(tmp_path):
+    source = street(tmp_path, stereo=False)
+    alike(source, tmp_path / "packed")
+    again = packed(tmp_path / "packed", with_speed=True)
+    again.setup("fit")
+    assert batches(again, "train")[0]["distance"].isfinite().all()
+
+
 def test_kitti_with_scans(tmp_path, kitti_mini):
     again = alike(kitti(kitti_mini / "raw", target_depth=True), tmp_path / "packed")
     assert batches(again, "train")[0]["target_depth"].any()

@@ -28,7 +28,7 @@ class MixedDataModule(DepthDataModule):
 
     On the command line: ``data=mixed +data@data.sources.town=kitti +data@data.sources.clips=video`` and then
     ``data.sources.town.root=...``. What every data set has (size, offsets, batch, augmentation) is set for the mixture.
-    With a source's ``with_speed`` its batches carry the way traveled, and those of other sources say it is unknown.
+    With ``with_speed`` of one source alone, its batches carry the way traveled and those of others say it is unknown.
 
     Args:
         sources: Name -> data module; names start the names of samples.
@@ -70,7 +70,7 @@ class MixedDataModule(DepthDataModule):
             key: tuple(one_of(key, name, self.sources) for name in names) or tuple(self.sources)
             for key, names in (("train", train), ("test", test))
         }
-        with_speed = frozenset(name for name, source in self.sources.items() if source.odometer)
+        with_speed = frozenset(name for name, source in self.sources.items() if source.odometer or self.odometer)
         self.odometer = partial(_distance, with_speed) if with_speed else None
         self.ground_truth, self.protocol = _truth([self.sources[name] for name in self._names["test"]])
 

@@ -283,10 +283,7 @@ class Velocity(Term):
         if "distance" not in batch and "T_src_tgt" in batch:
             distance = torch.linalg.vector_norm(batch["T_src_tgt"][..., :3, 3], dim=-1)
         else:
-            fix = (
-                "set data.with_speed=true or data.with_pose=true where the data set has it (one of your own: "
-                "docs/add_dataset.md), or drop the term"
-            )
+            fix = "set data.with_speed=true where the data set has speeds or poses, or drop the term"
             distance = require(batch, "distance", "the velocity term", fix)
         # The norm's gradient at zero motion is 0, not NaN.
         predicted = torch.linalg.vector_norm(poses[:, :predictions, :3, 3], dim=-1)

@@ -15,7 +15,7 @@ from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
 from saunet.data.loading.selecting import BETWEEN, Frame, has_speed, hold_out, hold_out_drives, moving, with_truth
 from saunet.data.loading.stored import DENSE_KINDS, DepthMaps
-from saunet.data.loading.windows import Selection, measured_distance, reach
+from saunet.data.loading.windows import Selection, reach
 from saunet.errors import ConfigError, DataError, in_range, one_of, suggest
 from saunet.registry import datamodules
 
@@ -48,7 +48,6 @@ class KittiDataModule(DepthDataModule):
             beforehand by ``saunet prepare densify``; ``none`` uses the scan.
         teacher: Batches carry another model's depth, made beforehand by ``saunet prepare teacher``.
         maps: Folder of these maps; None: beside the recordings.
-        with_speed: Batches carry the way traveled, from OXTS, for the velocity term; unknown where a record lacks.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
@@ -77,7 +76,6 @@ class KittiDataModule(DepthDataModule):
         maps: str | None = None,
         cache: str | None = None,
         stereo: bool = False,
-        with_speed: bool = False,
         **loading: Unpack[Loading],
     ) -> None:
         super().__init__(target_depth=target_depth or dense != "none", stereo=stereo, cache=cache, **loading)
@@ -100,7 +98,6 @@ class KittiDataModule(DepthDataModule):
             self.maps["target_depth"] = DepthMaps(dense, maps)
         if teacher:
             self.maps["target_teacher"] = DepthMaps("teacher", maps)
-        self.odometer = measured_distance if with_speed else None
 
     def select(self, split: str) -> Sequence[Selection]:
         raw = self._raw = self._raw or KittiRaw(self.root, self.annotated)

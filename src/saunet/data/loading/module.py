@@ -5,6 +5,7 @@ A data set subclasses `DepthDataModule`, names its own parameters beside the sha
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence, Set
 from typing import Any
@@ -31,6 +32,7 @@ from saunet.data.loading.windows import (
     WindowDataset,
     collate,
     find_windows,
+    measured_distance,
 )
 from saunet.errors import ConfigError, DataError, checked
 from saunet.types import EvalBatch, FrameBatch, TrainBatch
@@ -110,7 +112,7 @@ class DepthDataModule(LightningDataModule):
         self.prepare = Prepare(self.height, self.width)
         self.maps: dict[str, DepthMaps] = {}
         self.copies = ImageCache(cache) if cache else None
-        self.odometer: Odometer | None = None
+        self.odometer: Odometer | None = measured_distance if options.with_speed else None
         self.usage: dict[str, list[Usage]] = {}
         self.datasets: dict[str, WindowDataset] = {}
 
@@ -209,6 +211,8 @@ class DepthDataModule(LightningDataModule):
                 keep = ", or set data.static=keep" if self.static not in (None, "keep") else ""
                 advice = f"{still} frames show no motion (doubled or standing): give longer clips that move{keep}"
             raise DataError(f"split '{split}' has no usable frame ({found}); {advice}")
+        if split == "train" and self.odometer is not None:
+            self._check_distances(self.odometer, selections, windows)
         self.usage[split] = usage
         kind = SkippingWindows if self.on_error == "skip" and split == "train" else WindowDataset
         return kind(
@@ -225,6 +229,23 @@ class DepthDataModule(LightningDataModule):
             stereo=stereo,
             odometer=self.odometer if together else None,
             maps=self.maps if together else {},
+        )
+
+    def _check_distances(
+        self, odometer: Odometer, selections: Sequence[Selection], windows: Sequence[tuple[int, int]]
+    ) -> None:
+        """Refuse data that know no way traveled at all, where the velocity term would train nothing."""
+        for place, frame in windows:
+            for offset in self.offsets:
+                try:
+                    if math.isfinite(odometer(selections[place].drive, frame, frame + offset)):
+                        return
+                except DataError:
+                    if self.on_error != "skip":
+                        raise
+        raise DataError(
+            f"with_speed is true but no training frame of {self.root or type(self).__name__} has a speed with its "
+            "time, or a pose; add them, or set data.with_speed=false"
         )
 
     def _margin(self, split: str) -> tuple[int, int]:

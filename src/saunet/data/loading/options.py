@@ -27,6 +27,8 @@ class LoadOptions:
         color_jitter_prob: Probability of color jitter in training.
         track_motion: Take the camera's motion from tracked points instead of the pose network, which then learns it
             through ``objective.extra.tracked_motion``; see `saunet.geometry.tracks.tracked_motion`.
+        with_speed: Batches carry the way traveled between the frames, for the velocity term: from speeds and
+            times, or from poses.
         guess_camera: Start from 60 degrees of view where the camera is unknown and its frames do not tell it; else such
             data are refused. ``model.intrinsics=learned`` sets it.
         seed: Decides order, augmentation, and what is held out at random.
@@ -47,6 +49,7 @@ class LoadOptions:
     flip_prob: float = 0.5
     color_jitter_prob: float = 0.5
     track_motion: bool = False
+    with_speed: bool = False
     guess_camera: bool = False
     seed: int = 0
     manifest: str | None = None
@@ -75,6 +78,7 @@ class Loading(TypedDict, total=False):
     flip_prob: float
     color_jitter_prob: float
     track_motion: bool
+    with_speed: bool
     guess_camera: bool
     seed: int
     manifest: str | None

@@ -88,7 +88,7 @@ class PackedDataModule(DepthDataModule):
         for key in KEPT:
             setattr(self, key, plain[key])
         self.neighbors = tuple(dict.fromkeys((*plain["neighbors"], *self.neighbors)))
-        self.odometer = measured_distance if plain["with_speed"] else None
+        self.odometer = measured_distance if plain["with_speed"] or self.odometer else None
         self.maps = {key: _PackedMaps(key, kind) for key, kind in plain["maps"].items()}
         self._store.starts = list(itertools.accumulate(plain["shards"], initial=0))
         self._facts = plain

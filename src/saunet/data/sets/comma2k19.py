@@ -11,7 +11,6 @@ from typing_extensions import Unpack
 
 from saunet.data.drive import Drive
 from saunet.data.loading.options import Loading
-from saunet.data.loading.windows import measured_distance
 from saunet.data.sets.base import FilesDrive, report_missing, transform
 from saunet.data.sets.files import RecordingsDataModule
 from saunet.data.video.camera import CameraFile
@@ -61,7 +60,6 @@ class CommaDataModule(RecordingsDataModule):
     Args:
         root: Folder of the chunks, routes or segments (``video.hevc`` beside ``global_pose``).
         fps: Frames per second to use; the video has 20.
-        with_speed: Batches carry the way traveled between the poses, for the velocity term.
         val_drives: Segments to validate on, by name below the root or by pattern.
         test_drives: Segments to test and predict; by default the held-out frames.
         val_share: Share to hold out where none are named: whole segments where there are ten, else their tails.
@@ -82,7 +80,6 @@ class CommaDataModule(RecordingsDataModule):
         *,
         root: str = "data/comma2k19",
         fps: float = 10.0,
-        with_speed: bool = False,
         val_drives: Sequence[str] = (),
         test_drives: Sequence[str] = (),
         val_share: float = 0.1,
@@ -96,7 +93,6 @@ class CommaDataModule(RecordingsDataModule):
         self.root, self.fps = root, float(positive("fps", fps))
         self.frames_cache = default_cache() if frames_cache is None else Path(frames_cache).expanduser()
         self.max_width = int(positive("max_width", max_width))
-        self.odometer = measured_distance if with_speed else None
         self.hold_out(val_drives, test_drives, val_share)
 
     def prepare_data(self) -> None:

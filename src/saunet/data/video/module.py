@@ -25,7 +25,7 @@ from saunet.data.drive import GAP, Drive, LensModel
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
 from saunet.data.loading.selecting import BETWEEN, Division, divide
-from saunet.data.loading.windows import Selection, measured_distance, reach
+from saunet.data.loading.windows import Selection, reach
 from saunet.data.video.camera import FILE_NAME, CameraFile, Lens, check_crop, write_camera
 from saunet.data.video.clips import (
     Clip,
@@ -280,7 +280,6 @@ class VideoDataModule(DepthDataModule):
         crop: Shares to cut off at the [top, bottom, left, right], such as ``[0,0.12,0,0]`` for a bonnet; by default
             those of the camera file.
         camera_height: Meters from the road to the camera, for clips whose camera file does not say.
-        with_speed: Batches carry the way traveled by a clip's ``speeds.csv``, for the velocity term.
         align_speeds: Find the clock of each ``speeds.csv`` by the optical flow, if it is not that of the frames.
         frames_cache: Folder for decoded videos and measurements; by default in the user's cache folder.
         max_width: Frames of videos are kept at most this wide.
@@ -311,7 +310,6 @@ class VideoDataModule(DepthDataModule):
         static: Literal["drop", "keep"] = "drop",
         crop: Sequence[float] | None = None,
         camera_height: float | None = None,
-        with_speed: bool = False,
         align_speeds: bool = False,
         frames_cache: str | None = None,
         max_width: int = 1280,
@@ -332,7 +330,7 @@ class VideoDataModule(DepthDataModule):
         self._height = None if camera_height is None else float(positive("camera_height", camera_height))
         self.frames_cache = default_cache() if frames_cache is None else Path(frames_cache).expanduser()
         self.max_width = int(positive("max_width", max_width))
-        self.odometer, self.align_speeds = measured_distance if with_speed else None, align_speeds
+        self.align_speeds = align_speeds
         self._drives: list[ClipDrive] | None = None
         self._broken: list[str] = []
 
