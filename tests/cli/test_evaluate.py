@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,48 @@ def results(folder: Path) -> dict[str, dict[str, Any]]:
 def table(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def test_a_run_is_scored_on_its_own_data(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    shutil.copy(smoke_run / "checkpoints" / "best.ckpt", run / "checkpoints")
+    record = json.loads((smoke_run / "run.json").read_text())
+    record["config"]["data"]["train_drives"] = 3  # as if given on the command line
+    (run / "run.json").write_text(json.dumps(record))
+    for source in (str(run), checkpoint(run)):
+        outcome = tool("evaluate", source, "baselines=false", "output_dir=out")
+        assert outcome.code == 0, outcome.err
+        said = next(line for line in outcome.out.splitlines() if line.startswith("data: those of "))
+        assert "run: data=synthetic_tiny" in said
+        assert "data.train_drives=3" in said
+        assert len(table(tmp_path / "out" / "per_image.csv")) == 6
+    outcome = tool("evaluate", str(run), "output_dir=out")  # a baseline reads the training split
+    assert "train (3 of 3 drives)" in outcome.err + outcome.out
+    outcome = tool("evaluate", str(run), "data=synthetic_tiny", "baselines=false", "output_dir=out")
+    assert "also has data.train_drives=3; without it, frames that it was trained on" in outcome.out
+    outcome = tool("evaluate", str(run), "data=synthetic_tiny", "data.train_drives=3", "output_dir=out")
+    assert "trained on" not in outcome.out + outcome.err
+
+
+def test_a_run_on_the_data_set_of_a_plugin_names_it(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(smoke_run, run)
+    record = json.loads((run / "run.json").read_text())
+    record["choices"]["data"] = "my_drives"
+    record["overrides"] = ["plugins=[my_data.py]", "data=my_drives"]
+    (run / "run.json").write_text(json.dumps(record))
+    outcome = tool("evaluate", str(run), "output_dir=out")
+    outcome.says("trained on data=my_drives", "add plugins=[my_data.py]", "or choose data=...")
+    assert tool("evaluate", str(run), "data=synthetic_tiny", "output_dir=out").code == 0
+
+
+def test_without_a_run_the_default_data_are_named(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
+    shutil.copy(smoke_run / "checkpoints" / "best.ckpt", tmp_path / "alone.ckpt")
+    outcome = tool(
+        "evaluate", "alone.ckpt", "data.width=96", "data.frames_per_drive=3", "data.train_drives=1", "output_dir=out"
+    )
+    assert "data: rendered streets, data=synthetic; to score on others, give data=..." in outcome.out
 
 
 def test_protocols_side_by_side_each_on_its_own_truth(

@@ -215,7 +215,7 @@ def test_names_from_outside_cannot_become_markup() -> None:
 
 def _compared(*paths: Path) -> str:
     stream = io.StringIO()
-    tables, left_out = compared(collect(list(paths)), ())
+    tables, left_out, _ = compared(collect(list(paths)), ())
     show(tables, Console(file=stream, width=200))
     return stream.getvalue() + "".join(f"left out: {sentence}\n" for sentence in left_out)
 
@@ -226,8 +226,33 @@ def test_two_runs_are_compared_image_by_image(tmp_path: Path) -> None:
         make_evaluation(folder / "test", "x", value)
     text = _compared(*runs)
     assert re.search(r"objective\.beta\s+0\.1\s+0\.2", text)
-    assert "synthetic: second 'b' against first 'a'" in text
+    assert "synthetic: 'b' minus 'a'" in text
     assert re.search(r"Abs Rel ↓\s+0\.2750\s+0\.3250\s+\+0\.0500\s+\+0\.0500\s+\+0\.0500\s+0%\s+–", text)
+
+
+def test_a_comparison_writes_every_image_of_each_run(tmp_path: Path) -> None:
+    one, two = (make_run(tmp_path / name, beta=beta) for name, beta in (("a", 0.1), ("b", 0.2)))
+    make_evaluation(one / "test", "x", 0.25)
+    make_evaluation(two / "test", "x", 0.3)
+    _explained(one / "views", 0.1)
+    _explained(two / "views", 0.2)
+    report(ReportOptions(runs=(one, two), compare=True, output_dir=tmp_path / "out"))
+    lines = list(csv.DictReader((tmp_path / "out" / "images.csv").read_text().splitlines()))
+    assert [line["protocol"] for line in lines] == ["campus"] * 6 + ["synthetic"] * 6
+    assert [float(line["warped b"]) for line in lines[:3]] == pytest.approx([0.2, 0.21, 0.22])
+    assert [line["warped a"] for line in lines[6:]] == [""] * 6  # of depth, not of views
+    assert all(float(line["abs_rel b"]) - float(line["abs_rel a"]) == pytest.approx(0.05) for line in lines[6:])
+
+
+def test_two_evaluations_of_one_model_are_told_what_compares_them(tmp_path: Path) -> None:
+    folders = [make_evaluation(tmp_path / name, "street", 0.25) for name in ("one", "two")]
+    with pytest.raises(DataError, match=r"are of one model, street; .* run the second again with compare=.*one"):
+        compared(collect(folders, strangers=False), ())
+
+
+def test_curves_are_not_missed_where_nothing_was_trained(tmp_path: Path) -> None:
+    page = report(ReportOptions(runs=(_explained(tmp_path / "before", 0.2),)))
+    assert not [said for said in page.left_out if "during training" in said]
 
 
 def test_up_to_four_runs_are_compared_each_with_each_and_more_with_the_first(tmp_path: Path) -> None:
@@ -235,12 +260,12 @@ def test_up_to_four_runs_are_compared_each_with_each_and_more_with_the_first(tmp
     runs = [make_run(tmp_path / name, beta=0.1 + 0.1 * place) for place, name in enumerate(names)]
     for folder in runs[:4]:
         make_evaluation(folder / "test", "x", 0.25)
-    pairs = re.findall(r"second '(\w)' against first '(\w)'", _compared(*runs[:3]))
+    pairs = re.findall(r"'(\w)' minus '(\w)'", _compared(*runs[:3]))
     assert pairs == [("b", "a"), ("c", "a"), ("c", "b")]
     text = _compared(*runs[:3], runs[4])
     assert text.count("not evaluated") == 1  # with the first alone
-    assert len(re.findall(r"against first '[abc]'", text)) == 3
-    pairs = re.findall(r"second '(\w)' against first '(\w)'", _compared(*runs))
+    assert len(re.findall(r"minus '[abc]'", text)) == 3
+    pairs = re.findall(r"'(\w)' minus '(\w)'", _compared(*runs))
     assert pairs == [("b", "a"), ("c", "a"), ("d", "a")]
 
 
@@ -275,7 +300,7 @@ def test_runs_on_clips_without_ground_truth_are_compared_frame_by_frame(tmp_path
     _explained(one / "test", 0.1)
     _explained(two / "test", 0.2)
     text = _compared(one, two)
-    assert "campus: second 'b' against first 'a'" in text
+    assert "campus: 'b' minus 'a'" in text
     assert re.search(r"warped ↓\s+0\.1250\s+0\.2250\s+\+0\.1000\s+\+0\.1000\s+\+0\.1000\s+0%", text)
     assert re.search(r"explained ↑\s+0\.8000\s+0\.8000\s+\+0\.0000", text)
     assert "left out" not in text
@@ -290,10 +315,10 @@ def test_a_model_without_a_pose_network_is_compared_and_the_motion_of_both_is_sa
     after = make_run(tmp_path / "after", status="finished")
     _explained(after / "network", 0.12)
     text = " ".join(_compared(before, after).split())
-    assert "campus: second 'after' against first 'before'" in text  # as they are named
+    assert "campus: 'after' minus 'before'" in text  # as they are named
     assert not {"unknown", "None"} & set(text.split())
     text = " ".join(_compared(after, before).split())
-    assert "the first with the pose network's motion, the second with motion=tracked" in text
+    assert "after with the pose network's motion, before with motion=tracked" in text
     assert re.search(r"warped ↓ 0\.1450 0\.2250 \+0\.0800", text)
     assert "video, test split, motion=tracked" in text  # the heading of its row among the conditions
     _explained(after / "tracked", 0.1, motion="tracked")
@@ -333,7 +358,7 @@ def test_among_all_evaluations_those_of_the_same_images_are_paired(tmp_path: Pat
     make_evaluation(one / "zzz_other", "x", 0.9, drive="another drive")
     make_evaluation(two / "test", "x", 0.3)
     text = _compared(one, two)
-    assert text.count("against first") == 1
+    assert text.count("minus") == 1
     assert re.search(r"Abs Rel ↓\s+0\.2750\s+0\.3250\s+\+0\.0500", text)
     assert "left out" not in text
 
@@ -357,8 +382,8 @@ def test_other_systems_are_compared_under_their_names(tmp_path: Path) -> None:
     make_evaluation(ours / "test", "x", 0.25)
     theirs = [make_evaluation(tmp_path / f"foreign_{key}", None, 0.3, predictions=f"{key}.npy") for key in "ab"]
     text = _compared(ours, *theirs)
-    assert "second 'foreign_a' against first 'ours'" in text
-    assert "second 'foreign_b' against first 'ours'" in text
+    assert "'foreign_a' minus 'ours'" in text
+    assert "'foreign_b' minus 'ours'" in text
     assert "?" not in text
     assert "predictions" not in text
 
@@ -414,7 +439,7 @@ def test_the_shipped_model_is_compared_with_a_run_under_its_own_name(
     make_evaluation(run / "compared", "x", 0.25)
     make_evaluation(run / "compared_street", "street", 0.3)
     text = _compared(Path("street"), run)
-    assert "second 'town' against first 'street'" in text
+    assert "'town' minus 'street'" in text
     assert "left out" not in text
     document = build(collect([run]), ReportOptions(figures=False))  # which shows both
     parameters = next(table for table in document.tables if table.name == "table2")

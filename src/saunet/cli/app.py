@@ -180,6 +180,8 @@ def _run(name: str, argv: Sequence[str]) -> int:
     plugins.load(named_plugins(argv))
     table = read()
     flags, overrides = read_words(argv, tool, table)
+    if name == "evaluate" and not (flags.help or flags.cfg or flags.info):
+        overrides = [*data_of_run(overrides, table), *overrides]
     from saunet.cli import compose
 
     config, given = flags.config_name or tool.config or name, [*tool.preset, *overrides]
@@ -214,6 +216,35 @@ def resumed(words: Sequence[str]) -> list[str]:
         raise ConfigError(f"saunet resume takes the folder of a run, with its run.json; got {given}")
     again = [word for word in content.get("overrides", []) if not word.startswith("resume=")]
     return [*again, f"resume={folder / 'checkpoints' / 'last.ckpt'}", f"hydra.run.dir='{folder}'", *words[1:]]
+
+
+def data_of_run(overrides: Sequence[str], table: Table) -> list[str]:
+    """Return the overrides that choose the data a run was trained on, where a command line evaluates it and names none.
+
+    Says which data are meant, for scores of others would look just as plausible.
+    """
+    from saunet.cli import compose
+    from saunet.runs.folder import first_process
+
+    given = compose.parsed(overrides)
+    if "checkpoint" not in given or any(key.startswith("data@") for key in given):
+        return []
+    chosen = "data" in given
+    found, folder = compose.recorded_data(str(given["checkpoint"]), table, needed=not chosen)
+    recorded = compose.parsed(found)
+    if chosen:
+        same = all(str(given.get(key)) == str(recorded.get(key)) for key in ("data", "data.root"))
+        lacking = [word for word in found if same and word.partition("=")[0] in compose.OF_SPLITS - given.keys()]
+        if lacking and first_process():
+            print(
+                f"data: the run of {folder} also has {' '.join(lacking)}; without it, frames that it was trained on "
+                "may be scored: add it, or leave out data=... to take the run's data"
+            )
+        return []
+    if first_process():
+        said = f"those of {folder}: {' '.join(found)}" if found else "rendered streets, data=synthetic"
+        print(f"data: {said}; to score on others, give data=...")
+    return found
 
 
 def call(name: str, composed: Composed, table: Table) -> tuple[int, object]:

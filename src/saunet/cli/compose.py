@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import logging
+import re
 import sys
 import types
 import typing
@@ -38,14 +39,27 @@ from omegaconf._utils import get_yaml_loader
 
 from saunet import schema
 from saunet.cli.table import PLUGINS, TOOLS, TRAINER, Table, Tool, config_dir, read
-from saunet.cli.words import unknown
+from saunet.cli.words import hydra_value, unknown
 from saunet.errors import ConfigError, one_of
 from saunet.registry import Spec
+from saunet.runs.folder import read as read_run
 from saunet.weights.locate import of_run
 
 T = TypeVar("T")
 PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "predictions", "resume", "root")
 """Options that name files or folders."""
+_OF_TRAINING = ("height", "width", "track_motion", "with_speed", "flip_prob", "color_jitter_prob", "crop_margin")
+"""Settings of data that evaluation does not take over from a training; the size is that of the checkpoint."""
+OF_SPLITS = {
+    f"data.{key}"
+    for key in (
+        "split",
+        "seed",
+        "train_drives",
+        *(f"{split}_{what}" for split in ("val", "test") for what in ("clips", "drives", "share")),
+    )
+}
+"""Keys of data sets that decide which frames are trained on and which are held out."""
 _CONVERTED = (tuple, Sequence, Mapping, typing.Literal)
 
 
@@ -241,6 +255,43 @@ def of_job(cfg: DictConfig, hydra_cfg: DictConfig) -> Composed:
     choices, overrides = _plain(hydra_cfg.runtime.choices), tuple(hydra_cfg.overrides.task)
     chosen = {group: None if name is None else str(name) for group, name in choices.items()}
     return Composed(_plain(cfg), chosen, overrides, str(hydra_cfg.runtime.output_dir))
+
+
+def parsed(overrides: Sequence[str]) -> dict[str, object]:
+    """Return the keys that overrides set, with their values."""
+    made = OverridesParser.create().parse_overrides(list(overrides))
+    return {each.get_key_element().lstrip("+~"): each.value() for each in made}
+
+
+def recorded_data(checkpoint: str, table: Table, *, needed: bool = True) -> tuple[list[str], Path | None]:
+    """Return the overrides that choose the data of the run which a checkpoint belongs to, and the run's folder.
+
+    There are none for a checkpoint without a run, or without a choice of data in its record.
+
+    Raises:
+        ConfigError: if they are needed and the data set is of a plugin that is not loaded.
+    """
+    path = Path(checkpoint).expanduser()
+    folder = path if path.is_dir() else path.parent.parent
+    record = read_run(folder)
+    name, config = (record.get("choices") or {}).get("data"), (record.get("config") or {}).get("data")
+    if not name or not isinstance(config, Mapping):
+        return [], None
+    node = table.groups["data"].get(name)
+    if node is None and not needed:
+        return [], None
+    if node is None:
+        words = (word for word in record.get("overrides") or () if word.startswith(f"{PLUGINS.name}="))
+        plugin = next(words, f"{PLUGINS.name}=[FILE]")
+        raise ConfigError(
+            f"{folder} was trained on data={name}, which is not registered here; add {plugin}, or choose data=..."
+        )
+    values = {key.name: config[key.name] for key in node.keys if key.name in config and key.name not in _OF_TRAINING}
+    if any(isinstance(value, Mapping) for value in values.values()):  # a mixture's sources, each chosen by itself
+        return [word for word in record.get("overrides") or () if re.match(r"[+~]*data[.=@]", word)], folder
+    defaults = {key.name: key.default for key in node.keys}
+    changed = {key: value for key, value in values.items() if value != defaults[key]}
+    return [f"data={name}", *(f"data.{key}={hydra_value(value)}" for key, value in changed.items())], folder
 
 
 def _plain(cfg: DictConfig) -> dict[str, object]:

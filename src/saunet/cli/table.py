@@ -37,6 +37,7 @@ app checkpoints*: a page in the browser: drop a picture or a video, see its dept
     app
     app last.ckpt port=8000
 evaluate checkpoint: score a checkpoint, or predictions made elsewhere
+    evaluate runs/first
     evaluate last.ckpt data=kitti data.root=/data/kitti
     evaluate predictions=maps data=kitti
 odometry checkpoint: the camera's path through whole sequences, with its errors

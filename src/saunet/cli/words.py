@@ -188,6 +188,15 @@ def _list(value: str, kind: str) -> str:
     return f"[{','.join(_quoted(item.strip()) if kind.startswith('list[str') else item for item in items)}]"
 
 
+def hydra_value(value: object) -> str:
+    """Return a plain value, or a list of them, as Hydra's grammar has it."""
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(hydra_value, value))}]"
+    if isinstance(value, str):
+        return _quoted(value) if value else "''"
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def _quoted(text: str) -> str:
     """Return text in quotes, where Hydra would read it as something else without."""
     if len(text) > 1 and text[0] in "'\"" and text[-1] == text[0]:

@@ -201,7 +201,7 @@ class Comparison:
             good = (one.difference > 0) == (column.better > 0)
             cells = (column.label, *astuple(one)[1:])
             rows.append(Row(cells, marks={3: "good" if good else "bad"} if sure else {}))
-        title = f"{self.protocol}: second '{self.second}' against first '{self.first}'"
+        title = f"{self.protocol}: '{self.second}' minus '{self.first}'"
         told = f"{self.images} images, paired; {interval(self)}"
         return Table("comparison", title, headings, tuple(rows), (*notes, told))
 

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import itertools
 import shlex
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from saunet.errors import ConfigError, DataError
 from saunet.evaluation.files import read_rows
-from saunet.evaluation.rows import ERROR_COLUMNS, ImageRow, ViewRow
+from saunet.evaluation.rows import COMPARED, ERROR_COLUMNS, ImageRow, ViewRow
 from saunet.evaluation.statistics import compare as paired
 from saunet.reporting.inputs import Evaluation, Inputs, read_evaluation
 from saunet.reporting.tables import Groups, explained_table, health_tables, losses_table
 from saunet.runs.run import SUBJECTS, Run
 from saunet.runs.sweep import differing, settings, typed_names, values
-from saunet.tables import Column, Row, Table
+from saunet.tables import Column, Row, Table, csv_text
 from saunet.weights.locate import is_shipped
 
 _EACH_PAIR = 4
@@ -66,8 +67,8 @@ class Scored:
         return self.images == other.images and (self.of.how == other.of.how or self.of.foreign or other.of.foreign)
 
 
-def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
-    """Compare runs in pairs, image by image, wherever both were evaluated alike.
+def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str], dict[str, dict[str, Scored]]]:
+    """Compare runs in pairs, image by image, wherever both were evaluated alike; also return what was paired.
 
     Up to four runs, each is compared with each; of more, each with the first. Among all evaluations of two runs under a
     protocol, those of the same images and settings are paired.
@@ -75,6 +76,7 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
     names = list(runs)
     found = {name: _scored(run) for name, run in runs.items()}
     tables, left_out = [], []
+    rows: dict[str, dict[str, Scored]] = defaultdict(dict)
     for first, other in itertools.combinations(names, 2):
         if first != names[0] and len(names) > _EACH_PAIR:
             break
@@ -94,13 +96,29 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str]]:
                 for one, two in alike or pairs:
                     comparison = paired(one.rows, two.rows, names=(first, other))
                     sizes = _sizes(runs[first], runs[other], one)
-                    tables.append(comparison.table(_told(one.of, two.of), *_motions(one.of, two.of), *sizes))
+                    told = _told(one.of, two.of, first, other)
+                    tables.append(comparison.table(told, *_motions(one.of, two.of, first, other), *sizes))
+                    rows[protocol] |= {first: one, other: two}
                 if not pairs:
                     why = f"{_apart(ours, theirs)}; {_remedy(runs[first], runs[other])}"
                     left_out.append(f"{first} and {other} under {protocol}: {why}")
             except DataError as reason:
                 left_out.append(f"{first} and {other} under {protocol}: {reason}")
-    return tables, left_out
+    return tables, left_out, rows
+
+
+def images_csv(paired: Mapping[str, Mapping[str, Scored]]) -> str:
+    """Return what was paired as CSV: a line for each protocol and image, a column for each error and run."""
+    names = list(dict.fromkeys(name for runs in paired.values() for name in runs))
+    found: dict[tuple[str, str], dict[str, float]] = defaultdict(dict)
+    for protocol, runs in paired.items():
+        for name, scored in runs.items():
+            for row in scored.rows:
+                found[protocol, row.name] |= {f"{error} {name}": value for error, value in row.compared.items()}
+    errors = [f"{error} {name}" for error in COMPARED for name in names]
+    columns = [each for each in errors if any(each in values for values in found.values())]
+    lines = ((*image, *map(values.get, columns)) for image, values in sorted(found.items()))
+    return csv_text(("protocol", "image", *columns), lines)
 
 
 def _scored(run: Run) -> dict[str, list[Scored]]:
@@ -120,20 +138,20 @@ def _scored(run: Run) -> dict[str, list[Scored]]:
     return {protocol: list(members.values()) for protocol, members in found.items()}
 
 
-def _told(one: Evaluation, two: Evaluation) -> str:
+def _told(one: Evaluation, two: Evaluation, *names: str) -> str:
     """Say what two paired evaluations are of: the settings once where they are equal."""
     if one.how == two.how:
         return ", ".join(filter(None, (one.data, one.how, one.motion if one.motion == two.motion else "")))
     first, second = (each.how or ("as predicted elsewhere" if each.foreign else "plain") for each in (one, two))
-    return f"{one.data}; the first {first}, the second {second}"
+    return f"{one.data}; {names[0]} {first}, {names[1]} {second}"
 
 
-def _motions(one: Evaluation, two: Evaluation) -> list[str]:
+def _motions(one: Evaluation, two: Evaluation, *names: str) -> list[str]:
     """Say that the camera's motion was found in different ways, which photometric errors depend on too."""
     if one.motion == two.motion:
         return []
     ways = [each.motion or "the pose network's motion" for each in (one, two)]
-    return [f"the first with {ways[0]}, the second with {ways[1]}; motion=tracked for both compares depth alone"]
+    return [f"{names[0]} with {ways[0]}, {names[1]} with {ways[1]}; motion=tracked for both compares depth alone"]
 
 
 def _sizes(first: Run, other: Run, scored: Scored) -> list[str]:
@@ -184,9 +202,14 @@ def _typed(path: Path) -> str:
     return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
 
-def compared(inputs: Inputs, wanted: Sequence[str]) -> tuple[list[Table], list[str]]:
-    """Return all that can be said about how runs differ: tables, and sentences about what is left out."""
+def compared(inputs: Inputs, wanted: Sequence[str]) -> tuple[list[Table], list[str], str]:
+    """Return all that can be said about how runs differ: tables, sentences about what is left out, images as CSV."""
     members = inputs.all_runs
+    if len(members) == 1 and len(members[0].evaluations) > 1:
+        raise DataError(
+            f"all evaluations named are of one model, {members[0].name}; saunet report compare takes two models: to "
+            f"compare two evaluations of one, run the second again with compare={_typed(members[0].evaluations[0])}"
+        )
     if len(members) < 2:
         raise DataError(
             f"{len(members)} run is not enough to compare; name two or more: saunet report compare A B, or "
@@ -197,6 +220,6 @@ def compared(inputs: Inputs, wanted: Sequence[str]) -> tuple[list[Table], list[s
     runs = dict(zip(wanted or typed_names(members), members, strict=True))
     scores = scores_table(runs)
     side_by_side = (losses_table(runs), scores if scores.rows else None, explained_table(runs))
-    found, left_out = comparisons(runs)
+    found, left_out, rows = comparisons(runs)
     tables = [settings_table(runs), *(table for table in side_by_side if table), *health_tables(runs), *found]
-    return tables, left_out
+    return tables, left_out, images_csv(rows) if rows else ""

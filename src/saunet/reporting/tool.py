@@ -15,7 +15,7 @@ from rich.console import Console
 
 from saunet import __version__
 from saunet.errors import ConfigError, checked, one_of, positive, usable_device
-from saunet.io.atomic import check_folder
+from saunet.io.atomic import check_folder, write_bytes
 from saunet.published import published
 from saunet.reporting import figures, tables
 from saunet.reporting.compare import compared
@@ -29,6 +29,8 @@ from saunet.tables import Table, notebook_html, show
 from saunet.tables.drawing import Point, draw_speed, svg
 
 Named = dict[str, Run]
+IMAGES = "images.csv"
+"""What a comparison writes: what was paired, an image a line."""
 Scenes = str | Sequence[str] | Mapping[str, str | Sequence[str]] | None
 
 
@@ -39,7 +41,7 @@ class ReportOptions:
 
     Args:
         runs: Folders of runs, sweeps, evaluations and benchmarks, folders that hold such folders, and checkpoints.
-        compare: Write no page, but say how the runs differ.
+        compare: Write no page, but say how the runs differ, with ``images.csv``, the errors of every image in each run.
         checkpoint: Which checkpoint of a run is meant, ``best`` or ``last``.
         title: Heading of the page.
         labels: Names of the single runs, in order; by default made from what sets them apart.
@@ -102,7 +104,8 @@ class ReportResult:
         for sentence in self.left_out:
             print(f"left out: {sentence}", file=sys.stdout if self.document is None else sys.stderr)
         if self.folder is not None:
-            print(f"report: {self.folder / 'report.html'}")
+            place = self.folder / ("report.html" if self.document is not None else IMAGES)
+            print(f"{'image by image' if self.document is None else 'report'}: {place}")
 
 
 def report(options: ReportOptions) -> ReportResult:
@@ -122,11 +125,13 @@ def report(options: ReportOptions) -> ReportResult:
     Returns:
         The page, or the tables of a comparison; `ReportResult.show` prints it.
     """
-    folder = None if options.output_dir is None or options.compare else check_folder(options.output_dir)
+    folder = None if options.output_dir is None else check_folder(options.output_dir)
     inputs = collect(options.runs, options.checkpoint, strangers=not options.compare)
     if options.compare:
-        found, left_out = compared(inputs, options.labels)
-        return ReportResult(None, tuple(found), tuple(left_out))
+        found, left_out, images = compared(inputs, options.labels)
+        if folder is not None and images:
+            write_bytes(folder / IMAGES, images.encode())
+        return ReportResult(None, tuple(found), tuple(left_out), folder if images else None)
     with Console(stderr=True).status("reading") as status:
         document = build(inputs, options, status.update)
     if folder is not None:
@@ -256,6 +261,8 @@ def _runs(groups: Sequence[_Group], draw: bool, missing: list[Missing]) -> list[
 
 
 def _curves(group: _Group, missing: list[Missing]) -> list[Figure]:
+    if not any(run.record or run.config for run in group.runs.values()):  # evaluations and checkpoints alone
+        return []
     ordered = sweeps_ratio(list(group.runs.values()))
     wanted = (
         ("Fig. 4", "loss", (("train/loss", "training loss, total"), ("train/photometric", "photometric term")),
