@@ -14,6 +14,7 @@ from unittest import mock
 
 import pytest
 from echo_tool import ECHOED, EchoOptions
+from processes import python
 
 from saunet.cli import app, table
 from saunet.cli.table import Tool
@@ -413,6 +414,27 @@ def test_a_signal_ends_any_tool_with_a_word(
     assert stop.value.code == 128 + number
     assert f"saunet prepare: stopped by {name}" in capsys.readouterr().err
     assert tidied
+
+
+@pytest.mark.parametrize(("name", "word"), [("SIGINT", "interrupted"), ("SIGTERM", "stopped by SIGTERM")])
+def test_a_signal_during_the_imports_ends_the_process_at_once(name: str, word: str, tmp_path: Path) -> None:
+    """An exception there leaves half a torch, which prints figures of its cache at the exit."""
+    (tmp_path / "slow.py").write_text(
+        "import atexit, os, signal\n"
+        "atexit.register(print, 'FakeTensor cache stats')\n"
+        f"os.kill(os.getpid(), signal.{name})\n"
+        "print('still here')\n"
+    )
+    code = (
+        "import signal, sys\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell job ignores it\n"
+        "from saunet.cli import app\n"
+        "app.run('doctor', ['plugins=[slow.py]'])"
+    )
+    result = python("-c", code, cwd=tmp_path)
+    assert result.returncode == 128 + signal.Signals[name]
+    assert result.stderr.strip() == f"saunet doctor: {word}"
+    assert not result.stdout
 
 
 def test_keys_of_sources_that_changed_since_their_import_are_not_kept(

@@ -260,3 +260,34 @@ def test_sigterm_to_the_whole_group_before_the_first_step_is_an_interruption(del
     assert run.returncode == 143, said.read_text()
     assert "Traceback" not in said.read_text()
     assert record(tmp_path / "r")["status"] == "interrupted"
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_a_terminal_is_answered_once_and_the_second_ends_at_once(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "saunet", "train", *QUICK, "data.workers=2", f"output_dir={tmp_path}/r"]
+    command += ["trainer.max_epochs=500", "trainer.limit_train_batches=1.0", "trainer.limit_val_batches=0"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "FORCE_COLOR": "1", "TERM": "xterm"}  # a bar in a pipe
+    for again in (0, 1):
+        said = tmp_path / f"said {again}"
+        with (
+            said.open("w") as stream,
+            subprocess.Popen(
+                [*command, f"output_dir={tmp_path}/r{again}"],
+                stdout=stream,
+                stderr=stream,
+                env=environment,
+                start_new_session=True,
+            ) as run,
+        ):
+            while "loss=" not in said.read_text():  # the bar, once a step was made
+                assert run.poll() is None, said.read_text()
+                time.sleep(0.02)
+            os.killpg(run.pid, signal.SIGINT)
+            while again and "finishing" not in said.read_text() and run.poll() is None:
+                time.sleep(0.001)
+            if again and run.poll() is None:
+                os.killpg(run.pid, signal.SIGINT)
+        assert run.returncode == 130, said.read_text()
+        assert said.read_text().count("SIGINT: finishing the step, then saving") == 1
+        assert "Traceback" not in said.read_text()
+        assert "stopped by SIGINT after step" in said.read_text() or again

@@ -112,6 +112,33 @@ def test_a_loader_process_that_is_asked_to_end_gives_what_is_under_way_and_no_al
     assert worker.exitcode == 0
 
 
+def test_a_loader_process_leaves_ctrl_c_to_the_first_process_and_ends_at_the_second():
+    """A terminal sends it to the whole group, and the first process still needs what is under way."""
+    heard = multiprocessing.get_context("fork").SimpleQueue()
+    data = WindowDataset([NumberDrive()], [(0, i) for i in range(8)], offsets=(), height=20, width=30)
+    before = signal.signal(signal.SIGINT, lambda *_: heard.put(os.getpid()))  # which the fork inherits
+    try:
+        batches = DataLoader.__iter__(Loader(data, batch_size=None, **processes(1)))
+        next(batches)
+        (worker,) = batches._workers
+        _press_ctrl_c(worker.pid)
+        assert len(list(batches)) == 7
+        assert worker.is_alive()
+        assert heard.empty()
+        _press_ctrl_c(worker.pid)
+        worker.join(30)
+        assert worker.exitcode == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _press_ctrl_c(process):
+    """From another process: torch's processes end well when their own parent asks them."""
+    other = multiprocessing.get_context("fork").Process(target=os.kill, args=(process, signal.SIGINT))
+    other.start()
+    other.join(30)
+
+
 @pytest.mark.parametrize(
     ("count", "most", "places"), [(5, 9, [0, 1, 2, 3, 4]), (9, 3, [0, 4, 8]), (7, 1, [0]), (0, 4, [])]
 )

@@ -154,6 +154,22 @@ def test_a_second_interrupt_ends_at_once(tmp_path: Path) -> None:
         stop._receive(signal.SIGINT, None)
 
 
+def test_the_first_process_alone_answers_ctrl_c(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    GracefulStop(str(tmp_path))._receive(signal.SIGINT, None)
+    assert capsys.readouterr().err.count("SIGINT: finishing the step") == 1
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    other = GracefulStop(str(tmp_path))
+    other._receive(signal.SIGINT, None)
+    assert other.received == signal.SIGINT
+    forked = GracefulStop(str(tmp_path))
+    monkeypatch.setattr("os.getpid", lambda: -1)
+    forked._receive(signal.SIGINT, None)
+    assert forked.received is None
+    assert not capsys.readouterr().err
+
+
 def test_a_changed_rate_is_not_kept_in_silence(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     last = [LastCheckpoint(str(tmp_path))]
     first = tiny.tiny_trainer(tmp_path, max_epochs=1, callbacks=last)

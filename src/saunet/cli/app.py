@@ -147,6 +147,27 @@ def _ended_by_signals() -> Iterator[None]:
             signal.signal(each, handler)
 
 
+@contextlib.contextmanager
+def _ended_at_once(name: str) -> Iterator[None]:
+    """Let a signal end a process that only imports, without an exception inside somebody else's import.
+
+    Half of torch prints figures of its own at the exit, and half of NumPy fails in another way than with the exception.
+    """
+
+    def end(number: int, _: object) -> NoReturn:
+        word = "interrupted" if number == signal.SIGINT else f"stopped by {signal.Signals(number).name}"
+        os._exit(_say(name, word, 128 + number))  # nothing has been written or printed yet
+
+    main = threading.current_thread() is threading.main_thread()
+    wanted = [getattr(signal, each) for each in ("SIGINT", "SIGTERM", "SIGHUP") if main and hasattr(signal, each)]
+    before = {each: signal.signal(each, end) for each in wanted if callable(signal.getsignal(each))}
+    try:
+        yield
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+
 def _say(name: str, message: str, code: int) -> int:
     print(f"saunet {name}: {message}", file=sys.stderr)
     return code
@@ -177,7 +198,8 @@ def _run(name: str, argv: Sequence[str]) -> int:
     if tool.options is None:  # it reads its words itself
         imported(tool.function)(argv)
         return 0
-    plugins.load(named_plugins(argv))
+    with _ended_at_once(name):
+        plugins.load(named_plugins(argv))
     table = read()
     flags, overrides = read_words(argv, tool, table)
     if name == "evaluate" and not (flags.help or flags.cfg or flags.info):
@@ -253,7 +275,8 @@ def call(name: str, composed: Composed, table: Table) -> tuple[int, object]:
     from saunet.cli.errors import sentence
     from saunet.cli.log import quiet
 
-    made, called = map(imported, TOOLS[name].paths())
+    with _ended_at_once(name):
+        made, called = map(imported, TOOLS[name].paths())
     options = compose.options(made, composed, table)
     record = {"choices": composed.choices, "overrides": composed.overrides, "describe": sentence}
     wanted = inspect.signature(called).parameters

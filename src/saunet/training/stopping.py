@@ -19,7 +19,7 @@ from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from torch import distributed
 
 from saunet.errors import SaunetError, positive
-from saunet.runs.folder import Stopped, mark_lost, read
+from saunet.runs.folder import Stopped, first_process, mark_lost, read
 
 LAST = "last.ckpt"
 
@@ -51,6 +51,7 @@ class GracefulStop(Callback):
         self.folder = Path(folder)
         self.every_n_steps = int(positive("every_n_steps", every_n_steps))
         self.received: int | None = None
+        self._process = os.getpid()
         self._agreed = 0  # the signal for which all processes stop
         self._saved = self._went_on = False
         self._before: dict[int, Any] = {}
@@ -111,9 +112,13 @@ class GracefulStop(Callback):
     on_train_batch_start = on_train_epoch_start = _stop
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
+        if os.getpid() != self._process:  # a loader's process that has just been forked, and not yet its own handler
+            return
         if self.received == signal.SIGINT == number:
             raise KeyboardInterrupt
         self.received = number
+        if not first_process():  # a terminal and SLURM ask all processes of a run: one of them answers
+            return
         try:
             print(f"\n{signal.Signals(number).name}: finishing the step, then saving", file=sys.stderr, flush=True)
         except OSError:  # the terminal is gone: whatever writes there, such as the bar, must not fail before the saving

@@ -279,6 +279,10 @@ def train(
                     lost = "the connection to another process of this run broke, most likely because it died"
                     raise SaunetError(f"{lost}; {way_on(folder / 'checkpoints')}") from error
                 raise
+            except SystemExit as stop:
+                if trainer.is_global_zero and isinstance(stop.__context__, KeyboardInterrupt):
+                    raise stop.__context__ from None  # the trainer ends without a word, and as if it had failed
+                raise
             if model.intrinsics is not None:
                 found = model.found_intrinsics()
                 record.write(intrinsics=found.to_plain())

@@ -119,13 +119,20 @@ def processes(wanted: int) -> dict[str, Any]:
 def _prepare(worker: int) -> None:
     """Compute with one thread, and continue for a while if the process group is told to end: the first process saves.
 
-    It may be in the middle of an epoch or of a validation, and needs what is under way.
+    It may be in the middle of an epoch or of a validation, and needs what is under way. It alone speaks: its handler of
+    Ctrl-C, which a terminal sends to the whole group, is not kept here.
     """
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        signal.signal(signal.SIGINT, _end_at_the_second)
     for name in ("SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), _end_later)
+
+
+def _end_at_the_second(number: int, frame: object) -> None:
+    signal.signal(number, signal.default_int_handler)
 
 
 def _end_later(number: int, frame: object) -> None:
