@@ -28,10 +28,12 @@ from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import ImagePredictor
 from saunet.prediction.scaling import apply_scale as scale_predictor
 from saunet.registry import Spec
-from saunet.runs.checkpoint import read_checkpoint, store_scale
+from saunet.runs.checkpoint import read_checkpoint
 from saunet.runs.record import Scale
 from saunet.scale.options import ScaleOptions
+from saunet.scale.storing import scale_file, store_scale
 from saunet.synthetic import SyntheticDrive
+from saunet.weights import locate
 
 Tool = Callable[..., Any]
 UNKNOWN = 0.037
@@ -198,11 +200,67 @@ def test_predict_stores_what_it_measures(
 ) -> None:
     predictor, K = TrueDepth(street), Camera(street.intrinsics(), 64, 192)
     options = ScaleOptions(method="camera_height", camera_height=1.65, store=True)
-    scale_predictor(options, predictor, str(recording / "left"), K, recording / "out", checkpoint)
+    source, folder, store_in = str(recording / "left"), recording / "out", options.storable(checkpoint)
+    scale_predictor(options, predictor, source, K, folder, checkpoint, store_in=store_in)
     assert read_checkpoint(checkpoint).record.scale == predictor.scale
     said = capsys.readouterr().out
     assert f"stored in {checkpoint}" in said
     assert "scale.store=true" not in said
+
+
+def test_an_exported_folder_keeps_a_factor(
+    recording: Path, street: SyntheticDrive, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exported, K = tmp_path / "exported", street.intrinsics()
+    saunet.export(saunet.ExportOptions(checkpoint=checkpoint, output=exported, formats=["safetensors"]))
+    before = json.loads((exported / "config.json").read_text())
+    scale = ScaleOptions(method="camera_height", camera_height=1.65, store=True)
+    options = saunet.PredictOptions(
+        checkpoint=exported, input=recording / "left", output=tmp_path / "out", outputs=["npy"], scale=scale,
+        camera=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+    )  # fmt: skip
+    predictor = TrueDepth(street)
+    saunet.predict(options, predictor)
+    assert f"stored in {exported / 'config.json'}" in capsys.readouterr().out
+    factor = predictor.scale.factor if predictor.scale else None
+    after = json.loads((exported / "config.json").read_text())
+    assert after == {**before, "scale": {"factor": factor, "source": "camera height 1.65 m"}}
+    loaded = saunet.load(exported)
+    assert loaded.scale == predictor.scale
+    card = (exported / "README.md").read_text()
+    assert f"Network depth x {factor:g} is meters; the factor comes from camera height 1.65 m." in card
+    assert "| unit of depth | meters (scale from camera height 1.65 m) |" in card
+    assert "relative" not in card
+
+
+def test_what_cannot_keep_a_factor_is_said_before_anything_is_measured(
+    tool: Tool, recording: Path, checkpoint: Path, tmp_path: Path
+) -> None:
+    exported = tmp_path / "exported"
+    saunet.export(saunet.ExportOptions(checkpoint=checkpoint, output=exported, formats=["safetensors"]))
+    (exported / "model.onnx").write_bytes(b"a network")
+    scale = ("scale.method=camera_height", "scale.camera_height=1.65", "scale.store=true")
+    predict = ("predict", "input=left", "output=out", "camera=[90]", *scale)
+    evaluate = ("evaluate", "data=synthetic_tiny", "output_dir=out", *scale)
+    for command in (predict, evaluate):
+        tool(*command, "checkpoint=street").says(
+            "'street' comes with saunet", "saunet export street output=mystreet formats=[safetensors]",
+            "scale.store=true checkpoint=mystreet",
+        )  # fmt: skip
+        outcome = tool(*command, f"checkpoint={exported / 'model.onnx'}")
+        outcome.says("a folder exported with formats=[safetensors]", "model.onnx is neither", "then export that again")
+        assert "damaged" not in outcome.err
+        tool(*command, f"checkpoint={exported}").says("not that of model.onnx beside it", "formats=[safetensors]")
+    assert not (tmp_path / "out").exists()
+    (exported / "model.safetensors").unlink()
+    with pytest.raises(CheckpointError, match="exported is neither"):
+        scale_file(exported)
+
+
+def test_a_model_of_the_hub_keeps_no_factor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(locate, "_fetch", lambda name: tmp_path)
+    with pytest.raises(ConfigError, match=r"comes from the hub and stays as it is.*saunet export hf://someone/model"):
+        scale_file("hf://someone/model")
 
 
 def test_evaluate_measures_stores_and_predict_uses_it(tool: Tool, checkpoint: Path, tmp_path: Path) -> None:

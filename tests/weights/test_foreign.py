@@ -25,8 +25,8 @@ import saunet
 from saunet.errors import CheckpointError
 from saunet.exporting.tool import ExportOptions, export
 from saunet.io.plain import read_torch
-from saunet.runs.checkpoint import store_scale
 from saunet.runs.record import Scale
+from saunet.scale.storing import scale_file
 from saunet.weights.files import read_model
 
 State = dict[str, Tensor]
@@ -587,7 +587,7 @@ class TestMonodepth2:
 
     def test_a_scale_is_not_stored_into_their_files(self, folder: Path) -> None:
         with pytest.raises(CheckpointError, match=r"leave scale\.store out"):
-            store_scale(folder, Scale(2.0, "camera height"))
+            scale_file(folder)
 
     def test_a_part_alone_is_asked_for_with_its_folder(self, copy: Path) -> None:
         with pytest.raises(CheckpointError, match=r"one part of a model.*give its folder"):

@@ -167,7 +167,6 @@ class EvaluateOptions:
             raise ConfigError("flip=true blends two predictions of a model; leave it out with predictions=...")
         if self.predictions is not None and self.scale.method != "auto":
             raise ConfigError("scale.method measures the scale of a model; leave it out with predictions=...")
-        self.scale.storable(str(self.checkpoint))
 
 
 def evaluate(options: EvaluateOptions) -> EvaluationResult:
@@ -194,6 +193,7 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
 
 def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
     """Evaluate with the processes of a team; each returns the result of all."""
+    store_in = options.scale.storable(str(options.checkpoint))
     earlier = read_rows(Path(options.compare)) if options.compare else None
     device = team.device(usable_device(options.device))
     folder = None if options.output_dir is None else check_folder(options.output_dir)
@@ -212,7 +212,8 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         networks, found = checkpoint.networks(), checkpoint.record.intrinsics
         passes = _passes(options, _resized(options.data, checkpoint.record), motion=True)
         _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth is of the same images
-        depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device, first=team.rank == 0)
+        about_scale = {"first": team.rank == 0, "store_in": store_in}
+        depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device, **about_scale)
         model = NetworkPredictor(depth, options.flip)
         settings |= {"checkpoint": str(options.checkpoint), "scale": scale}
     else:
@@ -423,6 +424,7 @@ def _scaled(
     data: Any,
     device: torch.device,
     first: bool,
+    store_in: Path | None = None,
 ) -> tuple[nn.Module, nn.Module | None, dict[str, object]]:
     """Return depth and pose network on the device, in meters if the options ask for it, and what to report of that."""
     depth, pose = networks[0].to(device).eval(), None if networks[1] is None else networks[1].to(device).eval()
@@ -442,7 +444,6 @@ def _scaled(
         estimate = estimate_scale(method, batches, lambda image: depth(image).depth[0], pose, height)
         report = {key: value for key, value in estimate.as_json().items() if key != "per_frame"}  # scale.json has it
         folder = None if options.output_dir is None else Path(options.output_dir)
-        store_in = options.scale.storable(str(options.checkpoint))
         scale = keep_scale(estimate, store_in, folder) if first else estimate.scale()
     scale = options.scale.chosen(scale)
     if scale is None:

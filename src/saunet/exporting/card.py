@@ -10,8 +10,7 @@ from typing import Any
 
 from saunet.exporting.parity import Parity, parity_table
 from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
-from saunet.prediction.prediction import unit_of
-from saunet.runs.record import ModelRecord
+from saunet.runs.record import ModelRecord, scale_sentence, unit_of
 from saunet.tables import Column, Row, Table
 
 
@@ -23,14 +22,11 @@ def model_card(
     source: str | None = None,
 ) -> str:
     """Return the card of an exported model as Markdown."""
-    scale = "Depth is relative: multiply it by one unknown factor to get meters."
-    if record.scale:
-        scale = f"Network depth x {record.scale.factor:g} is meters; the factor comes from {record.scale.source}."
     quality = "No evaluation was given when this was exported (`evaluation=` the folder of a saunet evaluate run)."
     return filled(
         "card.md",
         record,
-        scale=scale,
+        scale=scale_sentence(record.scale),
         source=source or "path/to/this/folder",
         fingerprint=fingerprint(record.to_plain()["data"]),
         splits="".join(f"Fingerprint of the frames of split '{key}': `{value}`.\n" for key, value in splits.items()),

@@ -19,7 +19,7 @@ from saunet.io.atomic import write_bytes
 from saunet.io.colormaps import colorize
 from saunet.io.display import display
 from saunet.io.images import IMAGE_SUFFIXES, as_rgb_bytes, encode_png, network_input, read_image, write_image
-from saunet.runs.record import Scale
+from saunet.runs.record import Scale, unit_of
 from saunet.weights.locate import locate
 
 if TYPE_CHECKING:
@@ -142,11 +142,6 @@ class Prediction:
         from saunet.prediction.page import depth_figure
 
         return depth_figure(self)
-
-
-def unit_of(scale: Scale | None) -> str:
-    """Return in words what one unit of depth is, given the scale that was applied."""
-    return f"meters (scale from {scale.source})" if scale else "relative (meters times one unknown factor)"
 
 
 class ImagePredictor(abc.ABC):

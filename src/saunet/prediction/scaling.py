@@ -16,6 +16,7 @@ from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import ImagePredictor
 from saunet.prediction.sources import Input, Recording
 from saunet.scale.options import ScaleOptions
+from saunet.weights.locate import WEIGHTS, is_shipped, locate
 
 if TYPE_CHECKING:
     from saunet.io.speeds import SpeedTable
@@ -33,18 +34,18 @@ def apply_scale(
     folder: Path,
     checkpoint: str | Path,
     camera_height: float | None = None,
+    store_in: Path | None = None,
 ) -> None:
     """Give a predictor the scale that is asked for; print and write down what was measured.
 
-    The camera's height is the one of its file, and counts unless the options give one.
+    The camera's height is the one of its file, and counts unless the options give one. ``store_in`` is the file of the
+    model that is to keep the factor.
     """
     if options.measures:
         import torch
 
         from saunet.scale.estimate import estimate_scale, keep_scale
         from saunet.weights.files import read_model
-
-        store_in = options.storable(checkpoint)
 
         def depth(image: Any) -> Any:
             return 1 / torch.from_numpy(predictor.disparity(image.numpy()))[:, None]
@@ -59,8 +60,9 @@ def apply_scale(
             height = camera_height if options.camera_height is None else options.camera_height
             estimate = estimate_scale(options.method, batches, depth, pose, height)
         predictor.scale = keep_scale(estimate, store_in, folder)
-        if store_in is None and str(checkpoint).endswith(".ckpt"):
-            print("it counts for this command; scale.store=true keeps it in the checkpoint, for all later ones")
+        path = locate(checkpoint)
+        if store_in is None and (path.suffix == ".ckpt" or ((path / WEIGHTS).is_file() and not is_shipped(path))):
+            print("it counts for this command; scale.store=true keeps it in the model, for all later ones")
     predictor.scale = options.chosen(predictor.scale)
 
 

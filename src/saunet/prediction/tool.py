@@ -223,7 +223,7 @@ def predict(
         depth is ...
         2 files written: out
     """
-    folder = Path(options.output)
+    folder, store_in = Path(options.output), options.scale.storable(options.checkpoint)
     with contextlib.closing(Recording(options.input, folder, options.fps)) as recording:
         default = ("mp4",) if recording.images is None else ("color", "png16")
         outputs = tuple(dict.fromkeys(options.outputs or default))
@@ -237,7 +237,7 @@ def predict(
                 most = min(options.max_frames or math.inf, recording.declared or math.inf)
                 predictor = choose_runtime(predictor, options.checkpoint, options.runtime, most)
         camera, height = _camera(options, recording, predictor)
-        apply_scale(options.scale, predictor, options.input, camera, folder, options.checkpoint, height)
+        apply_scale(options.scale, predictor, options.input, camera, folder, options.checkpoint, height, store_in)
         print(f"depth is {predictor.unit}")
         if "pairs" in outputs and predictor.scale is None:
             raise ConfigError(

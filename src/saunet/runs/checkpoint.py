@@ -178,13 +178,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
 
 def store_scale(path: str | Path, scale: Scale) -> None:
     """Write a measured factor to meters into a checkpoint; everything else in the file stays as it is."""
-    try:
-        read_checkpoint(path)
-    except CheckpointError as reason:
-        raise CheckpointError(
-            f"a scale is stored in a checkpoint of saunet's, and {reason}; leave scale.store out, or train on from it "
-            "with init_from= first"
-        ) from reason
+    read_checkpoint(path)
     content = _load_plain(Path(path))
     content["saunet"]["scale"] = asdict(scale)
     atomic_save(content, path)

@@ -53,6 +53,18 @@ class Scale:
             raise CheckpointError(f"scale factor is {self.factor}; it must be a finite number above 0")
 
 
+def unit_of(scale: Scale | None) -> str:
+    """Return in words what one unit of depth is, given the scale that was applied."""
+    return f"meters (scale from {scale.source})" if scale else "relative (meters times one unknown factor)"
+
+
+def scale_sentence(scale: Scale | None) -> str:
+    """Return what a model's card says of its scale."""
+    if scale is None:
+        return "Depth is relative: multiply it by one unknown factor to get meters."
+    return f"Network depth x {scale.factor:g} is meters; the factor comes from {scale.source}."
+
+
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
     """The focal lengths that a training found (``model.intrinsics``)."""

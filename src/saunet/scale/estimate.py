@@ -18,9 +18,9 @@ from torch import Tensor, nn
 from saunet.errors import ConfigError, DataError, one_of, positive
 from saunet.geometry.ground import fit_ground
 from saunet.io.atomic import write_json
-from saunet.runs.checkpoint import store_scale
 from saunet.runs.record import Scale
 from saunet.scale.options import METHODS
+from saunet.scale.storing import store_scale
 from saunet.types import DepthPyramid, TrainBatch
 
 DepthOf = Callable[[Tensor], Tensor]
@@ -149,8 +149,8 @@ def estimate_scale(
     return ScaleEstimate(method, source, kept_names, kept, len(names) - len(kept))
 
 
-def keep_scale(estimate: ScaleEstimate, store_in: str | Path | None, folder: Path | None) -> Scale:
-    """Say what was measured, write ``scale.json`` into a folder, store the factor in a checkpoint, and return it."""
+def keep_scale(estimate: ScaleEstimate, store_in: Path | None, folder: Path | None) -> Scale:
+    """Say what was measured, write ``scale.json`` into a folder, store the factor in a model, and return it."""
     print(estimate)
     if folder is not None:
         write_json(folder / "scale.json", estimate.as_json())

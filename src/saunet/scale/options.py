@@ -7,7 +7,6 @@ from pathlib import Path
 
 from saunet.errors import ConfigError, one_of, positive
 from saunet.runs.record import Scale
-from saunet.weights.locate import shipped
 
 METHODS = ("camera_height", "speed", "stereo")
 """Ways to measure the scale."""
@@ -40,7 +39,7 @@ class ScaleOptions:
         stereo: Images of the other camera of a stereo pair.
         baseline: Meters to the other camera.
         frames: Of more frames, only so many are measured, evenly spread.
-        store: Write the measured factor into the checkpoint.
+        store: Write the measured factor into the checkpoint, or into an exported folder's ``config.json``.
 
     Raises:
         ConfigError: if a value is out of range, or nothing is measured that could be stored.
@@ -78,14 +77,13 @@ class ScaleOptions:
         """Whether the scale is measured on images, not taken from the checkpoint."""
         return self.method in METHODS
 
-    def storable(self, checkpoint: str | Path) -> str | Path | None:
-        """Return the checkpoint to store the measured factor in, None if it is not to be stored."""
-        if self.store and str(checkpoint) in shipped():
-            raise ConfigError(
-                f"scale.store=true writes into the checkpoint, but '{checkpoint}' comes with saunet and stays as it "
-                "is; leave scale.store out"
-            )
-        return checkpoint if self.store else None
+    def storable(self, checkpoint: str | Path) -> Path | None:
+        """Return the file to store the measured factor in, None if it is not to be stored; see `scale_file`."""
+        if not self.store:
+            return None
+        from saunet.scale.storing import scale_file
+
+        return scale_file(checkpoint)
 
     def chosen(self, known: Scale | None) -> Scale | None:
         """Return the scale to apply, given the measured or stored one."""

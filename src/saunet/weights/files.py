@@ -34,7 +34,7 @@ def read_model(source: str | Path) -> Checkpoint:
         return _of_any_system(path)
     if not path.is_file():
         raise CheckpointError(f"no model at {path}; check the path")
-    return restored(path, _read_config(path.with_name(CONFIG)))
+    return restored(path, read_config(path.with_name(CONFIG)))
 
 
 def _of_any_system(path: Path) -> Checkpoint:
@@ -65,7 +65,8 @@ def write_safetensors(state: Mapping[str, Tensor], path: str | Path) -> None:
     Path(path).write_bytes(save(plain, {"format": "pt"}))  # save_file would let its owner alone read the file
 
 
-def _read_config(path: Path) -> ModelRecord:
+def read_config(path: Path) -> ModelRecord:
+    """Read the record of an exported model."""
     try:
         return ModelRecord.from_plain(read_json(path))
     except OSError as reason:
