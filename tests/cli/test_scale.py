@@ -24,6 +24,7 @@ from saunet.data.video.camera import CameraFile, write_camera
 from saunet.errors import CheckpointError, ConfigError, DataError
 from saunet.evaluation.tool import EvaluateOptions, _odometer, _scaled
 from saunet.geometry.pose import pose_matrix
+from saunet.io.images import write_image
 from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import ImagePredictor
 from saunet.prediction.scaling import apply_scale as scale_predictor
@@ -255,6 +256,24 @@ def test_what_cannot_keep_a_factor_is_said_before_anything_is_measured(
     (exported / "model.safetensors").unlink()
     with pytest.raises(CheckpointError, match="exported is neither"):
         scale_file(exported)
+
+
+def test_one_factor_is_not_stored_for_two_cameras(tool: Tool, checkpoint: Path, tmp_path: Path) -> None:
+    drive = SyntheticDrive(seed=8, frames=5, height=64, width=192)
+    for clip, height in (("a", 1.65), ("b", 1.4)):
+        for index in drive.indices:
+            write_image(tmp_path / "clips" / clip / f"{index}.png", drive.image(index))
+        file = tmp_path / "clips" / clip / "camera.yaml"
+        write_camera(file, CameraFile(file, drive.intrinsics(0), (64, 192), fps=10.0, camera_height=height))
+    command = ("evaluate", f"checkpoint={checkpoint}", "data=video", "data.root=clips", "data.frames_cache=cache",
+               "data.workers=0", "output_dir=results", "scale.method=camera_height", "scale.camera_height=1.65",
+               "scale.store=true")  # fmt: skip
+    outcome = tool(*command, "data.test_clips=[a,b]")
+    outcome.says("one factor, which belongs to one camera", "'a' and 'b'", "data.test_clips=[a]")
+    assert read_checkpoint(checkpoint).record.scale is None
+    shutil.copyfile(tmp_path / "clips" / "a" / "camera.yaml", tmp_path / "clips" / "b" / "camera.yaml")
+    outcome = tool(*command, "data.test_clips=[a,b]")  # now one camera, which an untrained network may not measure
+    assert "belongs to one camera" not in outcome.err
 
 
 def test_a_model_of_the_hub_keeps_no_factor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -183,6 +183,11 @@ class Drive(ABC):
         return ""
 
     @property
+    def calibration(self) -> str | None:
+        """A text that differs between recordings of different cameras; None if all of a data set are of one kind."""
+        return None
+
+    @property
     def lens(self) -> LensModel | None:
         """The lens that `recorded_image` shows and `image` does not; None if images are as recorded."""
         return None

@@ -212,6 +212,8 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         networks, found = checkpoint.networks(), checkpoint.record.intrinsics
         passes = _passes(options, _resized(options.data, checkpoint.record), motion=True)
         _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth is of the same images
+        if store_in is not None:
+            _check_one_camera(passes[0][0], options.split)
         about_scale = {"first": team.rank == 0, "store_in": store_in}
         depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device, **about_scale)
         model = NetworkPredictor(depth, options.flip)
@@ -450,6 +452,20 @@ def _scaled(
         return depth, pose, {"method": method, "factor": None}
     report = {"method": method, **(report or {"source": scale.source, "factor": scale.factor})}
     return MetricDepth(depth, scale), None if pose is None else MetricMotion(pose, scale), report
+
+
+def _check_one_camera(data: EvaluationData, split: str) -> None:
+    """Check that one factor can be right for all recordings of a split."""
+    names = dict[str | None, str]()
+    for drive in data.datasets[split].drives:
+        names.setdefault(drive.calibration, drive.name)
+    if len(names) > 1:
+        first, second, *_ = names.values()
+        raise ConfigError(
+            f"scale.store=true stores one factor, which belongs to one camera, and the clips '{first}' and '{second}' "
+            f"have different ones; evaluate the clips of one camera, such as data.test_clips=[{first}], or leave "
+            "scale.store out"
+        )
 
 
 def _refined(batches: Iterable[EvalBatch], found: Intrinsics | None) -> Iterator[EvalBatch]:

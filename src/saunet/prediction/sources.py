@@ -202,16 +202,34 @@ def _holds_originals(folder: str | Path | None, original: Path) -> ConfigError:
     return ConfigError(f"the output folder {folder} holds the originals ({original}); choose another, such as {other}")
 
 
+def clips_of(source: Input, images: Sequence[Frame] | None) -> dict[Path, Path]:
+    """Return the folders of an input's images, or its video, each with the folder that the input names."""
+    if isinstance(source, str | Path) and _is_video(Path(source)):
+        return {Path(source): Path(source).parent}
+    items = [source] if isinstance(source, str | Path) else source
+    if images is None or not isinstance(items, Sequence):
+        return {}
+    bases, folders = [_base(item) for item in items], dict.fromkeys(Path(str(frame.image)).parent for frame in images)
+    return {folder: next(base for base in bases if base in (folder, *folder.parents)) for folder in folders}
+
+
+def _base(item: str | Path) -> Path:
+    """Return the folder that an input names or is in; of a pattern, the part without wildcards."""
+    path = Path(item)
+    if path.is_dir() or path.is_file():
+        return path if path.is_dir() else path.parent
+    return Path(*itertools.takewhile(lambda part: not glob.has_magic(part), path.parts[:-1]))
+
+
 def _expand(item: str | Path) -> tuple[Path, list[Path]]:
     """Return the folder that results' names are relative to, and the images."""
     path = Path(item)
     if path.is_dir():
-        return path, _images(_below(path))
+        return _base(item), _images(_below(path))
     if path.is_file():
-        return path.parent, [path]
+        return _base(item), [path]
     if glob.has_magic(str(item)):
-        fixed = itertools.takewhile(lambda part: not glob.has_magic(part), path.parts[:-1])
-        return Path(*fixed), _images(map(Path, glob.glob(str(item), recursive=True)))
+        return _base(item), _images(map(Path, glob.glob(str(item), recursive=True)))
     raise DataError(f"no file or folder at {item}; check the path")
 
 

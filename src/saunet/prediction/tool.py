@@ -17,6 +17,7 @@ from saunet.io.colormaps import COLORMAPS, RunningRange
 from saunet.io.images import IMAGE_SUFFIXES
 from saunet.io.video import CODECS, VIDEO_SUFFIXES
 from saunet.prediction import sinks
+from saunet.prediction.cameras import read_given, with_camera
 from saunet.prediction.foreign import NOTHING, ForeignOptions
 from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import ImagePredictor, load
@@ -55,7 +56,8 @@ class PredictOptions:
         colormap: magma, inferno, viridis, turbo or gray.
         camera: True intrinsics, which ``ply`` and ``html`` need: a camera.yaml; fx, fy, cx, cy in pixels of the first
             image; the nine numbers of K; one number, the horizontal field of view in degrees; or ``checkpoint`` for the
-            mean focal length that the model's training found (``model.intrinsics``).
+            mean focal length that the model's training found (``model.intrinsics``). By default, where one is needed,
+            the nearest camera.yaml in or above the folder of the images or the video, up to the input.
         undistort: A camera.yaml: undistort and crop the images first, as training on that camera's clips does.
         max_depth: Leave out points that are farther, in the unit of depth.
         max_frames: Predict the first so many images or frames only.
@@ -139,12 +141,6 @@ class PredictOptions:
             if getattr(self, name) is not None:
                 positive(name, getattr(self, name))
         RunningRange(self.range_smoothing)
-        for output in self.outputs or ():
-            if output in ("ply", "html") and self.camera is None and self.undistort is None:
-                raise ConfigError(
-                    f"outputs has '{output}', which needs the camera's true intrinsics; give camera fx, fy, cx, cy, "
-                    "a camera.yaml, or one number, the horizontal field of view in degrees"
-                )
         if self.undistort is not None:
             if self.camera is not None:
                 raise ConfigError(
@@ -227,6 +223,7 @@ def predict(
     with contextlib.closing(Recording(options.input, folder, options.fps)) as recording:
         default = ("mp4",) if recording.images is None else ("color", "png16")
         outputs = tuple(dict.fromkeys(options.outputs or default))
+        options = with_camera(options, recording, outputs)
         if predictor is None:
             device = str(usable_device(options.device))
             about = {"flip": options.flip, "keep_aspect": options.keep_aspect}
@@ -236,7 +233,7 @@ def predict(
 
                 most = min(options.max_frames or math.inf, recording.declared or math.inf)
                 predictor = choose_runtime(predictor, options.checkpoint, options.runtime, most)
-        camera, height = _camera(options, recording, predictor)
+        camera, height = read_given(options, recording, predictor)
         apply_scale(options.scale, predictor, options.input, camera, folder, options.checkpoint, height, store_in)
         print(f"depth is {predictor.unit}")
         if "pairs" in outputs and predictor.scale is None:
@@ -250,6 +247,9 @@ def predict(
 
             path, device = locate(options.checkpoint), str(usable_device(options.device))
             odometer = Odometer.from_model(path, options.motion, predictor.scale, device, options.batch_size)
+            if odometer.tracks and camera is None:
+                options = with_camera(options, recording, outputs, asked_by="outputs=[trajectory]")
+                camera, _ = read_given(options, recording, predictor)
             if odometer.tracks and camera is None:
                 why = "motion is 'tracked'" if options.motion == "tracked" else "the model has no pose network"
                 raise ConfigError(
@@ -377,58 +377,3 @@ def _refuse_existing(sink: Sink, overwrite: bool) -> None:
     for path in sink.paths:
         if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
             raise ConfigError(f"{path} exists; choose another output folder, or set overwrite=true")
-
-
-def _camera(
-    options: PredictOptions, recording: Recording, predictor: ImagePredictor
-) -> tuple[Camera | None, float | None]:
-    """Return the true intrinsics of what is predicted and the camera's height, None if they are not given.
-
-    Makes the predictor undistort.
-    """
-    given = options.camera if options.undistort is None else options.undistort
-    if given is None or isinstance(given, Camera):
-        return given, None
-    if given == "checkpoint":
-        from saunet.weights.files import read_model
-
-        found, size = read_model(options.checkpoint).record.intrinsics, recording.first_size
-        if found is None:
-            raise ConfigError(
-                f"camera=checkpoint asks for the focal length that a training found, and '{options.checkpoint}' has "
-                "none; give the camera, or train with model.intrinsics=learned"
-            )
-        view = math.degrees(2 * math.atan(0.5 / found.mean[1]))
-        return None if size is None else Camera.from_numbers([view], *size), None
-    numbers = _numbers(str(given)) if isinstance(given, str | Path) else given
-    if numbers is not None:
-        size = recording.first_size
-        return None if size is None else Camera.from_numbers(numbers, *size), None
-    from saunet.data.video.calibrations import split_name
-    from saunet.data.video.camera import Undistorter, read_camera
-
-    file = read_camera(str(given))
-    if options.undistort is not None:
-        predictor.undistort = undistorter = Undistorter(file)
-        content = hashlib.sha256(f"{split_name(str(given))[1]}\n".encode() + file.path.read_bytes())
-        predictor.undistorted_by = f"camera {content.hexdigest()[:16]}"
-        size = file.image_size or recording.first_size
-        if size is None:
-            return None, file.camera_height
-        lens = undistorter.lens(*size)
-        return Camera(lens.K, lens.height, lens.width), file.camera_height
-    if not file.is_straight:
-        raise ConfigError(
-            f"camera={given} describes a lens with distortion, and points need straight images; "
-            f"set undistort={given} in its place"
-        )
-    size = recording.first_size
-    camera = None if size is None else Camera(file.intrinsics(*size, "the images"), *size)
-    return camera, file.camera_height
-
-
-def _numbers(text: str) -> list[float] | None:
-    """Return the numbers in a text such as ``80,80,44.5,29.5``; None for the name of a file."""
-    words = text.split(",")
-    plain = all(word.strip().replace(".", "", 1).replace("-", "", 1).isdigit() for word in words)
-    return [float(word) for word in words] if plain else None

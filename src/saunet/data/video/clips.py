@@ -306,13 +306,15 @@ def _highest(path: Path, base: Path) -> Path:
     return base.parent if path == base else base
 
 
-def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraFile | None:
-    """Return the nearest camera file of a clip, or None without one."""
+def nearest_camera(path: Path, base: Path) -> Path | None:
+    """Return the nearest camera file of a clip that was found below ``base``, or is it; None without one."""
     folders = [path, *path.parents] if path.is_dir() else list(path.parents)
-    for folder in folders[: folders.index(_highest(path, base)) + 1]:
-        file = folder / FILE_NAME
-        if file not in known and file.is_file():
-            known[file] = read_camera(file, may_be_unknown=True)
-        if file in known:
-            return known[file]
-    return None
+    files = (folder / FILE_NAME for folder in folders[: folders.index(_highest(path, base)) + 1])
+    return next((file for file in files if file.is_file()), None)
+
+
+def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraFile | None:
+    file = nearest_camera(path, base)
+    if file is not None and file not in known:
+        known[file] = read_camera(file, may_be_unknown=True)
+    return None if file is None else known[file]

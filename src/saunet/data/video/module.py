@@ -186,6 +186,12 @@ class ClipDrive(Drive):
         """(height, width) of the frames before they are cropped."""
         return self._lens.recorded
 
+    @property
+    def calibration(self) -> str:
+        camera = self.clip.camera
+        known = (camera.K.tolist(), camera.image_size, camera.model, camera.distortion)
+        return repr((*known, self.camera_height))
+
     def seen_by(self, camera: CameraFile) -> ClipDrive:
         """Return the same drive with another camera."""
         twin = copy.copy(self)
