@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from saunet.cli.log import RunLog, quiet
+from saunet.io.said import PRINTED, say
 
 
 def _said(text: str) -> logging.LogRecord:
@@ -45,6 +46,27 @@ def test_a_tool_that_is_refused_adds_no_line_to_the_log_of_an_earlier_run(tmp_pa
     (tmp_path / "run.json").touch()  # the checks have passed
     log.emit(_said("epoch 1"))
     assert file.read_text().splitlines() == ["of an earlier run", "6 frames used", "epoch 1"]
+
+
+def test_what_is_printed_and_warned_of_is_in_the_log_and_once_on_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)  # put back afterwards
+    log = RunLog(str(tmp_path / "run" / "train.log"))
+    (tmp_path / "run").mkdir()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = lambda message, *_: print(f"on the terminal: {message}")
+        quiet()
+        quiet()  # before each job of a sweep
+        say("resuming from last.ckpt")
+        warnings.warn_explicit("the frame rate is unknown", UserWarning, "/x/saunet/module.py", 3)
+    log.close()
+    kept = (tmp_path / "run" / "train.log").read_text()
+    shown = capsys.readouterr().out
+    for line in ("resuming from last.ckpt", "the frame rate is unknown"):
+        assert kept.count(line) == shown.count(line) == 1
+    assert log not in PRINTED.handlers
 
 
 def test_a_warning_is_one_line_without_its_place_in_the_code(monkeypatch: pytest.MonkeyPatch) -> None:

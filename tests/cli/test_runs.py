@@ -19,6 +19,7 @@ import cv2
 import pytest
 import yaml
 
+from saunet.errors import DataError
 from saunet.runs.folder import RunRecord
 from saunet.runs.sweep import summary
 from saunet.training.stopping import GracefulStop
@@ -162,6 +163,9 @@ def test_an_interrupted_sweep_names_the_jobs_that_never_started(
     assert re.findall(r"\(.*seed=(\d)\) (interrupted|not started)", outcome.err) == [
         ("1", "interrupted"), ("2", "not started"), ("3", "not started")
     ]  # fmt: skip
+    kept = (tmp_path / "sweep" / "0" / "train.log").read_text()
+    assert kept.count("SIGINT: finishing the step, then saving") == 1
+    assert kept.count("saunet train: stopped by SIGINT after step") == 1
 
 
 def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
@@ -175,6 +179,26 @@ def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, 
     outcome = tool("train", *again, f"init_from={last}", "resume=warm/checkpoints/last.ckpt", "output_dir=warm")
     assert outcome.code == 0, outcome.err
     assert f"init_from={last} is not used" in outcome.out + outcome.err
+    kept = (tmp_path / "warm" / "train.log").read_text()
+    assert [kept.count(f" INFO {words}") for words in ("starting from", "resuming from", "results: ")] == [1, 2, 3]
+
+
+def test_the_log_of_a_run_holds_why_it_failed(tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(error: Exception) -> Callable[..., None]:
+        def hook(self: GracefulStop, *_: Any) -> None:
+            raise error
+
+        return hook
+
+    monkeypatch.setattr(GracefulStop, "on_before_backward", fail(DataError("the disk is gone")), raising=False)
+    tool("train", *QUICK, "output_dir=failed").says("the disk is gone")
+    assert "saunet train: the disk is gone" in (tmp_path / "failed" / "train.log").read_text()
+    monkeypatch.setattr(GracefulStop, "on_before_backward", fail(ZeroDivisionError("of ours")))
+    with pytest.raises(ZeroDivisionError):
+        tool("train", *QUICK, "output_dir=defect")
+    kept = (tmp_path / "defect" / "train.log").read_text()
+    assert "Traceback" in kept
+    assert "ZeroDivisionError: of ours" in kept
 
 
 def test_a_finished_run_is_not_replaced_by_mistake(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from saunet import __version__, plugins
 from saunet.cli.table import TOOLS, Table, imported, read
 from saunet.cli.words import named_plugins, read_words
 from saunet.errors import ConfigError, SaunetError, suggest
+from saunet.io.said import PRINTED
 from saunet.threads import wait_briefly
 
 if TYPE_CHECKING:
@@ -116,6 +117,7 @@ def run(name: str, argv: Sequence[str]) -> None:
         debug = os.environ.get("HYDRA_FULL_ERROR") == "1" and "LOCAL_RANK" not in os.environ
         said = None if debug else sentence(error, None if isinstance(error, SaunetError) else read())
         if said is None:
+            PRINTED.info(f"saunet {name}: ended by a defect of the program", exc_info=error)
             raise
         code = _say(name, said, 1)
     if code:
@@ -170,6 +172,7 @@ def _ended_at_once(name: str) -> Iterator[None]:
 
 def _say(name: str, message: str, code: int) -> int:
     print(f"saunet {name}: {message}", file=sys.stderr)
+    PRINTED.info(f"saunet {name}: {message}")
     return code
 
 

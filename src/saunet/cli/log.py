@@ -7,13 +7,16 @@ import os
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
+
+from saunet.io.said import PRINTED
 
 
 class RunLog(logging.FileHandler):
     """A log in a run's folder, begun by the first file that the tool writes there: what is said before is kept.
 
-    A tool that is refused leaves neither a folder nor a line in the log of an earlier run. Each further process of a
-    run has a file of its own.
+    It keeps what goes through loggers, and what is printed with `saunet.io.said`. A tool that is refused leaves neither
+    a folder nor a line in the log of an earlier run. Each further process of a run has a file of its own.
     """
 
     def __init__(self, filename: str) -> None:
@@ -21,6 +24,7 @@ class RunLog(logging.FileHandler):
         super().__init__(path if rank == "0" else path.with_stem(f"{path.stem}_rank{rank}"), delay=True)
         self._early: list[logging.LogRecord] = []
         self._before = self._changed() if rank == "0" else None  # the first process has started the others
+        PRINTED.addHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record, once the tool has written to the folder."""
@@ -29,6 +33,7 @@ class RunLog(logging.FileHandler):
 
     def close(self) -> None:
         """Write what is still kept: a tool may say nothing more once it has written."""
+        PRINTED.removeHandler(self)
         self._write()
         super().close()
 
@@ -60,9 +65,24 @@ def _one_line(
     return _with_place(message, category, filename, lineno, line)
 
 
+def _keep_warnings() -> None:
+    """Let the log of a run keep the warnings too, which Python writes past all loggers."""
+    shown = warnings.showwarning
+    if getattr(shown, "kept", False):
+        return
+
+    def show(*words: Any, **named: Any) -> None:
+        shown(*words, **named)
+        PRINTED.info(warnings.formatwarning(*words[:4]).rstrip())
+
+    show.kept = True  # type: ignore[attr-defined]
+    warnings.showwarning = show
+
+
 def quiet() -> None:
     """Let Lightning, once imported, speak through our loggers and of what concerns the user alone."""
     warnings.formatwarning = _one_line
+    _keep_warnings()
     if "lightning.pytorch.utilities.rank_zero" in sys.modules:
         for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
             logging.getLogger(name).handlers.clear()

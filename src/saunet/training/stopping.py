@@ -19,6 +19,7 @@ from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from torch import distributed
 
 from saunet.errors import SaunetError, positive
+from saunet.io.said import PRINTED
 from saunet.runs.folder import Stopped, first_process, mark_lost, read
 
 LAST = "last.ckpt"
@@ -53,7 +54,7 @@ class GracefulStop(Callback):
         self.received: int | None = None
         self._process = os.getpid()
         self._agreed = 0  # the signal for which all processes stop
-        self._saved = self._went_on = False
+        self._saved = self._went_on = self._noted = False
         self._before: dict[int, Any] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -74,6 +75,9 @@ class GracefulStop(Callback):
         if (batch_idx + 1) % trainer.accumulate_grad_batches and not trainer.is_last_batch:
             return
         number = self._agreed or self.received or 0
+        if self.received and not self._noted:  # not in the handler, which may interrupt a line of the log
+            self._noted = True
+            PRINTED.info(_answer(self.received))
         if trainer.world_size > 1 and not self._agreed:
             if trainer.global_step % self.every_n_steps and not trainer.is_last_batch:
                 return
@@ -120,7 +124,7 @@ class GracefulStop(Callback):
         if not first_process():  # a terminal and SLURM ask all processes of a run: one of them answers
             return
         try:
-            print(f"\n{signal.Signals(number).name}: finishing the step, then saving", file=sys.stderr, flush=True)
+            print(f"\n{_answer(number)}", file=sys.stderr, flush=True)
         except OSError:  # the terminal is gone: whatever writes there, such as the bar, must not fail before the saving
             nowhere = os.open(os.devnull, os.O_WRONLY)
             for stream in (1, 2):
@@ -133,6 +137,10 @@ class GracefulStop(Callback):
             signal.signal(number, handler)
 
     on_train_end = on_exception = _restore
+
+
+def _answer(number: int) -> str:
+    return f"{signal.Signals(number).name}: finishing the step, then saving"
 
 
 class ProcessWatch(Callback):
@@ -202,6 +210,7 @@ class ProcessWatch(Callback):
         sentence = f"{reason}; {way_on(self.checkpoints)}"
         mark_lost(self.folder, sentence)
         print(f"\nsaunet train: {sentence}", file=sys.stderr, flush=True)
+        PRINTED.info(f"saunet train: {sentence}")
         for process in started:
             process.kill()
         os._exit(1)  # the main thread waits inside a collective call, which no exception reaches

@@ -19,6 +19,7 @@ from saunet import plugins
 from saunet.data.loading.module import DepthDataModule
 from saunet.errors import ConfigError, SaunetError, checked, divisible, in_range, one_of, positive, suggest
 from saunet.io.atomic import remove_partial_files
+from saunet.io.said import say
 from saunet.metrics.depth import DepthMetrics
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.metrics.protocols import protocol
@@ -269,9 +270,9 @@ def train(
             for logger in loggers if resume else ():
                 keep_rows(logger, done)
             if resume or started:
-                print(f"resuming from {resume}" if resume else started)
+                say(f"resuming from {resume}" if resume else str(started))
             if due and 0 <= trainer.max_steps <= steps:
-                print("the validation after the last step was cut short; saunet evaluate makes up for it")
+                say("the validation after the last step was cut short; saunet evaluate makes up for it")
             try:
                 trainer.fit(model, datamodule=data, ckpt_path=resume, weights_only=True)
             except RuntimeError as error:
@@ -289,13 +290,13 @@ def train(
                 rank_zero_info(model.intrinsics.told(found))
     if resume and trainer.global_step == steps:
         more = "trainer.max_steps=N" if 0 <= trainer.max_steps <= steps else "epochs=N"
-        print(f"nothing was left to train: it was complete after step {steps}; {more} continues to a later end")
+        say(f"nothing was left to train: it was complete after step {steps}; {more} continues to a later end")
     elif told := _ended_early(trainer):
         rank_zero_info(told)
     if trainer.is_global_zero:
         if trainer.global_step >= DRAWN_FROM:
             _draw(folder)
-        print(f"results: {folder}")
+        say(f"results: {folder}")
     kept = [each for each in trainer.checkpoint_callbacks if isinstance(each, BestCheckpoint)]
     best = next((Path(each.best_model_path) for each in kept if each.best_model_path), None)
     cost = next((each.cost for each in kept if each.cost is not None), None)
@@ -319,7 +320,7 @@ def _draw(folder: Path) -> None:
     try:
         write_results(folder)
     except SaunetError as reason:
-        print(f"no picture of the results: {reason}")
+        say(f"no picture of the results: {reason}")
 
 
 def assemble(options: TrainOptions, data: DepthDataModule, pretrained: bool = True) -> SelfSupervisedDepth:
