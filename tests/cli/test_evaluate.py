@@ -151,7 +151,7 @@ def test_exported_predictions_score_the_same_and_compare(tool: Tool, smoke_run: 
     assert outcome.code == 0, outcome.err
     first, second = results(tmp_path / "a")["synthetic"], results(tmp_path / "b")["synthetic"]
     assert [second[name] for name in ERROR_NAMES] == pytest.approx([first[name] for name in ERROR_NAMES], rel=2e-3)
-    assert "second 'predictions' against first 'model of a'" in outcome.out
+    assert "'predictions' minus 'model of a'" in outcome.out
     assert [row["error"] for row in table(tmp_path / "b" / "comparison.csv")] == list(ERROR_NAMES)
 
 
