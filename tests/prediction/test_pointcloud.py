@@ -51,14 +51,45 @@ def test_intrinsics_of_another_size_are_scaled() -> None:
     assert np.allclose(there.points, point_cloud(prediction, camera, max_depth=100.0).points, atol=1e-4)
 
 
-def test_stride_and_edges() -> None:
+def test_stride() -> None:
     prediction, camera = ground()
     assert len(point_cloud(prediction, camera, stride=4, edge=0.0).points) == 15 * 20
-    depth = np.full((60, 80), 10.0, np.float32)
-    depth[:, 40:] = 20.0
-    step = Prediction(depth, 1 / depth, prediction.image)
-    kept = point_cloud(step, camera, edge=0.1)
-    assert len(kept.points) == 60 * 78, "one column on each side of the jump is left out"
+
+
+def missing(*nearness: float, edge: float = 0.1) -> list[int]:
+    """Return which columns of a picture of 320 pixels have no points, given the disparity of nine of them."""
+    row = np.full(320, nearness[0], np.float32)
+    row[100:109], row[109:] = nearness, nearness[-1]
+    disparity = np.tile(row, (60, 1))
+    prediction = Prediction(1 / disparity, disparity, np.zeros((60, 320, 3), np.uint8))
+    camera = Camera.from_numbers((300.0, 300.0, 159.5, 29.5), 60, 320)
+    points = point_cloud(prediction, camera, edge=edge).points
+    return sorted({*range(320)} - {*np.round(points[:, 0] / points[:, 2] * 300 + 159.5).astype(int).tolist()})
+
+
+def test_what_floats_between_two_surfaces_is_left_out() -> None:
+    ramp = (0.05, 0.05, 0.05, 0.08, 0.125, 0.17, 0.2, 0.2, 0.2)
+    assert missing(*ramp) == [103, 104, 105]
+    assert missing(*ramp, edge=0.0) == []
+    assert missing(*reversed(ramp)) == [103, 104, 105]
+
+
+def test_both_sides_of_a_sharp_edge_are_kept() -> None:
+    assert missing(0.05, 0.05, 0.05, 0.05, 0.05, 0.2, 0.2, 0.2, 0.2) == []
+
+
+def test_a_thin_near_post_is_kept() -> None:
+    assert missing(0.05, 0.05, 0.05, 0.1, 0.2, 0.1, 0.05, 0.05, 0.05) == [103, 105]
+
+
+def test_a_road_far_away_is_kept() -> None:
+    """Its depth changes by a tenth and more from row to row, and it is no edge."""
+    rows = np.maximum(np.arange(120, dtype=np.float32) - 40.0, 5.0)
+    disparity = np.tile(rows[:, None] / 500, (1, 320))
+    prediction = Prediction(1 / disparity, disparity, np.zeros((120, 320, 3), np.uint8))
+    cloud = point_cloud(prediction, Camera.from_numbers((300.0, 300.0, 159.5, 39.5), 120, 320))
+    assert len(cloud.points) == 120 * 320
+    assert len(prediction.point_cloud(90, edge=0).points) == 120 * 320
 
 
 def test_ply_round_trip(tmp_path: Path) -> None:

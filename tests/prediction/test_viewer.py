@@ -65,11 +65,19 @@ def test_points_survive(tmp_path: Path) -> None:
         assert abs(int(image[15, 10, 2]) - 60 * (index + 1)) < 12
 
 
-def test_far_points_and_edges_are_left_out(tmp_path: Path) -> None:
-    write_viewer(tmp_path / "x.html", clip(1), CAMERA, width=160, max_depth=10.0)
-    levels = np.frombuffer(base64.b64decode(content(tmp_path / "x.html")["frames"][0]["disparity"]), "<u2")
-    row = levels.reshape(60, 160)[30]
-    assert np.flatnonzero(row).tolist() == list(range(71, 79))
+def test_far_points_and_the_ramps_of_edges_are_left_out(tmp_path: Path) -> None:
+    def shown(prediction: Prediction, **more: Any) -> list[int]:
+        write_viewer(tmp_path / "x.html", [prediction], CAMERA, width=160, **more)
+        levels = np.frombuffer(base64.b64decode(content(tmp_path / "x.html")["frames"][0]["disparity"]), "<u2")
+        return np.flatnonzero(levels.reshape(60, 160)[30]).tolist()
+
+    (sharp,) = clip(1)
+    assert shown(sharp, max_depth=10.0) == list(range(70, 80))
+    disparity = sharp.disparity.copy()
+    disparity[:, 69] = disparity[:, 80] = 1 / 12
+    ramped = Prediction(1 / disparity, disparity, sharp.image, sharp.scale)
+    assert shown(ramped) == [*range(69), *range(70, 80), *range(81, 160)]
+    assert shown(ramped, edge=0.0) == list(range(160))
 
 
 def test_page_fetches_nothing_and_a_title_cannot_break_it(tmp_path: Path) -> None:

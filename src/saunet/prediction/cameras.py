@@ -28,15 +28,17 @@ def with_camera(
     Raises:
         ConfigError: if points are asked for and there is no camera, or clips of several cameras need one.
     """
-    from saunet.data.video.clips import nearest_camera
-
-    clips = clips_of(options.input, recording.images)
     points = next((output for output in outputs if output in ("ply", "html")), None)
     needs = [f"outputs=[{points}]"] if points else []
     needs += [f"scale.method={options.scale.method}"] if options.scale.method in ("camera_height", "stereo") else []
     needs += ["motion=tracked"] if options.motion == "tracked" else []
     needs += [asked_by] if asked_by else []
     given = options.camera if options.undistort is None else options.undistort
+    if given is None and not needs:
+        return options
+    from saunet.data.video.clips import nearest_camera
+
+    clips = clips_of(options.input, recording.images)
     if given is not None:
         found = {nearest_camera(clip, base) for clip, base in clips.items()} - {None}
         others = sorted(str(file) for file in found if file and not _same(file, given))
@@ -44,8 +46,6 @@ def with_camera(
             key = "camera" if options.undistort is None else "undistort"
             text = given if isinstance(given, str | Path) else "..." if isinstance(given, Camera) else [*given]
             print(f"{key}={text} is used for every frame; passed over: {', '.join(others)}")
-        return options
-    if not needs:
         return options
     by_content: dict[bytes | None, tuple[Path, Path | None]] = {}
     for clip, base in clips.items():

@@ -19,6 +19,10 @@ from saunet.io.images import encode_jpeg, resize
 from saunet.prediction.prediction import Prediction
 
 _PAGE = Path(__file__).with_name("viewer.html")
+_RAMP = 1 / 160
+"""Half the width of the ramp that a depth edge becomes, in widths of the picture."""
+_ENDS = 0.7
+"""Change of disparity within it over that within twice as much, above which it is a ramp: a plane has 0.5, a step 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,12 +98,18 @@ class Camera:
 
 
 def point_cloud(
-    prediction: Prediction, camera: Camera, *, max_depth: float | int | None = None, stride: int = 1, edge: float = 0.1
+    prediction: Prediction,
+    camera: Camera,
+    *,
+    max_depth: float | int | None = None,
+    stride: int = 1,
+    edge: float | int = 0.1,
 ) -> PointCloud:
     """Return a prediction's pixels as points in space, colored by the image.
 
-    Left out are those farther than ``max_depth``, in the unit of depth, and those around which depth changes by more
-    than the fraction ``edge``: they would float between near and far surfaces.
+    Left out are those farther than ``max_depth``, in the unit of depth, and those at depth edges that would float
+    between a near and a far surface: their depth differs from both by more than the fraction ``edge``. On street scenes
+    that is a twentieth of the pixels; 0 keeps all.
     """
     positive("stride", stride)
     positive("edge", edge, allow_zero=True)
@@ -109,7 +119,7 @@ def point_cloud(
     if max_depth is not None:
         keep &= depth <= positive("max_depth", max_depth)
     if edge:
-        keep &= ~jumps(prediction.disparity, edge)
+        keep &= ~between_surfaces(prediction.disparity, edge)
     rows, columns = np.nonzero(keep[::stride, ::stride])
     rows, columns = rows * stride, columns * stride
     z = depth[rows, columns].astype(np.float64)
@@ -135,10 +145,25 @@ def camera_of(camera: Camera | Sequence[float | int] | float | int | str | Path,
     return Camera.from_numbers([camera] if isinstance(camera, float | int) else camera, height, width)
 
 
-def jumps(disparity: Float32[np.ndarray, "h w"], fraction: float) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels around which disparity, and so depth, changes by more than ``fraction``."""
-    square = np.ones((3, 3), np.uint8)
-    return np.asarray(cv2.dilate(disparity, square) > (1 + fraction) * cv2.erode(disparity, square))
+def between_surfaces(disparity: Float32[np.ndarray, "h w"], fraction: float) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels at depth edges that lie on neither surface: their depth differs by ``fraction`` from both.
+
+    Networks and interpolation make ramps of edges, a few pixels wide. The surfaces are the nearest and the farthest
+    depth around a pixel. Slanted ones, such as a road far away, change as steeply but do not end: around twice as large
+    they change twice as much.
+    """
+    radius = max(1, round(_RAMP * disparity.shape[1]))
+    near, far = _extremes(disparity, radius)
+    nearer, farther = _extremes(disparity, 2 * radius)
+    ends = near - far > _ENDS * (nearer - farther)
+    return np.asarray(ends & (disparity > (1 + fraction) * far) & (near > (1 + fraction) * disparity))
+
+
+def _extremes(
+    values: Float32[np.ndarray, "h w"], radius: int
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    square = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    return np.asarray(cv2.dilate(values, square)), np.asarray(cv2.erode(values, square))
 
 
 class ViewerWriter(Session):
@@ -205,7 +230,7 @@ class ViewerWriter(Session):
         if self._max_depth is not None:
             keep &= disparity >= 1 / self._max_depth
         if self._edge:
-            keep &= ~jumps(disparity, self._edge)
+            keep &= ~between_surfaces(disparity, self._edge)
         jpeg = encode_jpeg(resize(prediction.image, self._rows, self._width), quality=85)
         return {"image": base64.b64encode(jpeg).decode(), **encoded(disparity, keep)}
 

@@ -77,14 +77,22 @@ class Prediction:
         return float(low), float(high)
 
     def point_cloud(
-        self, camera: Camera | Sequence[float | int] | float | int | str | Path, max_depth: float | int | None = None
+        self,
+        camera: Camera | Sequence[float | int] | float | int | str | Path,
+        max_depth: float | int | None = None,
+        edge: float | int = 0.1,
     ) -> PointCloud:
         """Return the pixels as colored points in space.
+
+        Pixels at depth edges that would float between a near and a far surface are left out, about a twentieth of a
+        street scene.
 
         Args:
             camera: Where rays go: a camera.yaml; fx, fy, cx, cy in pixels of this image; the nine numbers of K; or one
                 number, the horizontal field of view in degrees.
             max_depth: Leave out points that are farther, in the unit of ``depth``.
+            edge: Leave out points whose depth differs by more than this fraction from the surfaces on both sides of an
+                edge; 0 keeps all.
 
         Returns:
             The points, n x 3; `PointCloud.save` writes them.
@@ -95,7 +103,7 @@ class Prediction:
         """
         from saunet.prediction.pointcloud import camera_of, point_cloud
 
-        return point_cloud(self, camera_of(camera, *self.depth.shape), max_depth=max_depth)
+        return point_cloud(self, camera_of(camera, *self.depth.shape), max_depth=max_depth, edge=edge)
 
     def save(self, path: str | Path) -> None:
         """Write depth as float32 (``.npy``), disparity in colors (``.png``, ``.jpg`` ...), or a page (``.html``).
