@@ -76,7 +76,7 @@ KITTI = (
         ("experiment=smoke trainer.precision=64", ("trainer.precision is '64'", "allowed: 32-true")),
         ("experiment=smoke trainer.overfit_batches=1", ("use trainer.limit_train_batches",)),
         ("experiment=smoke logger=null", ("cannot be null; choose logger=none",)),
-        ("experiment=smoke callbacks=null", ("a group of the config cannot be null",)),
+        ("experiment=smoke callbacks=null", ("a config group cannot be null",)),
         ("experiment=smoke output_dir=", ("output_dir= is empty",)),
         ("experiment=smoke resume=", ("resume= is empty",)),
         ("experiment=smoke trainer.max_epochs=-1", ("trainer.max_epochs is -1",)),
@@ -188,7 +188,7 @@ def test_a_checkpoint_of_another_model_cannot_be_resumed(tool: Tool, smoke_run: 
 def test_a_resumed_run_with_other_settings(tool: Tool, smoke_run: Path) -> None:
     last = smoke_run / "checkpoints" / "last.ckpt"
     outcome = tool("train", "experiment=smoke", "model/pose=posecnn", "data.width=128", f"resume={last}")
-    outcome.says("width 96 and this run has 128", "saunet resume")
+    outcome.says("width 96 but this run has 128", "saunet resume")
 
 
 def test_an_empty_drive(tool: Tool, raw_root: Path) -> None:

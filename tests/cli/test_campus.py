@@ -127,7 +127,7 @@ def test_the_doctor_ends_with_an_error_where_training_would(tool: Tool, tmp_path
         ("data.root=gone", ("no data root at", "gone", "set data.root")),
         ("data.manifest=gone.json", ("no manifest at gone.json",)),
         ("data.crop=[0.9]", ("crop is [0.9]",)),
-        ("data.val_clips=[b]", ("val_clips names 'b', which fits no clip; clips: a.avi",)),
+        ("data.val_clips=[b]", ("val_clips names 'b', which matches no clip; clips: a.avi",)),
         ("data.camera=gone.yaml", ("no camera file at gone.yaml", "saunet calibrate")),
         ("data=mixed ~data.frames_cache", ("data=mixed has no sources",)),
     ],

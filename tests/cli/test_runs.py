@@ -113,7 +113,7 @@ def test_a_sweep_does_not_write_its_jobs_over_each_other(tool: Tool, tmp_path: P
     outcome = tool(*jobs, "output_dir=runs/all", "hydra.sweep.dir=sweep")
     assert outcome.code == 1
     assert "output_dir is 'runs/all'" in outcome.err
-    assert "set hydra.sweep.dir=runs/all, below which each job gets its own" in outcome.err
+    assert "set hydra.sweep.dir=runs/all, where each job gets a folder of its own" in outcome.err
     assert "sweep:" not in outcome.out
     assert not (tmp_path / "runs").exists()
     outcome = tool(*jobs, "output_dir=${hydra:runtime.output_dir}/run", "hydra.sweep.dir=sweep")
@@ -206,7 +206,7 @@ def test_a_finished_run_is_not_replaced_by_mistake(tool: Tool, smoke_run: Path, 
     shutil.copytree(smoke_run, run)
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     for mistake, words in (
-        ((), "holds best.ckpt of an earlier run; continue it by resume=auto"),
+        ((), "holds best.ckpt of an earlier run; continue it with resume=auto"),
         (("seed=-1", "resume=auto"), "seed is -1"),
         (("resume=run/checkpoints/lst.ckpt",), "no checkpoint at"),
         (("resume=run/checkpoints/last.ckpt",), "checkpoint of another model"),  # refused once the data were set up

@@ -74,7 +74,7 @@ def test_spawned_processes_are_refused_with_the_reason(config: dict[str, Any]) -
 def test_a_sweep_over_processes_is_refused_with_the_ways_out(tmp_path: Path) -> None:
     done = python("-m", "saunet.cli.train", "--multirun", *SMOKE, *TWO, "seed=1,2", cwd=tmp_path)
     assert done.returncode == 1
-    assert "start each training with a command of its own" in done.stderr
+    assert "start each training with its own command" in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -59,10 +59,10 @@ def test_the_figures_of_a_step() -> None:
     [
         ("disparity_spread", 0.001, "depth has collapsed"),
         ("holes", 0.2, "20.0% of the pixels are holes"),
-        ("automask", 0.01, "only 1.0% of the pixels teach"),
+        ("automask", 0.01, "only 1.0% of the pixels are used"),
         ("translation", 1e-9, "the pose network has collapsed"),
         ("rotation", 1.0, "turns by 1.00 rad"),
-        ("automask", 1.0, "drops no pixel (100.00% teach)"),
+        ("automask", 1.0, "drops almost no pixel (100.00% are used)"),
         ("loss", 1e-6, "the loss is nearly zero (1.0e-06)"),
         ("disparity_spread", float("nan"), "is not a number"),
     ],

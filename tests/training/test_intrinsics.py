@@ -181,14 +181,14 @@ def test_a_training_says_what_it_found_keeps_it_and_resumes(
     further = train(train_options(again)).model.found_intrinsics().focals[name][1]
     assert further != now
     config["model"]["intrinsics"] = "fixed"
-    with pytest.raises(CheckpointError, match=r"model\.intrinsics=learned and this run has fixed"):
+    with pytest.raises(CheckpointError, match=r"model\.intrinsics=learned but this run has fixed"):
         train(train_options(again | {"model": config["model"]}))
 
 
 def test_a_stereo_pair_alone_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"model\.intrinsics=refined needs neighbors in time"):
         focal_lengths("refined", Bends(offsets=[], stereo=True))
-    with pytest.raises(ConfigError, match=r"model\.intrinsics=learned and data\.track_motion=true do not go together"):
+    with pytest.raises(ConfigError, match=r"model\.intrinsics=learned and data\.track_motion=true cannot be combined"):
         focal_lengths("learned", Bends(track_motion=True))
     with pytest.raises(ConfigError, match=r"model\.intrinsics"):
         train_options({"model": {"encoder": {}, "decoder": {}, "intrinsics": "free"}})

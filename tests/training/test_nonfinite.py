@@ -49,7 +49,7 @@ def finite(folder: Path) -> int:
 
 def test_the_run_stops_with_the_names_and_keeps_the_batch(tmp_path: Path) -> None:
     with pytest.raises(
-        SaunetError, match=r"NaN or infinite at step 3 \(batch: train \d .*; kept as (.*)\); look at"
+        SaunetError, match=r"NaN or infinite at step 3 \(batch: train \d .*; kept as (.*)\); check the"
     ) as e:
         fit(tmp_path, Spoil(3), NonFinite(str(tmp_path / "bad")))
     assert "\n" not in str(e.value)

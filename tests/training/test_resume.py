@@ -212,10 +212,10 @@ def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Pa
     count = len(other.depth.state_dict())
     assert f"all {count} tensors of the depth network" in said
     assert f"{len(other.pose.state_dict()) - 2} of {len(other.pose.state_dict())} tensors of the pose" in said
-    assert "pose network (left as they were: layers.0.weight, not in it, and 1 more)" in said
+    assert "pose network (left unchanged: layers.0.weight, not in it, and 1 more)" in said
     assert torch.equal(next(other.depth.parameters()), next(model.depth.parameters()))
     atomic_save({"saunet": model.record, "state_dict": {"depth.x": torch.zeros(1)}}, tmp_path / "b.ckpt")
-    with pytest.raises(CheckpointError, match=r"nothing of .*b\.ckpt fits the depth network"):
+    with pytest.raises(CheckpointError, match=r"no weights in  .*b\.ckpt fit the depth network"):
         warm_start(other, tmp_path / "b.ckpt")
 
 
@@ -224,7 +224,9 @@ def test_a_warm_start_says_what_else_makes_depth_differ(model: Any, tmp_path: Pa
     record["model"]["encoder"]["normalization"] = "imagenet"
     atomic_save({"saunet": record, "state_dict": model.state_dict()}, tmp_path / "a.ckpt")
     said = warm_start(model, tmp_path / "a.ckpt")
-    assert "its encoder has normalization imagenet and here monodepth2, so the same weights give other depths" in said
+    assert (
+        "its encoder has normalization imagenet but monodepth2 here, so the same weights give different depths" in said
+    )
 
 
 def test_a_warm_start_from_a_shipped_model(
@@ -238,7 +240,7 @@ def test_a_warm_start_from_a_shipped_model(
     said = warm_start(other, "street")
     assert "starting from street: all " in said
     assert f"all {len(other.pose.state_dict())} tensors of the pose network" in said
-    assert "max_depth is 100 and here 50" in said
+    assert "max_depth is 100 but 50 here" in said
     for part in ("depth", "pose"):
         for own, theirs in zip(getattr(other, part).parameters(), getattr(model, part).parameters(), strict=True):
             assert own.dtype == torch.float32
@@ -269,8 +271,8 @@ def test_a_writer_that_dies_midway_leaves_the_previous_checkpoint(tmp_path: Path
 @pytest.mark.parametrize(
     ("seed", "data", "words"),
     [
-        (5, {}, "with seed 0 and this run has 5"),
-        (0, {"batch_size": 2}, "with data.batch_size 4 and this run has 2"),
+        (5, {}, "with seed 0 but this run has 5"),
+        (0, {"batch_size": 2}, "with data.batch_size 4 but this run has 2"),
         (0, {"offsets": (-2, 2)}, r"with training frames \(SHA-256 of their names\)"),
     ],
 )

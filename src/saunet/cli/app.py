@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Partial(Protocol):
-    """A result of which some parts failed, each said in one sentence."""
+    """A result with failed parts, one sentence for each."""
 
     failures: Sequence[str]
 
 
 @runtime_checkable
 class Shown(Protocol):
-    """A result that prints itself, in colors and at the terminal's width; others are printed as text."""
+    """A result that prints itself with colors and at the terminal's width; other results are printed as text."""
 
     show: Callable[[], None]
 
@@ -52,9 +52,9 @@ class Graded(Protocol):
 
 RESUME = "continue a stopped training in its folder, with its own settings"
 RESUME_HELP = """\
-RUN is the run's folder, the one with run.json. Its command line is repeated from its last checkpoint; relative paths in
-it start at the current folder. What follows differs: `saunet resume RUN epochs=20` trains longer. `saunet train --help`
-lists the keys."""
+RUN is the run's folder, the one with run.json. Its command is run again from its last checkpoint; relative paths in it
+start at the current folder. Keys that you add change it: `saunet resume RUN epochs=20` trains longer. All keys: `saunet
+train --help`."""
 
 
 @runtime_checkable
@@ -71,11 +71,11 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _end_if_unread() -> None:
-    """End, where the reader of what is printed has gone, as a program does that SIGPIPE ends."""
+    """Exit as after SIGPIPE if nobody reads the output any more."""
     try:
         print(flush=True)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is buffered goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # drops what is still buffered
         raise SystemExit(128 + 13) from None
 
 
@@ -91,10 +91,10 @@ def overview() -> str:
 
 
 def run(name: str, argv: Sequence[str]) -> None:
-    """Run a tool with the words of a command line; ends in `SystemExit` with the code, unless all went well.
+    """Run a tool with the words of a command line; raises `SystemExit` with the exit code if anything failed.
 
-    What a user can mend is said in one sentence; only a defect of the program shows a traceback.
-    ``HYDRA_FULL_ERROR=1`` shows it always. It ends quietly when nobody reads what it prints, as after ``| head``.
+    An error that the user can fix is one sentence; only a bug shows a traceback. ``HYDRA_FULL_ERROR=1`` always shows
+    it. The tool exits quietly when nobody reads its output, as with ``| head``.
     """
     wait_briefly()
     try:
@@ -126,16 +126,16 @@ def run(name: str, argv: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end a tool as Ctrl-C does, tidily and with a word; a training saves first."""
+    """Make SIGTERM and SIGHUP end a tool as Ctrl-C does, tidily and with a message; a training saves first."""
 
     def stop(number: int, _: object) -> NoReturn:
         from saunet.runs.folder import Stopped
 
-        # A signal to the whole process group ends torch's loader processes too. Its handler for that raises wherever
-        # the program is, and would make a failure of the stop that is under way.
+        # A signal to the whole process group also ends torch's loader processes. Torch's handler for that raises
+        # wherever the program is, and would turn the stop in progress into a failure.
         if hasattr(signal, "SIGCHLD"):
             before[signal.SIGCHLD] = signal.signal(signal.SIGCHLD, lambda *_: None) or signal.SIG_DFL
-        raise Stopped(f"stopped by {signal.Signals(number).name}; what is complete stays", 128 + number)
+        raise Stopped(f"stopped by {signal.Signals(number).name}; finished results are kept", 128 + number)
 
     main = threading.current_thread() is threading.main_thread()
     wanted = [getattr(signal, each) for each in ("SIGTERM", "SIGHUP") if main and hasattr(signal, each)]
@@ -198,7 +198,7 @@ def _run(name: str, argv: Sequence[str]) -> int:
         name, argv = "train", resumed(argv)
     tool = TOOLS[name]
     argv = [tool.words.get(argv[0], argv[0]), *argv[1:]] if argv else []
-    if tool.options is None:  # it reads its words itself
+    if tool.options is None:  # it parses its own words
         imported(tool.function)(argv)
         return 0
     with _ended_at_once(name):
@@ -223,7 +223,7 @@ def _run(name: str, argv: Sequence[str]) -> int:
         composed = None if flags.multirun else compose.single(hydra, config, given)
         if composed is None:
             return compose.sweep(hydra, config, [*given, "hydra.mode=MULTIRUN"], functools.partial(job, name))
-    # What starts further processes runs this command again, with the same folder.
+    # Launchers of further processes run this command again, with the same folder.
     kept = {"--config-dir": flags.config_dir, "--config-name": flags.config_name}
     again = [*overrides, *(f"{option}={value}" for option, value in kept.items() if value)]
     sys.argv[1:] = [name, *again, f"hydra.run.dir='{composed.folder}'"]
@@ -231,7 +231,7 @@ def _run(name: str, argv: Sequence[str]) -> int:
 
 
 def resumed(words: Sequence[str]) -> list[str]:
-    """Return the command line that continues a run from its last checkpoint, given its folder and what shall differ."""
+    """Return the command line that resumes a run from its last checkpoint, given its folder and the keys to change."""
     from saunet.runs import folder as runs
 
     folder = Path(words[0]).absolute() if words else Path()
@@ -284,8 +284,8 @@ def call(name: str, composed: Composed, table: Table) -> tuple[int, object]:
     record = {"choices": composed.choices, "overrides": composed.overrides, "describe": sentence}
     wanted = inspect.signature(called).parameters
     quiet()
-    if gc.get_freeze_count() == 0:  # not before each job of a sweep, whose remains would stay for good
-        gc.freeze()  # what is imported stays: to search it for garbage again and again doubles the time of an index
+    if gc.get_freeze_count() == 0:  # not before each job of a sweep, whose leftovers would never be removed
+        gc.freeze()  # imported modules stay: searching them for garbage again and again doubles an index's time
     result = called(options, **{key: value for key, value in record.items() if key in wanted})
     first = os.environ.get("RANK", "0") == "0"  # of the processes that torchrun started, if it did
     if isinstance(result, Shown) and first:
@@ -301,7 +301,7 @@ def call(name: str, composed: Composed, table: Table) -> tuple[int, object]:
 def job(name: str, raising: bool, cfg: DictConfig) -> object:
     """Do one job of a sweep, perhaps in another process, and return what a search minimizes.
 
-    What goes wrong is said at once and ends this job only.
+    An error is reported at once and ends this job only.
     """
     from hydra.core.hydra_config import HydraConfig
 

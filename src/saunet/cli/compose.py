@@ -1,7 +1,7 @@
-"""Hydra and nothing else: a tool's configuration, composed and checked by type, becomes the tool's options.
+"""The only module that uses Hydra: it composes a tool's configuration, checks its types, and builds the tool's options.
 
 Nothing is written for a single run: its folder appears with the first file that a tool writes, after its checks. In a
-sweep each job has its folder, one failed job costs no other, and at the end every failure is named.
+sweep each job has its own folder, a failed job does not stop the others, and every failure is listed at the end.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ _CONVERTED = (tuple, Sequence, Mapping, typing.Literal)
 
 
 class _Hydra(Hydra):
-    """Hydra that looks at a sweep with the first of its choices, for ``experiment=a,b`` brings the keys of others."""
+    """Hydra that checks a sweep with the first of its choices, because the choices of ``experiment=a,b`` bring keys."""
 
     def compose_config(
         self, config_name: str | None, overrides: list[str], run_mode: RunMode, *args: bool, **kwargs: bool
@@ -86,7 +86,7 @@ class _Hydra(Hydra):
 
 @contextmanager
 def hydra(tool: Tool, table: Table, extra: str | None = None) -> Iterator[Hydra]:
-    """Give Hydra, knowing the keys of a tool and of all components; an extra folder of YAML files comes first."""
+    """Return Hydra with the keys of a tool and of all components; an extra folder of YAML files comes first."""
     _register(table)
     _register_tool(table, tool)
     setbase("1.3")
@@ -94,7 +94,7 @@ def hydra(tool: Tool, table: Table, extra: str | None = None) -> Iterator[Hydra]
     path = create_config_search_path(str(config_dir()))
     if extra is not None:
         if not Path(extra).is_dir():
-            raise ConfigError(f"--config-dir is {extra}, which is no folder; check the path")
+            raise ConfigError(f"--config-dir is {extra}, which is not a folder; check the path")
         first = f"file://{Path(extra).resolve()}"
         path.prepend(provider="command-line", path=first, anchor=SearchPathQuery(provider="schema"))
     GlobalHydra.instance().clear()
@@ -110,7 +110,7 @@ def hydra(tool: Tool, table: Table, extra: str | None = None) -> Iterator[Hydra]
 
 
 def _source(tool: str, table: Table) -> type[FileConfigSource]:
-    """Return what reads YAML files: text as it was written, where YAML would see a number in ``2024_05_01``."""
+    """Return a YAML loader that keeps text as written where YAML would see a number, as in ``2024_05_01``."""
 
     def keep_text(node: yaml.Node, key: str) -> None:
         if isinstance(node, yaml.MappingNode):
@@ -169,7 +169,7 @@ def _register(table: Table) -> None:
 
 
 def structured(node: schema.Node) -> type:
-    """Return the dataclass by which OmegaConf checks a node's keys and types."""
+    """Return the dataclass with which OmegaConf checks a node's keys and types."""
     fields: list[tuple[str, object, object]] = []
     if node.path is not None:
         fields += [("_target_", str, node.path), ("_convert_", str, "all")]
@@ -193,18 +193,18 @@ class Composed:
     config: Mapping[str, object]
     """As plain data, resolved."""
     choices: Mapping[str, str | None]
-    """Config group -> what was chosen."""
+    """Config group -> the choice."""
     overrides: tuple[str, ...]
-    """What the command line said."""
+    """The overrides of the command line."""
     folder: str
-    """The run's folder as ``hydra.run.dir`` says, not made yet."""
+    """The run's folder, from ``hydra.run.dir``; it may not exist yet."""
 
 
 def single(hydra: Hydra, name: str, overrides: list[str]) -> Composed | None:
     """Compose the configuration of one run; None if it asks for a sweep by itself."""
     try:
         cfg = hydra.compose_config(name, overrides, RunMode.RUN)
-    except Exception as error:  # perhaps of a sweep whose YAML file says so
+    except Exception as error:  # a YAML file may ask for a sweep
         if "multirun" not in str(error):
             raise
         cfg = hydra.compose_config(name, overrides, RunMode.MULTIRUN)
@@ -247,7 +247,7 @@ def _flat(node: object, prefix: str) -> Iterator[tuple[str, object]]:
 
 
 def of_job(cfg: DictConfig, hydra_cfg: DictConfig) -> Composed:
-    """Return what a job of a sweep, or a single run, is to do."""
+    """Return the configuration of a single run or of one job of a sweep."""
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
         needed = " ".join(f"{key}=..." for key in missing)
@@ -301,12 +301,12 @@ def _plain(cfg: DictConfig) -> dict[str, object]:
 
 
 def options(cls: Callable[..., T], composed: Composed, table: Table) -> T:
-    """Build a tool's options; a key that nobody reads is an error."""
+    """Build a tool's options; an unused key is an error."""
     given = {key: value for key, value in composed.config.items() if key != PLUGINS.name}
     _check(given, "", table)
     for key in PATHS:
         if given.get(key) == "":
-            raise ConfigError(f"{key}= is empty, perhaps from a shell variable that is not set; name a path")
+            raise ConfigError(f"{key}= is empty, perhaps because a shell variable is not set; give a path")
     for key, names in (("checkpoint", ("best", "last")), ("init_from", ("best", "last")), ("resume", ("last",))):
         if given.get(key):  # a run's folder stands for the checkpoint in it
             folder = Path(str(given[key])).expanduser()
@@ -316,7 +316,7 @@ def options(cls: Callable[..., T], composed: Composed, table: Table) -> T:
 
 
 def _check(given: Mapping[str, object], prefix: str, table: Table) -> None:
-    """Check the keys of every component: Hydra's ``+`` adds keys that nobody reads."""
+    """Check the keys of every component: Hydra's ``+`` adds keys without checking them."""
     node = table.by_path(given.get("_target_"))
     known = [key.name for key in node.keys] if node else []
     for key, value in given.items():
@@ -336,7 +336,7 @@ def _build(cls: Callable[..., T], given: Mapping[str, object], choices: Mapping[
 
 
 def _value(annotation: object, value: object, choices: Mapping[str, str | None], key: str) -> object:
-    """Return what the options' annotation asks for: a `Spec`, nested options, a path, a tuple, or the value itself."""
+    """Return what the options' annotation asks for: a `Spec`, nested options, a path, a tuple or the plain value."""
     origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
     if value is None:
         return None
@@ -361,18 +361,18 @@ def _value(annotation: object, value: object, choices: Mapping[str, str | None],
 
 
 class Failed:
-    """What a job returns that failed and said so."""
+    """The result of a job that failed and reported it."""
 
 
 def sweep(hydra: Hydra, name: str, overrides: list[str], task: Callable[[bool, DictConfig], object]) -> int:
     """Run a job for each combination of the values given, and return the exit code.
 
-    A job's task is given whether it raises what goes wrong, as a search wants it, and its configuration.
+    A job's task gets its configuration, and whether to raise its errors, as a search needs.
     """
     from saunet.runs.folder import FILE, locked
     from saunet.runs.sweep import PLAN, summary, write_plan
 
-    # Each job names itself instead.
+    # Each job prints its own name instead.
     logging.getLogger("hydra._internal.core_plugins.basic_launcher").setLevel(logging.WARNING)
     cfg = hydra.compose_config(name, overrides, RunMode.MULTIRUN)
     HydraConfig.instance().set_config(cfg)
@@ -419,20 +419,20 @@ def _planned(cfg: DictConfig) -> list[list[str]]:
 
 
 def check_job(config: Mapping[str, object], job: str) -> None:
-    """Check that a job writes into the folder that the sweep gave it alone, and does not start the sweep once more."""
+    """Check that a job writes only to its own folder of the sweep, and does not start the sweep again."""
     folder = config.get("output_dir")
     if folder:  # an empty one is refused below
         given, own = Path(str(folder)).resolve(), Path(job).resolve()
         if own != given and own not in given.parents:
             raise ConfigError(
-                f"output_dir is '{folder}' and the jobs of a sweep must not share a folder; "
-                f"leave it out and set hydra.sweep.dir={folder}, below which each job gets its own"
+                f"output_dir is '{folder}' and the jobs of a sweep must not share a folder; leave it out and set "
+                f"hydra.sweep.dir={folder}, where each job gets a folder of its own"
             )
     trainer = config.get("trainer")
     if isinstance(trainer, Mapping) and _replays(trainer):
         raise ConfigError(
-            "--multirun with several processes per job would replay the whole sweep on every process; "
-            "use one process per job, or start each training with a command of its own, such as in a shell loop"
+            "--multirun with several processes per job would replay the whole sweep on every process; use one "
+            "process per job, or start each training with its own command, for example in a shell loop"
         )
 
 

@@ -1,4 +1,4 @@
-"""The README's demo: train on rendered video, score on its streets and on an unseen one, draw pictures and a video."""
+"""The README's demo: train on rendered video, score on its streets and a new one, draw pictures and a video."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from saunet.training.tool import TrainOptions, train
 SHIPPED = "street"
 """The model that comes with saunet, shown beside the one that the demo trains."""
 PICTURES = 3
-"""Frames shown in a panel: of one street evenly spread, of several one each."""
+"""Frames shown in a panel: evenly spread over a single street, or one from each of several."""
 STREETS = {
     "driven": "Streets that the camera drove through: 'model' has learned from their video, not from their depth.",
     "unseen": "A street that neither network has seen; 'model' was trained without any depth.",
 }
-"""What was scored, by the name of its files."""
+"""The scored streets, by the name of their files."""
 WIDTH = 640
-"""Of the pictures in pixels; rendered frames are rendered anew at this width, and the networks reduce them."""
+"""Width of the pictures in pixels; frames are rendered again at this width, and the networks resize them."""
 
 
 def demo(

@@ -1,4 +1,4 @@
-"""What went wrong, in one sentence, where the user can mend it."""
+"""Turn errors that the user can fix into one sentence."""
 
 from __future__ import annotations
 
@@ -12,20 +12,23 @@ _TYPES = {"Float": "float", "Integer": "int", "Boolean": "bool (true or false)"}
 
 
 def sentence(error: BaseException, table: Table | None = None) -> str | None:
-    """Return one sentence; None for a defect of the program. The table has the keys that are allowed."""
-    cause, kind = error.__cause__, type(error).__name__  # by name: nothing is imported for its errors
+    """Return one sentence; None for a bug. The table has the allowed keys."""
+    cause, kind = error.__cause__, type(error).__name__  # by name, to import nothing only for its errors
     text = f"{error}\n{cause or ''}"
     if isinstance(error, SaunetError):
         return str(error)
     if kind == "OutOfMemoryError":
-        return "the GPU's memory is too small for this; lower the batch size (in training data.batch_size) or the size"
+        return (
+            "the GPU has too little memory for this; lower the batch size (data.batch_size in training) or the image "
+            "size"
+        )
     if "Config group override must be a string or a list" in text:
-        return "a group of the config cannot be null; choose logger=none, or set single members to null"
+        return "a config group cannot be null; choose logger=none, or set single keys of the group to null"
     spawned = re.search(r"^saunet\.errors\.\w+: (.*)", str(error), re.MULTILINE)
-    if spawned:  # raised in another process, as of a launcher of sweeps: only its traceback's text arrives here
+    if spawned:  # raised in another process, such as a sweep launcher's: only the text of its traceback arrives here
         return spawned[1]
     for each in (error, cause):
-        if type(each).__name__ == "MisconfigurationException":  # Lightning's word for a user's error
+        if type(each).__name__ == "MisconfigurationException":  # Lightning's name for a user's error
             return _line(str(each))
     missing = re.search(r"\b(wandb|mlflow)\b", text) if isinstance(error, ModuleNotFoundError) else None
     if missing:
@@ -33,7 +36,7 @@ def sentence(error: BaseException, table: Table | None = None) -> str | None:
     if type(error).__module__.partition(".")[0] in ("hydra", "omegaconf"):
         return _of_hydra(str(getattr(error, "override", "")) if kind == "OverrideParseException" else "", text, table)
     if isinstance(error, OSError):
-        return f"cannot use {error.filename or 'a file'}: {error.strerror or error}; check the path and its rights"
+        return f"cannot use {error.filename or 'a file'}: {error.strerror or error}; check the path and its permissions"
     return None
 
 
@@ -62,7 +65,7 @@ def _of_hydra(unread: str, text: str, table: Table | None) -> str:
         said = suggest(unknown[1], allowed).replace(f"'{unknown[1]}'", "")
         return f"unknown key '{key}'{said or ';'} allowed: {', '.join(allowed)}" if allowed else f"unknown key '{key}'"
     if there := re.search(r"Could not append to config\. An item is already at '([^']+)'", text):
-        return f"+{there[1]}=... adds a key and there is one already; leave out the plus sign: {there[1]}=..."
+        return f"+{there[1]}=... adds a key that exists already; leave out the plus sign: {there[1]}=..."
     typed = re.search(r"Value ('.*') of type '\w+' could not be converted to (\w+)", text)
     if typed and full_key:  # as the components say it
         return f"{full_key[1]} is {typed[1]}; it must be {_TYPES.get(typed[2], typed[2])}"

@@ -1,4 +1,4 @@
-"""What there is: a tool's help, the list of components, and Tab completion, all from the table of keys alone."""
+"""A tool's help, the list of components, and Tab completion, all from the table of keys alone."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from saunet.registry import REGISTRIES, registry
 WIDTH = 118
 COMPONENT = ("component", "component?")
 PARTS = (TRAINER[0], "callbacks", "logger")
-"""Keys that a config group fills, beside those of components."""
+"""Keys filled by a config group that are not components."""
 RECIPES = {
-    "experiment": "a training with all that belongs to it, one of",
-    "loss": "a change of the objective, one of",
+    "experiment": "a complete training, one of",
+    "loss": "a variant of the objective, one of",
     "sweep": "several trainings, one of",
 }
 """Config groups of ``train`` that no component fills, and what they choose."""
@@ -49,11 +49,11 @@ compdef _saunet saunet""",
 end
 complete -c saunet -f -a '(_saunet)'""",
 }
-"""Shell -> what it has to evaluate: ``eval "$(saunet --completion bash)"``."""
+"""Shell -> the script that it evaluates: ``eval "$(saunet --completion bash)"``."""
 
 
 def tool_help(tool: Tool, table: Table, values: Mapping[str, object], chosen: Mapping[str, str]) -> str:
-    """Return the help of one tool, with the values that its keys have and what is chosen by group."""
+    """Return the help of one tool, with the current values of its keys and the choice of each group."""
     plain = f" [{tool.positional.upper().replace('*', ' ...')}]" if tool.positional else ""
     node, said = table.tools[tool.name], f"saunet {tool.name}"
     lines = [f"{said}: {tool.summary}", "", f"usage: {said}{plain} [KEY=VALUE ...]", "", "examples:"]
@@ -85,7 +85,7 @@ def recipes(group: str) -> Iterator[tuple[str, str]]:
 
 
 def _with_folder(keys: Sequence[schema.Key], tool: Tool) -> list[schema.Key]:
-    """Give the key of the folder for results the default that the tool's YAML file gives it."""
+    """Give the key of the results folder the default from the tool's YAML file."""
     found = re.search(r"^(?:    dir|output): (outputs/\S+)", _yaml(tool), re.MULTILINE)
     folder = found and found[1].replace("${name}", "NAME").partition("${now")[0] + "DATE_TIME"
     return [replace(key, default=folder) if folder and key.name in ("output", "output_dir") else key for key in keys]
@@ -99,7 +99,7 @@ def _yaml(tool: Tool) -> str:
 def described(
     keys: Sequence[schema.Key], prefix: str, values: Mapping[str, object] = MappingProxyType({})
 ) -> Iterator[str]:
-    """Yield a line for each key that holds a value, with what stands before its name; ``values`` go before defaults."""
+    """Yield a line for each key with a value, its name behind a prefix; ``values`` override defaults."""
     for name, key in leaves(keys, prefix):
         if key.name not in PARTS:
             shown = "|".join(map(str, key.choices)) if key.choices else key.annotation.replace(" | None", "")
@@ -107,12 +107,12 @@ def described(
             value = key.default if "${" in str(value) else value  # it follows another key
             default = " (required)" if value == schema.REQUIRED else f" = {written(value)}"
             if value is None:
-                default = " (as Lightning has it)" if name.strip().startswith(f"{TRAINER[0]}.") else " (not set)"
+                default = " (Lightning's default)" if name.strip().startswith(f"{TRAINER[0]}.") else " (not set)"
             yield f"{name}: {shown}{default}{f'  {key.help}' if key.help else ''}"
 
 
 def leaves(keys: Sequence[schema.Key], prefix: str = "") -> Iterator[tuple[str, schema.Key]]:
-    """Yield the keys that hold a value, those of nested options too, with their whole names."""
+    """Yield the keys with a value, including those of nested options, with their full names."""
     for key in keys:
         if key.node is not None:
             yield from leaves(key.node.keys, f"{prefix}{key.name}.")
@@ -140,7 +140,7 @@ def groups(node: schema.Node) -> Iterator[str]:
 
 
 def chosen_names(tool: Tool, table: Table, given: Mapping[str, str]) -> dict[str, str]:
-    """Return what is chosen for each group: what the command line says, else what the tool's YAML file says."""
+    """Return the choice for each group: from the command line, else from the tool's YAML file."""
     chosen = {**dict(re.findall(r"^  - (\w+): (?!null$)(\w+)$", _yaml(tool), re.MULTILINE)), **given}
     model = table.components["model"].get(chosen.get("model", ""))
     parts = {f"model/{key.name}": str(key.default) for key in (model.keys if model else ())}
@@ -157,12 +157,14 @@ def components(arguments: Sequence[str]) -> None:
     """Print what is registered: all, a kind, or one component."""
     parser = argparse.ArgumentParser(
         prog="saunet components",
-        description="every registered component with its keys, defaults and a sentence each",
+        description="every registered component with its keys, defaults and one sentence",
         epilog=f"{PLUGINS.name}=[my_file.py,...]  {PLUGINS.help}",
     )
     parser.add_argument("kind", nargs="?", help=f"one of: {', '.join(REGISTRIES)}; all by default")
     parser.add_argument("name", nargs="?", help="one component of that kind")
-    parser.add_argument("--count", action="store_true", help="only names and numbers of trainable weights, of networks")
+    parser.add_argument(
+        "--count", action="store_true", help="for networks: only names and numbers of trainable weights"
+    )
     plugins.load(named_plugins(arguments))
     given = parser.parse_args([word for word in arguments if not is_plugins(word)])
     everything = NETWORKS if given.count else tuple(REGISTRIES)
@@ -177,7 +179,7 @@ def components(arguments: Sequence[str]) -> None:
                 print(f"  {name:20}{count(kind, name):>12}")
                 continue
             node, group = found[kind][name], "model" if kind == "model" else REGISTRIES[kind].group
-            if kind == "term":  # added to an objective, not chosen in the place of another
+            if kind == "term":  # added to an objective instead of replacing another component
                 choose = f"+objective.extra.{name}.weight=..."
             else:
                 choose = f"{group}={name}" if group else f'saunet.build("{kind}", "{name}", ...)'
@@ -186,13 +188,13 @@ def components(arguments: Sequence[str]) -> None:
 
 
 def count(kind: str, name: str) -> str:
-    """Return the number of parameters of a network, in millions or as it is."""
+    """Return a network's number of parameters, in millions or exactly."""
     import torch
 
     from saunet.tools.benchmark import count_parameters
 
     owner = registry(kind)
-    with torch.device("meta"):  # shapes without memory
+    with torch.device("meta"):  # shapes only, no memory
         late: dict[str, object] = {"channels": 64} if "channels" in owner.late else {}
         if "features" in owner.late:
             late["features"] = registry("encoder").build("stratified_tiny").features
@@ -205,12 +207,12 @@ def count(kind: str, name: str) -> str:
 
 
 def completion(shell: str) -> list[str]:
-    """Return what a shell evaluates to complete ``saunet``."""
+    """Return the script that makes a shell complete ``saunet``."""
     return [SCRIPTS[one_of("--completion", shell, SCRIPTS)]]
 
 
 def complete(line: str) -> list[str]:
-    """Return what the last word of a line can become, given the line up to the cursor, from ``saunet`` on."""
+    """Return the completions of a line's last word, given the line from ``saunet`` up to the cursor."""
     given, table = line.split(" ")[1:], read()
     word = given[-1] if given else ""
     if len(given) < 2:

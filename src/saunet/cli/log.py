@@ -1,4 +1,4 @@
-"""What is said besides results: to the terminal, and with the time into a file of the run's folder."""
+"""Messages other than results: to the terminal, and with the time to a file in the run's folder."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from saunet.io.said import PRINTED
 
 
 class RunLog(logging.FileHandler):
-    """A log in a run's folder, begun by the first file that the tool writes there: what is said before is kept.
+    """A log in a run's folder, held back in memory until the tool writes its first file there.
 
-    It keeps what goes through loggers, and what is printed with `saunet.io.said`. A tool that is refused leaves neither
-    a folder nor a line in the log of an earlier run. Each further process of a run has a file of its own.
+    It keeps what goes through loggers, and what is printed with `saunet.io.said`. A refused command leaves neither a
+    folder nor a line in the log of an earlier run. Each further process of a run has its own file.
     """
 
     def __init__(self, filename: str) -> None:
@@ -32,7 +32,7 @@ class RunLog(logging.FileHandler):
         self._write()
 
     def close(self) -> None:
-        """Write what is still kept: a tool may say nothing more once it has written."""
+        """Write the messages still held back: a tool may log nothing more after its first file."""
         PRINTED.removeHandler(self)
         self._write()
         super().close()
@@ -44,7 +44,7 @@ class RunLog(logging.FileHandler):
                 super().emit(each)
 
     def _changed(self) -> int | None:
-        """Return when a file was last made in the folder or renamed; None while there is no folder."""
+        """Return when a file was last created or renamed in the folder; None while there is no folder."""
         folder = Path(self.baseFilename).parent
         return folder.stat().st_mtime_ns if folder.is_dir() else None
 
@@ -59,7 +59,7 @@ _with_place = warnings.formatwarning
 def _one_line(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
 ) -> str:
-    """Return a warning of ours without its place in the code, which tells the user of a command nothing."""
+    """Return one of our warnings without its location in the code, which tells the user of a command nothing."""
     if "saunet" in filename and issubclass(category, UserWarning):
         return f"warning: {message}\n"
     return _with_place(message, category, filename, lineno, line)
@@ -80,7 +80,7 @@ def _keep_warnings() -> None:
 
 
 def quiet() -> None:
-    """Let Lightning, once imported, speak through our loggers and of what concerns the user alone."""
+    """Send Lightning's messages, once it is imported, through our loggers, and only those that concern the user."""
     warnings.formatwarning = _one_line
     _keep_warnings()
     if "lightning.pytorch.utilities.rank_zero" in sys.modules:

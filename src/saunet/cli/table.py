@@ -1,7 +1,7 @@
-"""The tools, and what can be configured: plain data in a file, read instead of importing every component.
+"""The tools and everything configurable: plain data in a file, read instead of importing every component.
 
-The file lies in the user's cache folder and counts only while the sources, the installed packages and Python are the
-ones that it was made from; otherwise it is made again, which imports everything once.
+The file lies in the user's cache folder. It is valid only for the sources, installed packages and Python that it was
+made from; otherwise it is made again, which imports everything once.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ demo: the README's demo: train on rendered video, evaluate, draw
 class Tool:
     """One tool: ``saunet predict`` calls `saunet.predict` with `saunet.PredictOptions`.
 
-    Its function may also take ``choices``, ``overrides`` and ``describe``, which puts an error into one sentence, for
-    the record of a run; what it returns is not printed then.
+    Its function may also take ``choices``, ``overrides`` and ``describe`` (an error as one sentence) for the record of
+    a run; its result is not printed then.
     """
 
     name: str
@@ -84,18 +84,18 @@ class Tool:
     positional: str = ""
     aliases: Mapping[str, str] = field(default_factory=dict)
     words: Mapping[str, str] = field(default_factory=dict)
-    """First word -> what it stands for."""
+    """First word -> its meaning."""
     function: str = ""
-    """What is called, as ``module:name``, where it is not the name in saunet."""
+    """The function to call, as ``module:name``, if it is not the tool's name in saunet."""
     options: str | None = ""
-    """What it is called with; None if it reads the command line itself."""
+    """The options it is called with; None if it parses the command line itself."""
     config: str = ""
-    """The root config, where it is not named like the tool."""
+    """The root config, if it is not named like the tool."""
     preset: Sequence[str] = ()
-    """Overrides that come before those of the command line."""
+    """Overrides applied before those of the command line."""
 
     def paths(self) -> tuple[str, str]:
-        """Return where the options and the function are, as ``module:name``."""
+        """Return the locations of the options and the function, as ``module:name``."""
         return self.options or f"saunet:{self.name.title()}Options", self.function or f"saunet:{self.name}"
 
 
@@ -119,7 +119,7 @@ TOOLS["demo"] = replace(
     preset=("experiment=demo",),
 )
 TRAINER = ("trainer", "lightning", "lightning:Trainer", "lightning.Trainer")
-"""A config node that is not a component: its group and name, what it configures, and the path to build it from."""
+"""A config node that is not a component: its group and name, the class it configures, and the path to build it from."""
 PLUGINS = schema.Key(
     "plugins",
     "list[str]",
@@ -127,11 +127,11 @@ PLUGINS = schema.Key(
     "Your own modules or .py files, imported first; they may register components.",
     annotation="list[str]",
 )
-"""The key that every tool has beside those of its options."""
+"""The key that every tool has in addition to its options."""
 HIDDEN = {"base", "lightning"}
-"""Members of config groups that others build on and nobody chooses."""
+"""Config group members that only serve as a base for others and are not offered."""
 _IMPORTED = time.time_ns()
-"""About when this process imported the sources: a table made later, of sources that changed since, is not kept."""
+"""Roughly when this process imported the sources: a table made later from sources that changed since is not kept."""
 
 
 def config_dir() -> Path:
@@ -140,7 +140,7 @@ def config_dir() -> Path:
     for folder in (package / "conf", package.parents[1] / "conf"):
         if (folder / "train.yaml").is_file():
             return folder
-    raise ConfigError(f"no configuration files beside {package}; reinstall saunet")
+    raise ConfigError(f"no configuration files found beside {package}; reinstall saunet")
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +161,7 @@ class Table:
         return sorted({*files, *registered} - HIDDEN)
 
     def known(self, tool: str, key: str) -> list[schema.Key]:
-        """Return what a key can be: of the tool's options, or of any component that has it."""
+        """Return the values a key can take, from the tool's options or any component that has the key."""
         if own := self.tools[tool].key(key):
             return [own]
         nodes = [
@@ -175,11 +175,11 @@ class Table:
     def type(self, tool: str, key: str) -> str:
         """Return the type of a key as `saunet.schema.Key.type`; ``any`` for one that is not known."""
         found = {each.type for each in self.known(tool, key)}
-        alike = {each.rstrip("?") for each in found}  # one data set may need a folder that another can do without
+        alike = {each.rstrip("?") for each in found}  # one data set may require a folder that another does not
         return "any" if len(alike) != 1 else found.pop() if len(found) == 1 else f"{alike.pop()}?"
 
     def by_path(self, path: object) -> schema.Node | None:
-        """Return the keys of what a ``_target_`` names; None if it is no component."""
+        """Return the keys of the component named by a ``_target_``; None if it is not a component."""
         return next((node for each in self.groups.values() for node in each.values() if node.path == path), None)
 
     def by_name(self, name: str) -> schema.Node | None:
@@ -198,7 +198,7 @@ def imported(path: str) -> Callable[..., object]:
 def read() -> Table:
     """Return the table, from the file or, where that is missing or outdated, made now and written.
 
-    What plugins registered in this process is part of it and never written.
+    Components that plugins registered in this process are included but never written.
     """
     registered = tuple(entry for registry in REGISTRIES.values() for entry in registry.registered())
     return _read(_state(), os.environ.get("XDG_CACHE_HOME"), registered)
@@ -213,7 +213,7 @@ def _read(state: str, cache_home: str | None, registered: tuple[Entry, ...]) -> 
         plain = json.loads(file.read_bytes())
     if plain is None or plain["state"] != state:
         plain = {"state": state, **_make()}
-        with suppress(OSError):  # without a cache folder it is only slower
+        with suppress(OSError):  # without a cache folder it is merely slower
             if all(path.stat().st_mtime_ns <= _IMPORTED for path in _sources()):
                 file.parent.mkdir(parents=True, exist_ok=True)
                 temporary = file.with_suffix(f".{os.getpid()}")

@@ -1,7 +1,7 @@
 """From the words of a command line to Hydra's overrides.
 
-Hydra's grammar turns ``2024_05_01`` into a number and stumbles over ``=`` and brackets in a path: values of keys that
-hold text or a list are quoted or put into a list first.
+Hydra's grammar turns ``2024_05_01`` into a number and fails on ``=`` and brackets in a path, so values of keys that
+hold text or a list are first quoted or put into a list.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def is_plugins(word: str) -> bool:
 
 
 def named_plugins(words: Sequence[str]) -> list[str]:
-    """Return the plugins that a command line names, which have to be imported before the rest is understood."""
+    """Return the plugins on a command line; they must be imported before the rest is parsed."""
     given = [word.partition("=")[2] for word in words if is_plugins(word)]
     lists = (value[1:-1] if value.startswith("[") and value.endswith("]") else value for value in given)
     return [item.strip().strip("'\"") for each in lists for item in _parts(each)]
@@ -72,7 +72,7 @@ def read_words(
 ) -> tuple[argparse.Namespace, list[str]]:
     """Return Hydra's options and, in its grammar, the overrides among the words after ``saunet TOOL``.
 
-    ``conf`` has the YAML files that ``experiment=glob(table3/*)`` sees, where they are not the usual ones.
+    ``conf`` is the folder of YAML files for ``experiment=glob(table3/*)``, if not the usual one.
     """
     flags, rest = split(words)
     sweeping = flags.multirun or any(word.startswith(("sweep=", "hydra.mode=MULTIRUN")) for word in rest)
@@ -86,7 +86,7 @@ class _Reader:
     table: Table
     sweeping: bool
     own: bool
-    """Whether all YAML files are ours, so that a key that they do not have is a mistake: told before Hydra starts."""
+    """Whether all YAML files are ours, so that a key they do not have is a mistake, reported before Hydra starts."""
     conf: Path
 
     def overrides(self, words: Sequence[str]) -> list[str]:
@@ -110,7 +110,7 @@ class _Reader:
         return [*self.tool.aliases, *(["size"] if own.key("data") and not own.key("size") else [])]
 
     def _below(self, own: schema.Node) -> Iterator[str]:
-        """Yield the keys below those of the tool: of nested options, and of the components that it takes."""
+        """Yield the keys below those of the tool: nested options, and the components that it takes."""
         for key in own.keys:
             yield from (f"{key.name}.{each.name}" for each in (key.node.keys if key.node else ()))
         for group, nodes in self.table.groups.items():
@@ -124,7 +124,7 @@ class _Reader:
         if not key or (len(plain) > 1 and not key.endswith("*")):
             model = key == "input" and self.table.tools[self.tool.name].key("checkpoint") is not None
             hint = f"; if it is the model, write checkpoint={plain[-1]}" if key and model else ""
-            hint += "; several images are a folder or a pattern" if key and model else ""
+            hint += "; for several images give a folder or a pattern" if key and model else ""
             raise ConfigError(
                 f"'{plain[-1]}' is not KEY=VALUE{hint}; see `saunet {self.tool.name} --help` for the keys"
             )
@@ -198,7 +198,7 @@ def hydra_value(value: object) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return text in quotes, where Hydra would read it as something else without."""
+    """Return text in quotes if Hydra would otherwise misread it."""
     if len(text) > 1 and text[0] in "'\"" and text[-1] == text[0]:
         return text
     if (_PLAIN.fullmatch(text) and not _NOT_TEXT.fullmatch(text)) or "${" in text:
@@ -228,7 +228,7 @@ def _parts(text: str) -> list[str]:
 
 
 def unknown(key: str, known: Sequence[str], further: Sequence[str] = ()) -> ConfigError:
-    """Return the error for an unknown key, with the nearest one and all; ``further`` are short and nested ones."""
+    """Return the error for an unknown key, with the allowed keys; ``further`` are short and nested ones."""
     names = (key, ELSEWHERE.get(key))
     same = next((each for each in further if each.rpartition(".")[2] in names), None)
     hint = f"; did you mean '{same}'?" if same else suggest(key, known)

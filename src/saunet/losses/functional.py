@@ -108,7 +108,7 @@ def combine_sources(
 def automask(
     error: Float[Tensor, "b 1 h w"], identity: Float[Tensor, "b 1 h w"], noise: float = 0.0
 ) -> Bool[Tensor, "b 1 h w"]:
-    """Pixels that teach: warping explains them better than doing nothing, SAU-Net eq. (11) the right way round.
+    """Pixels that the loss uses: warping explains them better than no motion, SAU-Net eq. (11) with its sign corrected.
 
     The paper prints the comparison reversed, which would keep static pixels; this is Monodepth2's.
 

@@ -47,7 +47,7 @@ class Photometric(Term):
         sources: ``minimum`` over the sources, eq. (10), or their ``mean``, eq. (6).
         ssim_weight: Weight of SSIM in the error, 0 to 1; the rest is the absolute difference.
         automask: Drop pixels that the unwarped sources explain better, eq. (11).
-        reduction: Mean over the pixels that teach (``masked``), or over all with the smaller of the warped and unwarped
+        reduction: Mean over the used pixels (``masked``), or over all with the smaller of the warped and unwarped
             error (``all``, Monodepth2's code).
         use_validity: Ignore a source where the point leaves its image or lies behind its camera. Without it such pixels
             compare with the border color, as Monodepth2 does.
@@ -115,7 +115,7 @@ class Photometric(Term):
     def _reduce(
         self, error: Float[Tensor, "b 1 h w"], known: Bool[Tensor, "b 1 h w"], identity: Float[Tensor, "b 1 h w"] | None
     ) -> tuple[Tensor, Tensor]:
-        """Return the mean error and the pixels that teach."""
+        """Return the mean error and the pixels used."""
         if identity is None:
             return masked_mean(error, known), known
         mask = known & automask(error, identity, self.noise if self.training else 0.0)

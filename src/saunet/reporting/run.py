@@ -33,7 +33,7 @@ _CURVES = (
 _HEALTH = {
     "disparity_spread": "spread of disparity, 0 when depth has collapsed",
     "holes": "fraction of pixels in holes of depth",
-    "automask": "fraction of pixels that teach",
+    "automask": "fraction of pixels used by the loss",
     "translation": "motion between frames, relative units",
     "rotation": "rotation between frames, radians",
 }

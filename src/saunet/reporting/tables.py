@@ -284,12 +284,12 @@ def losses_table(runs: Mapping[str, Run]) -> Table | None:
         if any(cell is not None for cell in cells):
             rows.append(Row((name, *cells), "measured"))
     notes = [
-        "Loss: mean over the last tenth of the logged steps; of those pixels alone that teach, where there is an "
-        "auto-mask: with few of them left, it says little."
+        "Loss: mean over the last tenth of the logged steps; with an auto-mask, over the used pixels only, so it "
+        "says little if these are few."
     ]
     if any(key.split(".")[0] in ("objective", "loss") for key in differing(list(runs.values()))):
         notes.append("The objectives differ, so these losses do not compare.")
-    headings = columns("run", "epochs", "loss|.4f", "lowest val/loss|.4f", "pixels that teach|.3f")
+    headings = columns("run", "epochs", "loss|.4f", "lowest val/loss|.4f", "pixels used|.3f")
     logged = any(cell is not None for row in rows for cell in row.cells[2:])
     return Table("losses", "Losses", headings, tuple(rows), tuple(notes)) if logged else None
 

@@ -1,4 +1,4 @@
-"""What accompanies a training: checkpoints, the progress bar, a picture every epoch."""
+"""Training callbacks: checkpoints, the progress bar, a picture every epoch."""
 
 from __future__ import annotations
 
@@ -35,21 +35,19 @@ from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View
 
 _IN_DOUBT = " in doubt"
 EVERY = 10.0
-"""Seconds between two lines of a training whose output is no terminal."""
+"""Seconds between two progress lines if the output is not a terminal."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Lightning's own storage, but that every local file is complete or keeps its former content.
+    """Lightning's own storage, except that every local file is written completely or keeps its former content.
 
-    Lightning's writer passes over a refused permission in silence, so a run could end without a checkpoint. Addresses
-    such as ``s3://...`` are left to Lightning.
+    Lightning's writer silently ignores a denied permission, so a run could end without a checkpoint. Addresses such as
+    ``s3://...`` are left to Lightning.
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None) -> None:
         if storage_options is not None:
-            raise ConfigError(
-                f"storage_options is {storage_options!r}; checkpoints are stored without any, leave it out"
-            )
+            raise ConfigError(f"storage_options is {storage_options!r}; checkpoints take none, so leave it out")
         if "://" in str(path):
             super().save_checkpoint(checkpoint, path)
         else:
@@ -57,11 +55,11 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 class LastCheckpoint(ModelCheckpoint):
-    """``last.ckpt``, after every epoch and every so many steps: what to resume from.
+    """``last.ckpt``, saved after every epoch and every given number of steps, to resume from.
 
     Args:
-        folder: Where it goes.
-        every_n_steps: Also after so many optimizer steps; 0 for never.
+        folder: Where it is saved.
+        every_n_steps: Also save after this many optimizer steps; 0 for never.
     """
 
     def __init__(self, folder: str, every_n_steps: int = 1000) -> None:
@@ -70,28 +68,28 @@ class LastCheckpoint(ModelCheckpoint):
         self._saved_at = 0
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take nothing over: a recorded path would be removed after the next save, and a foreign file may name any."""
+        """Restore nothing: a recorded path would be removed after the next save, and a foreign file may name any."""
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Save when it is time, right after an optimizer step."""
+        """Save when due, right after an optimizer step."""
         step = trainer.global_step
         if (batch_idx + 1) % trainer.accumulate_grad_batches and not trainer.is_last_batch:
-            return  # a gradient that is being accumulated is in no checkpoint
+            return  # a partly accumulated gradient is not in a checkpoint
         if self.every_n_steps and step % self.every_n_steps == 0 and step != self._saved_at:
             self._saved_at = step
             trainer.save_checkpoint(Path(str(self.dirpath)) / "last.ckpt", weights_only=False)
 
 
 class BestCheckpoint(ModelCheckpoint):
-    """``best.ckpt``: the state with the best monitored value, the smallest but for ``val/a1``, ``a2`` and ``a3``.
+    """``best.ckpt``: the checkpoint with the best monitored value, the smallest except for ``val/a1``, ``a2``, ``a3``.
 
     Args:
-        folder: Where it goes.
-        monitor: What decides; where it is not measured (no validation frame has ground truth), ``val/loss`` does, and
-            without validation ``train/loss``, its mean over the epoch. A state whose loss says little (see
-            `saunet.training.health.doubt`) is only taken while there is no other.
+        folder: Where it is saved.
+        monitor: The metric that decides. If it is not measured (no validation frame has ground truth), ``val/loss``
+            decides; without validation, the epoch's mean ``train/loss``. A checkpoint whose loss says little (see
+            `saunet.training.health.doubt`) is kept only until there is another.
     """
 
     def __init__(self, folder: str, monitor: str = "val/abs_rel") -> None:
@@ -102,7 +100,7 @@ class BestCheckpoint(ModelCheckpoint):
 
     @property
     def cost(self) -> float | None:
-        """The best monitored value as what a search minimizes: negative where more is better, infinite if in doubt."""
+        """The best monitored value as a cost for searches: negated if larger is better, infinite if in doubt."""
         if self.best_model_score is None:
             return None
         if self._scored_by.endswith(_IN_DOUBT):
@@ -111,15 +109,15 @@ class BestCheckpoint(ModelCheckpoint):
 
     @property
     def state_key(self) -> str:
-        """Name in the checkpoint; without the monitor, which may have fallen back."""
+        """Name in the checkpoint; without the monitor, because that may have been replaced."""
         return "BestCheckpoint"
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Note where the checkpoint lies that is resumed: its best one lies beside it."""
+        """Remember the resumed checkpoint's folder: its best checkpoint lies beside it."""
         self._beside = Path(str(trainer.ckpt_path)).parent if trainer.ckpt_path else None
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over the best so far from the run that is resumed, with its file, into this run's folder.
+        """Copy the resumed run's best checkpoint and its value into this run.
 
         The recorded path is not followed: the folder may have been moved, and a foreign file may name any path.
         """
@@ -145,7 +143,7 @@ class BestCheckpoint(ModelCheckpoint):
         measured = [name for name in ranked if name in monitor_candidates]
         before = self._scored_by.removesuffix(_IN_DOUBT)
         if self.best_model_path and before in ranked and ranked.index(before) < ranked.index((measured or ranked)[0]):
-            return  # a run resumed for its last steps measures less: the best so far was chosen by more
+            return  # a run resumed for its last steps measures less than the best so far was chosen by
         self.monitor = measured[0] if measured else wanted
         self.mode = _direction(self.monitor)
         if self.monitor != wanted and not self._said:
@@ -156,19 +154,19 @@ class BestCheckpoint(ModelCheckpoint):
         if why and not self._doubted:
             self._doubted = True
             rank_zero_info(
-                f"step {trainer.global_step}: the loss says little about this state: {why}; best.ckpt is such a state "
-                "only while there is no other"
+                f"step {trainer.global_step}: the loss says little about this checkpoint: {why}; best.ckpt keeps it "
+                "only until there is another"
             )
         if why and self.best_model_path and self._scored_by == self.monitor:
             return
         kind = f"{self.monitor}{_IN_DOUBT if why else ''}"
-        if kind != self._scored_by:  # what is known of the best is of another kind
+        if kind != self._scored_by:  # the recorded best belongs to another metric
             self._scored_by = kind
             self.best_k_models, self.kth_best_model_path, self.best_model_score = {}, "", None
         super()._save_topk_checkpoint(trainer, monitor_candidates)
 
     def _doubt(self, trainer: Trainer, measured: dict[str, Tensor]) -> str | None:
-        """Say why the loss that decides says little; None if it does not, or something else decides."""
+        """Return why the deciding loss says little; None if it can be trusted, or another metric decides."""
         if self.monitor not in ("val/loss", EPOCH_LOSS) or trainer.global_step < FEW:
             return None
         place = "val" if self.monitor == "val/loss" else "health"
@@ -183,7 +181,7 @@ class PicturePanel(Callback):
     """Write input, disparity, warped view and auto-mask of one validation batch after every validation.
 
     Args:
-        folder: Where the PNG files go.
+        folder: Where the PNG files are saved.
         rows: How many samples to show.
     """
 
@@ -199,7 +197,7 @@ class PicturePanel(Callback):
             self._batch = batch
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw the batch with the networks as they are now."""
+        """Draw the batch with the current networks."""
         batch, self._batch = self._batch, None
         if batch is None or trainer.sanity_checking:
             return
@@ -216,7 +214,7 @@ class PicturePanel(Callback):
 def _drawn(
     batch: TrainBatch, pyramid: DepthPyramid, views: Sequence[View], terms: LossTerms, rows: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw the first samples of a batch, one per row; maps of the loss are gray, white is 1 or the largest value."""
+    """Draw the first samples of a batch, one per row; loss maps are gray, and white is 1 or the largest value."""
 
     def array(values: Tensor) -> Any:
         return values.detach().float().cpu().numpy()
@@ -239,12 +237,12 @@ def _drawn(
 
 
 class Progress(TQDMProgressBar):
-    """One bar with what matters, after one line that says how large the networks are, and one line per epoch.
+    """A progress bar with the main numbers, after a line with the networks' sizes, and one line per epoch.
 
-    The bar is on a terminal or in a notebook only; a file or a pipe gets a line about every ten seconds.
+    The bar appears only on a terminal or in a notebook; a file or a pipe gets a line about every ten seconds.
 
     Args:
-        refresh_rate: Steps between two updates of the bar.
+        refresh_rate: Steps between updates of the bar.
     """
 
     def __init__(self, refresh_rate: int = 5) -> None:
@@ -253,18 +251,18 @@ class Progress(TQDMProgressBar):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         super().setup(trainer, pl_module, stage)
-        self._lines = not watched(Console())  # standard output, where Lightning's bar is
+        self._lines = not watched(Console())  # standard output, as Lightning's bar
         if self._lines:
             self.disable()
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say how many parameters are trained."""
+        """Print how many parameters are trained."""
         counts = {
             name: sum(parameter.numel() for parameter in module.parameters()) / 1e6
             for name, module in pl_module.named_children()
         }
         parts = ", ".join(f"{name} {count:.1f} M" for name, count in counts.items() if count and name != "intrinsics")
-        rank_zero_info(f"networks: {parts}; together {sum(counts.values()):.1f} M parameters")
+        rank_zero_info(f"networks: {parts}; {sum(counts.values()):.1f} M parameters in total")
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_train_start(trainer, pl_module)
@@ -298,6 +296,6 @@ class Progress(TQDMProgressBar):
         return ", ".join(parts)
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
-        """Return what the bar shows; the logger's version number is not a metric."""
+        """Return the bar's metrics, without the logger's version number."""
         metrics = super().get_metrics(trainer, pl_module)
         return {name: value for name, value in metrics.items() if name != "v_num"}

@@ -1,4 +1,4 @@
-"""How a training is doing: figures that show early how it fails, and what to do about it."""
+"""Training health: figures that show early how a training fails, and what to do about it."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from saunet.geometry import full_precision
 from saunet.types import DepthPyramid, LossTerms
 
 FAR = 0.8
-"""Fraction of the largest depth that can be predicted from which a pixel counts as near the limit."""
+"""A pixel counts as near the far limit above this fraction of the largest depth that can be predicted."""
 FEW = 10
-"""Steps from which on it is said that a loss says little: before, networks are fresh and nobody looks at it."""
+"""A loss that says little is reported from this step on: before, the networks are fresh."""
 
 
 def health(
     pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"], terms: LossTerms, max_depth: float
 ) -> dict[str, Float[Tensor, ""]]:
-    """Return what to watch of one step, detached and without waiting for the device.
+    """Return the health figures of one step, detached and without waiting for the device.
 
     ``disparity_spread``: standard deviation of an image's disparity over its mean, 0 for a flat picture;
-    ``holes``: fraction of pixels near the far limit with something nearer above them, as sky never has;
+    ``holes``: fraction of pixels near the far limit with something nearer above them, which sky never has;
     ``translation``: mean length of the motion, in units of depth; ``rotation``: mean angle, radians;
-    ``automask``: fraction of pixels that teach, where the objective has such a mask.
+    ``automask``: fraction of pixels used by the loss, if the objective has such a mask.
     """
     disparity = pyramid.disparity[0].detach().float().flatten(1)
     return {
@@ -41,7 +41,7 @@ def health(
 
 
 def learned_from(poses: Float[Tensor, "b s 4 4"], terms: LossTerms) -> dict[str, Float[Tensor, ""]]:
-    """Return the part of `health` that concerns the motion and the pixels behind the loss, not the depth."""
+    """Return the figures of `health` about motion and the pixels behind the loss, not those about depth."""
     figures = _motion(poses.detach())
     if "automask" in terms.maps:
         figures["automask"] = terms.maps["automask"].float().mean()
@@ -53,13 +53,13 @@ DOUBTED = ("automask", "rotation")
 
 
 def doubt(figures: Mapping[str, float], automask: float = 0.05, rotation: float = 0.5) -> str | None:
-    """Say why the loss tells little about networks with these figures; None if nothing speaks against it.
+    """Return why the loss says little about networks with these figures; None if it can be trusted.
 
-    A mean over the few pixels that an auto-mask leaves is small where depth and motion are wrong almost everywhere.
+    A mean over the few pixels that an auto-mask leaves is small even if depth and motion are wrong almost everywhere.
     """
     reasons = []
     if figures.get("automask", 1.0) < automask:
-        reasons.append(f"it is of {figures['automask']:.1%} of the pixels (auto-mask)")
+        reasons.append(f"it covers only {figures['automask']:.1%} of the pixels (auto-mask)")
     if figures.get("rotation", 0.0) > rotation:
         reasons.append(f"the predicted camera turns by {figures['rotation']:.2f} rad between frames")
     return " and ".join(reasons) or None
@@ -82,19 +82,19 @@ def _motion(T: Float[Tensor, "b s 4 4"]) -> dict[str, Tensor]:
 
 
 class HealthMonitor(Callback):
-    """Say in one sentence when depth collapses, holes open, the mask or the pose network fails, or the loss is nothing.
+    """Warn in one sentence when depth collapses, holes open, the mask or the pose network fails, or the loss vanishes.
 
-    The figures are in the log as ``health/...`` all the time. Each sentence is said once a run, and stands in
-    ``run.json`` under ``health``.
+    The figures are always logged as ``health/...``. Each warning appears once per run, and is kept in ``run.json``
+    under ``health``.
 
     Args:
-        every_n_steps: How often the figures are looked at, and once more at the end of the training.
-        after: Step from which on they are; fresh networks may look strange.
+        every_n_steps: Steps between checks of the figures; they are also checked at the end of the training.
+        after: First step that is checked; fresh networks may look strange.
         spread: Smallest healthy ``disparity_spread``.
         holes: Largest healthy fraction of holes.
-        automask: Smallest healthy fraction of pixels that teach.
+        automask: Smallest healthy fraction of pixels used by the loss.
         translation: Smallest healthy length of motion.
-        unmasked: Largest healthy fraction of pixels that teach, where there is a mask.
+        unmasked: Largest healthy fraction of pixels used by the loss, if there is a mask.
         rotation: Largest healthy rotation between frames, radians.
         loss: Smallest healthy loss.
     """
@@ -125,14 +125,14 @@ class HealthMonitor(Callback):
             "rotation": positive("rotation", rotation),
         }
         self.found: dict[str, str] = {}
-        """What was sick so far: the sentence by the figure's name."""
+        """The warnings so far, by the figure's name."""
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         if trainer.global_step >= self.after and trainer.global_step % self.every_n_steps == 0:
             self._look(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Look at a short training too; where its networks are still fresh, only at whether its loss means anything."""
+        """Check a short training too; while its networks are fresh, check only whether its loss means anything."""
         if trainer.global_step >= min(self.after, self.every_n_steps):
             self._look(trainer, pl_module)
         elif trainer.global_step >= FEW:
@@ -158,7 +158,7 @@ class HealthMonitor(Callback):
             if name in self.found:
                 continue
             if math.isnan(value):
-                said[name] = f"{name} is not a number, so the training is broken; lower optim.lr and start again"
+                said[name] = f"{name} is not a number, so the training has failed; lower optim.lr and start again"
             elif value < self.least.get(name, -math.inf):
                 said[name] = TOO_LOW[name].format(value)
             elif value > self.most.get(name, math.inf):
@@ -170,7 +170,8 @@ class HealthMonitor(Callback):
         """Return a sentence if the loss of a short training says little."""
         why = doubt(figures, self.least["automask"], self.most["rotation"])
         said = (
-            f"the loss says little about this training: {why}; lower optim.lr or train longer, and do not compare by it"
+            f"the loss says little about this training: {why}; lower optim.lr or train longer, and do not compare "
+            "runs by it"
         )
         self.found.update({"loss": said} if why else {})
         return [said] if why else []
@@ -179,19 +180,20 @@ class HealthMonitor(Callback):
 TOO_LOW = {
     "disparity_spread": "disparity is nearly flat (it varies by {:.2%} of its mean), so depth has collapsed; lower "
     "optim.lr, check data.offsets and the intrinsics, or start from public weights",
-    "automask": "only {:.1%} of the pixels teach (auto-mask), so the loss says little: the camera stands still in most "
-    "frames, exposure jumps between them, or optim.lr is too high; leave static frames out, use larger data.offsets, "
-    "or lower optim.lr",
+    "automask": "only {:.1%} of the pixels are used (auto-mask), so the loss says little: the camera stands still in "
+    "most frames, exposure jumps between them, or optim.lr is too high; leave static frames out, use larger "
+    "data.offsets, or lower optim.lr",
     "translation": "the predicted motion is nearly zero ({:.1e}), so the pose network has collapsed; lower optim.lr, "
     "or leave static frames out",
     "loss": "the loss is nearly zero ({:.1e}), so there is nothing to learn: target and sources are the same picture; "
     "leave static and doubled frames out (data.static=drop)",
 }
 TOO_HIGH = {
-    "holes": "{:.1%} of the pixels are holes at the far limit inside the picture, as cars driving along leave them; "
+    "holes": "{:.1%} of the pixels are holes at the far limit inside the picture, typical of cars that drive along; "
     "leave out frames in which the camera stands still, and use objective.photometric.automask=true",
-    "automask": "the auto-mask drops no pixel ({:.2%} teach), so even the wrong depth explains the frames better than "
-    "no motion: the sources may not be neighbors of the target; check data.offsets and the order of the frames",
+    "automask": "the auto-mask drops almost no pixel ({:.2%} are used), so even wrong depth explains the frames "
+    "better than no motion: the sources may not be neighbors of the target; check data.offsets and the order of "
+    "the frames",
     "rotation": "the predicted camera turns by {:.2f} rad between frames, which no vehicle does, so the pose network "
-    "has diverged; lower optim.lr, or check that neighboring frames follow each other",
+    "has diverged; lower optim.lr, or check that neighboring frames are consecutive",
 }

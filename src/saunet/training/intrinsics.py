@@ -1,4 +1,4 @@
-"""Focal lengths that a training finds itself, one per recording, together with the networks (``model.intrinsics``)."""
+"""Focal lengths learned together with the networks, one per recording (``model.intrinsics``)."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from saunet.geometry.camera import GUESS, zoom_intrinsics
 from saunet.runs.record import Intrinsics
 
 RATE = 10.0
-"""A focal length's logarithm moves this much faster than a weight: with Adam by up to 0.1 % a step at rate 1e-4."""
+"""A focal length's logarithm learns this much faster than a weight: with Adam up to 0.1 % per step at rate 1e-4."""
 _TOLD = 8
 
 
 class FocalLengths(nn.Module):
     """One factor on the focal lengths of K per recording, as Gordon et al. (2019) and slowtv learn intrinsics.
 
-    The center and the ratio of fx and fy stay as given. A recording that was not trained on gets the mean of the
-    others: their mean change if ``refined``, their mean focal length if ``learned``.
+    The center and the ratio of fx to fy stay as given. A recording that was not trained on gets the mean of the others:
+    their mean change if ``refined``, their mean focal length if ``learned``.
 
     Args:
         mode: ``refined`` starts from the given focal lengths, ``learned`` from `GUESS`.
@@ -47,7 +47,7 @@ class FocalLengths(nn.Module):
         self.change = nn.Parameter(torch.zeros(len(given)))
 
     def forward(self, K: Float[Tensor, "b 3 3"], names: Sequence[str], width: int) -> Float[Tensor, "b 3 3"]:
-        """Return the intrinsics of samples by their names, given those of the data; ``width`` is that of the images."""
+        """Return the intrinsics of samples by their names, given those of the data; ``width`` is the images' width."""
         found = self.start + RATE * self.change
         factors = found - self.given
         places = [self._places.get(recording_of(name), -1) for name in names]
@@ -59,14 +59,14 @@ class FocalLengths(nn.Module):
         return zoom_intrinsics(K, factors[torch.tensor(places, device=K.device)].exp())
 
     def found(self, change: Tensor) -> Intrinsics:
-        """Return what was found, given the state of ``change``."""
+        """Return the focal lengths found, given the state of ``change``."""
         now = (self.start.to(change) + RATE * change.detach()).double().exp().tolist()
         return Intrinsics(
             self.mode, {name: (given, each) for (name, given), each in zip(self._focals.items(), now, strict=True)}
         )
 
     def told(self, found: Intrinsics) -> str:
-        """Say what was found, in pixels of the recordings."""
+        """Describe the focal lengths found, in pixels of the recordings."""
         lines = []
         for name, (given, now) in list(found.focals.items())[:_TOLD]:
             pixels, change = self.widths[name], now / given - 1
@@ -83,7 +83,7 @@ class FocalLengths(nn.Module):
 
 
 def focal_lengths(mode: str, data: DepthDataModule) -> FocalLengths | None:
-    """Return what learns the focal lengths of a data module that is set up; None if they are fixed.
+    """Return the module that learns the focal lengths of a data module that is set up; None if they are fixed.
 
     Raises:
         ConfigError: if there is no motion to learn them from.
@@ -92,13 +92,13 @@ def focal_lengths(mode: str, data: DepthDataModule) -> FocalLengths | None:
         return None
     if not data.offsets:
         raise ConfigError(
-            f"model.intrinsics={mode} needs neighbors in time, and data.offsets is empty: one stereo pair fits any "
-            "focal length; set data.offsets=[-1,1], or model.intrinsics=fixed"
+            f"model.intrinsics={mode} needs neighbors in time, and data.offsets is empty: a stereo pair alone fits "
+            "any focal length; set data.offsets=[-1,1], or model.intrinsics=fixed"
         )
     if data.track_motion:
         raise ConfigError(
-            f"model.intrinsics={mode} and data.track_motion=true do not go together: tracking trusts the given K; "
-            "set one of them back"
+            f"model.intrinsics={mode} and data.track_motion=true cannot be combined: tracking relies on the given K; "
+            "leave one of them out"
         )
     given: dict[str, tuple[float, int]] = {}
     dataset = data.datasets["train"]

@@ -1,4 +1,4 @@
-"""Lightning's loop over the steps of an epoch, but that no training ends without a validation of its last weights."""
+"""Lightning's loop over the steps of an epoch, except that every training ends with a validation of its weights."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from lightning.pytorch.loops.training_epoch_loop import _TrainingEpochLoop
 
 
 class EpochLoop(_TrainingEpochLoop):
-    """Validates after the last step of a training too, wherever in an epoch or between two validations that falls.
+    """Also validates after the last step of a training, wherever that falls in an epoch.
 
-    Lightning leaves that out where ``max_steps`` ends it, or ``check_val_every_n_epoch`` or ``val_check_interval`` do
-    not divide its length: the last row and ``best.ckpt`` would be of older weights than ``last.ckpt``.
+    Lightning leaves that out if ``max_steps`` ends the training, or if ``check_val_every_n_epoch`` or
+    ``val_check_interval`` do not divide its length. The last row and ``best.ckpt`` would then be of older weights than
+    ``last.ckpt``.
     """
 
     @classmethod
     def install(cls, trainer: Trainer) -> Trainer:
-        """Put this loop in the place of the trainer's own, and return the trainer."""
+        """Replace the trainer's own loop with this one, and return the trainer."""
         own = trainer.fit_loop.epoch_loop
         trainer.fit_loop.epoch_loop = cls(trainer, own.min_steps, own.max_steps)
         return trainer
@@ -39,8 +40,8 @@ class EpochLoop(_TrainingEpochLoop):
 def total_steps(trainer: Trainer, data: Any) -> int:
     """Return the optimizer steps of a whole training on a data module.
 
-    The trainer could count them too, but sets up its loader for that: before a resumed run knows where in an epoch it
-    was, so that it would begin the epoch again.
+    The trainer could count them too, but sets up its loader for that. A resumed run does not yet know its position in
+    the epoch then, and would begin the epoch again.
     """
     overfit = float(getattr(trainer, "overfit_batches", 0.0)) > 0
     if data is None or overfit or trainer.max_epochs in (None, -1):

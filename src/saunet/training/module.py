@@ -1,4 +1,4 @@
-"""What is trained: a step that reads like the paper, validation under a named protocol, and how both are resumed."""
+"""The LightningModule: a training step that reads like the paper, validation under a named protocol, and resuming."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from saunet.training.speed import Speed
 from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View, Views
 
 EPOCH_LOSS = "train/loss_epoch"
-"""Name of the mean of ``train/loss`` over an epoch and all processes, which is itself the last batch's."""
+"""Name of the mean of ``train/loss`` over an epoch and all processes (``train/loss`` itself is the last batch's)."""
 
 
 class SelfSupervisedDepth(LightningModule):
@@ -40,12 +40,11 @@ class SelfSupervisedDepth(LightningModule):
 
     Args:
         depth: Image -> `DepthPyramid`.
-        pose: (target, sources) -> ``T_src_tgt`` of the neighbors in time; None where the stereo view is the only
-            source.
+        pose: (target, sources) -> ``T_src_tgt`` of the neighbors in time; None if the stereo view is the only source.
         objective: (batch, pyramid, poses, views) -> `LossTerms`.
         recipe: Optimizer and schedule.
         metrics: Scores validation batches that have ground truth.
-        seed: With step and process, all that dropped paths and tie-break noise depend on.
+        seed: Dropped paths and tie-break noise depend on it, the step and the process, and nothing else.
         record: Plain data stored in every checkpoint under ``"saunet"``; `saunet.load` rebuilds the networks from it.
         speed: Speed switches.
     """
@@ -71,12 +70,12 @@ class SelfSupervisedDepth(LightningModule):
         self.record = dict(record or {})
         self.speed = speed if speed is not None else Speed()
         self.objective_node: Mapping[str, Any] | None = None
-        """Config node of the objective, where it is known; kept in checkpoints."""
+        """Config node of the objective, if known; kept in checkpoints."""
         self.run_record: RunRecord | None = None
-        """The run's ``run.json``, where there is one."""
+        """The run's ``run.json``, if there is one."""
         self.average = MovingAverage(self.recipe.ema) if self.recipe.ema > 0 else None
         self.intrinsics: FocalLengths | None = None
-        """Learns the focal lengths, where the data's are not fixed."""
+        """Learns the focal lengths; None if the data's are fixed."""
         self._prepared = False
         self._owed = False  # a validation that a killed run did not finish
 
@@ -99,16 +98,16 @@ class SelfSupervisedDepth(LightningModule):
         self.log_dict(figures, prog_bar=False, batch_size=count)
         self.log("train/lr", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=count)
         self.log("loss", figures["train/loss"], prog_bar=True, logger=False, batch_size=count)
-        # What best.ckpt is chosen by where nothing is validated: the last batch alone would be chance.
+        # Without validation, best.ckpt is chosen by this: the last batch alone would be chance.
         mean: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True, "logger": False}
         self.log(EPOCH_LOSS, terms.total.detach(), batch_size=count, **mean)
         return terms.total
 
     def _of_all_processes(self, figures: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the means over the processes of a run, in one exchange, where somebody will look at them."""
+        """Return the means over the processes of a run, in one exchange, if they are going to be used."""
         trainer, step = self.trainer, self.global_step + 1
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
-        # After the last step of an epoch or training, all of them must come to the same decision about the best state.
+        # After the last step of an epoch or training, all processes must choose the same best checkpoint.
         looked_at = (every and step % every == 0) or trainer.is_last_batch or step == trainer.max_steps
         if trainer.world_size == 1 or not looked_at:
             return figures
@@ -120,8 +119,8 @@ class SelfSupervisedDepth(LightningModule):
         """Predict depth and motion, synthesize the target from its neighbors, and compare."""
         if "target" not in batch:
             raise ConfigError(
-                f"the batch has {', '.join(batch)} and no target: it comes from the loader as bytes; "
-                "prepare it first: batch = data.on_after_batch_transfer(batch, 0)"
+                f"the batch has {', '.join(batch)} and no target: it holds the loader's bytes; prepare it first: "
+                "batch = data.on_after_batch_transfer(batch, 0)"
             )
         if self.intrinsics is not None:
             batch = {**batch, "K": self.intrinsics(batch["K"], batch["name"], batch["target"].shape[-1])}
@@ -146,7 +145,7 @@ class SelfSupervisedDepth(LightningModule):
             return known[0]
         if self.pose is None:
             raise ConfigError(
-                "the model has no pose network and the batch has neighbors in time; build one, or use data with a "
+                "the batch has neighbors in time but the model has no pose network; build one, or use data with a "
                 "stereo view only"
             )
         predicted: Tensor = self.pose(batch["target"], sources[:, : sources.shape[1] - len(known)])
@@ -154,7 +153,7 @@ class SelfSupervisedDepth(LightningModule):
 
     @staticmethod
     def _tracked(batch: TrainBatch, pyramid: DepthPyramid, poses: Tensor) -> tuple[TrainBatch, Tensor]:
-        """Put the motion of tracked points, with the length that depth gives it, in the place of the predicted one."""
+        """Replace the predicted motion with that of tracked points, with its length taken from depth."""
         tracked = scaled_motion(batch["T_tracked"], batch["track_points"], pyramid.depth[0])
         own, rest = poses[:, : tracked.shape[1]], poses[:, tracked.shape[1] :]
         known = tracked.isfinite().flatten(-2).all(-1)[..., None, None]
@@ -173,7 +172,7 @@ class SelfSupervisedDepth(LightningModule):
         return tuple(warp.synthesize(batch["loss_sources"], depth, batch["K"], poses) for depth in depths)
 
     def validation_step(self, batch: EvalBatch, batch_idx: int) -> None:
-        """Score depth where there is ground truth, and the loss where the batch has neighbors."""
+        """Score depth if there is ground truth, and the loss if the batch has neighbors."""
         count = len(batch["name"])
         if batch["sources"].shape[1] > 0:
             pyramid, poses, _, terms = self.step(batch)
@@ -185,12 +184,12 @@ class SelfSupervisedDepth(LightningModule):
         disparity = pyramid.disparity[0]
         if "depth" in batch:
             self.metrics.update(disparity, batch["depth"], batch["depth_size"])
-        else:  # counted all the same: every process then has something to sum, and torchmetrics nothing to warn of
+        else:  # counted anyway: every process then has something to sum, and torchmetrics nothing to warn about
             nothing = torch.zeros(count, 2, dtype=torch.int64, device=disparity.device)
             self.metrics.update(disparity, disparity.new_zeros(count, 1, 1, 1), nothing)
 
     def on_validation_start(self) -> None:
-        """Count anew the batches of a validation that was owed."""
+        """Count the batches of a postponed validation again."""
         if self._owed and not self.trainer.sanity_checking:
             self._owed = False
             self.trainer.fit_loop.epoch_loop.val_loop.batch_progress.total.reset()
@@ -199,15 +198,15 @@ class SelfSupervisedDepth(LightningModule):
         """Log the metrics over the whole validation set, exact over any number of processes."""
         result = self.metrics.compute()
         if result["images"] > 0:
-            # Every process holds the same synchronized numbers; the trainer warns where they are not reduced all the
-            # same, and the largest of them is each of them, to the last digit.
+            # Every process holds the same synchronized numbers, but the trainer warns if they are not reduced. Their
+            # maximum equals each of them to the last digit.
             named = {f"val/{name}": value.to(torch.float32) for name, value in result.items()}
             self.log_dict(named, sync_dist=True, reduce_fx="max")
             self.log("abs_rel", named["val/abs_rel"], prog_bar=True, logger=False, sync_dist=True, reduce_fx="max")
         self.metrics.reset()
 
     def setup(self, stage: str) -> None:
-        """Freeze and switch on what the config asks for, once, in the process that trains."""
+        """Apply freezing and speed switches from the config, once, in the process that trains."""
         if self._prepared:
             return
         self._prepared = True
@@ -215,13 +214,13 @@ class SelfSupervisedDepth(LightningModule):
             part.requires_grad_(False)
         for part in self.recipe.fixed(self):
             part.eval()
-            warnings.filterwarnings("ignore", message=r"Found \d+ module\(s\) in eval mode")  # as it is meant to be
-        # A convolution of 1x1 has several right strides, and DDP copies a gradient that comes in another one.
+            warnings.filterwarnings("ignore", message=r"Found \d+ module\(s\) in eval mode")  # on purpose
+        # A 1x1 convolution has several valid strides, and DDP copies a gradient with other strides than its own.
         warnings.filterwarnings("ignore", message=r"Grad strides do not match bucket view strides")
         self.speed.apply(self, self.trainer.strategy.root_device)
 
     def train(self, mode: bool = True) -> SelfSupervisedDepth:
-        """Change between training and evaluation; frozen parts and statistics stay in evaluation."""
+        """Switch between training and evaluation; frozen parts and statistics stay in evaluation mode."""
         super().train(mode)
         for part in self.recipe.fixed(self) if mode and self._prepared else ():
             part.eval()
@@ -231,12 +230,12 @@ class SelfSupervisedDepth(LightningModule):
         return {**super().__getstate__(), "average": None}  # which holds a copy of this module
 
     def configure_callbacks(self) -> list[Callback]:
-        """Let Lightning keep the average, and put it in while validating."""
+        """Let Lightning keep the average of the weights, and use it for validation."""
         return [self.average] if self.average is not None else []
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        """Make the step's randomness a function of seed, step and process: a resumed run draws what it would have."""
-        micro = batch_idx % self.trainer.accumulate_grad_batches  # else accumulated batches would all draw the same
+        """Make the step's randomness a function of seed, step and process, so a resumed run draws the same numbers."""
+        micro = batch_idx % self.trainer.accumulate_grad_batches  # or accumulated batches would all draw the same
         position = [self.seed, self.global_step, self.global_rank, micro]
         torch.manual_seed(int(np.random.SeedSequence(position).generate_state(1)[0]))
 
@@ -253,7 +252,7 @@ class SelfSupervisedDepth(LightningModule):
         return self.recipe.configure(self.recipe.groups(self), total)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Store the record from which the networks are rebuilt, and what a resumed training must share."""
+        """Store the record that rebuilds the networks, and the settings that a resumed training must share."""
         checkpoint["saunet"] = self.record
         if self.intrinsics is not None:
             found = self.found_intrinsics(checkpoint["state_dict"])
@@ -261,14 +260,14 @@ class SelfSupervisedDepth(LightningModule):
         checkpoint["saunet_training"] = self.training_state(getattr(self._trainer, "datamodule", None))
 
     def found_intrinsics(self, state: Mapping[str, Tensor] | None = None) -> Intrinsics:
-        """Return the focal lengths that were learned, by a state of this module, or as they are now or on average."""
+        """Return the learned focal lengths, from a state of this module, or the current or averaged ones."""
         assert self.intrinsics is not None
         if state is None:
             state = self.average.values if self.average is not None else self.state_dict()
         return self.intrinsics.found(state["intrinsics.change"])
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Check that the training continues, and say what becomes of a changed recipe, network or objective."""
+        """Check that the same training continues, and report changes of recipe, networks or objective."""
         if self._trainer is None or self.trainer.state.fn != TrainerFn.FITTING:
             return
         for sentence in continuation(checkpoint, self, getattr(self.trainer, "datamodule", None)):
@@ -276,11 +275,11 @@ class SelfSupervisedDepth(LightningModule):
         self._owed = validation_due(checkpoint)
         if self._owed:
             owe_validation(checkpoint["loops"]["fit_loop"])
-        if self.average is None and "current_model_state" in checkpoint:  # it is averaged no longer
+        if self.average is None and "current_model_state" in checkpoint:  # no longer averaged
             checkpoint["state_dict"] = checkpoint["current_model_state"]
 
     def training_state(self, data: Any) -> dict[str, Any]:
-        """Return what a checkpoint keeps of a training beside its networks; what is unknown is left out."""
+        """Return what a checkpoint keeps of a training besides its networks; unknown entries are left out."""
         settings: dict[str, Any] = {"seed": self.seed}
         if self.objective_node:
             settings["objective"] = dict(self.objective_node)
@@ -293,7 +292,7 @@ class SelfSupervisedDepth(LightningModule):
         return {**known, "unlogged": row} if row else known
 
     def _to_come(self) -> tuple[bool, dict[str, float]]:
-        """Return whether a validation follows the step just done, and the step's row of the curves, if it is due.
+        """Return whether a validation follows the step just done, and the step's row of the curves if due.
 
         Lightning logs a step after the callbacks that save it. A kill in between would lose the row.
         """

@@ -1,4 +1,4 @@
-"""NaN and infinity in losses and gradients: the batch is kept, and the run stopped or the step left out."""
+"""NaN and infinity in losses and gradients: keep the batch, then stop the run or skip the step."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from saunet.errors import CheckpointError, SaunetError, one_of, positive
 from saunet.runs.checkpoint import atomic_save
 
 DUMPS = 5
-"""Bad batches kept at most in one run, on each process."""
+"""At most this many bad batches are kept per run and process."""
 NAMED = 3
-"""Bad batches named at most in one message."""
+"""At most this many bad batches are named per message."""
 AHEAD = 8
-"""Batches that the device may lag behind before their flags are waited for."""
+"""Batches that the device may lag behind before the host waits for their flags."""
 
 
 @dataclass
@@ -32,23 +32,23 @@ class _Step:
     number: int
     batches: Sequence[Mapping[str, Any]]
     flags: Tensor
-    """Bad are: a loss of any process, the step, then the loss of each batch of this process."""
+    """Flags of a bad loss on any process, a bad step, then a bad loss of each batch of this process."""
     arrived: torch.cuda.Event | None
 
 
 class NonFinite(Callback):
-    """Watch loss and gradients; on NaN or infinity keep the batch with its names, then stop the run or skip the step.
+    """Watch loss and gradients; on NaN or infinity, keep the batch with its names, then stop the run or skip the step.
 
-    ``stop`` costs nothing: flags travel to the host while the device works, and are read when they are there, at the
+    ``stop`` costs nothing: flags are copied to the host while the device works, and read once they have arrived, at the
     latest before anything is saved. ``skip`` reads them before every step, which waits for the device; weights,
-    optimizer and batch statistics stay as they were. All processes of a run do the same, and name the batch of the one
+    optimizer and batch statistics stay unchanged. All processes of a run do the same, and name the batch of the process
     whose loss was bad. With a loss scaler (``trainer.precision=16-mixed``) an infinite gradient is routine, and the
-    scaler leaves that step out; only the loss counts there.
+    scaler skips that step; only the loss counts there.
 
     Args:
-        folder: Where bad batches go, as files that ``torch.load`` reads.
+        folder: Where bad batches are saved, as files for ``torch.load``.
         action: ``stop`` or ``skip``.
-        patience: Steps skipped in a row after which the run stops all the same.
+        patience: The run stops after this many skipped steps in a row.
     """
 
     def __init__(self, folder: str, action: Literal["stop", "skip"] = "stop", patience: int = 20) -> None:
@@ -56,13 +56,13 @@ class NonFinite(Callback):
         self.action = one_of("action", action, ("stop", "skip"))
         self.patience = int(positive("patience", patience))
         self._pending: deque[_Step] = deque()
-        self._batches: list[Mapping[str, Any]] = []  # since the last optimizer step, with the flags of their losses
+        self._batches: list[Mapping[str, Any]] = []  # batches since the last optimizer step, with their losses' flags
         self._losses: list[Tensor] = []
         self._kept: list[tuple[Tensor, Tensor]] = []
         self._in_a_row = self._dumped = 0
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Keep the batch in reach, and the batch statistics that a bad one would spoil."""
+        """Hold on to the batch, and to the batch statistics that a bad batch would spoil."""
         if batch_idx % trainer.accumulate_grad_batches == 0:
             self._batches, self._losses = [], []
             if self.action == "skip":
@@ -77,7 +77,7 @@ class NonFinite(Callback):
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: torch.optim.Optimizer
     ) -> None:
-        """Send the step's flags on their way, or take a bad step back before it is made."""
+        """Send the step's flags to the host, or cancel a bad step before it is taken."""
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         flags = self._flags(trainer, [each.grad for each in parameters if each.grad is not None])
         arrived = None
@@ -87,7 +87,7 @@ class NonFinite(Callback):
             arrived.record()
         step = _Step(trainer.global_step + 1, self._batches, flags, arrived)
         if self.action == "stop":
-            self._pending.append(step)  # from here on nothing is saved before it is read
+            self._pending.append(step)  # from here on, flags are read before anything is saved
         elif bool(flags[1]):
             self._skip(trainer, step, parameters)
         else:
@@ -99,21 +99,21 @@ class NonFinite(Callback):
             self._read_oldest(trainer)
 
     def _read(self, trainer: Trainer, *_: Any, **__: Any) -> None:
-        """Look before broken weights are scored, saved in place of good ones, or count as finished."""
+        """Check before broken weights are scored, replace good ones, or count as finished."""
         while self._pending:
             self._read_oldest(trainer)
 
     on_validation_start = on_train_epoch_end = on_save_checkpoint = on_train_end = _read
 
     def _flags(self, trainer: Trainer, gradients: list[Tensor]) -> Tensor:
-        """Return the flags of the step at hand, without waiting for the device."""
+        """Return the flags of the current step, without waiting for the device."""
         losses = torch.stack(self._losses)
         loss = losses.any()
         bad = loss
         if gradients and getattr(trainer.precision_plugin, "scaler", None) is None:
             bad = bad | ~torch.isfinite(torch.stack(torch._foreach_norm(gradients)).sum())
         shared = torch.stack([loss, bad])
-        if trainer.world_size > 1:  # else each would do something else, and wait for the others
+        if trainer.world_size > 1:  # otherwise each would act differently, and wait for the others
             counted = shared.int()
             distributed.all_reduce(counted, distributed.ReduceOp.MAX)
             shared = counted.bool()
@@ -121,7 +121,7 @@ class NonFinite(Callback):
 
     def _skip(self, trainer: Trainer, step: _Step, parameters: list[Tensor]) -> None:
         for parameter in parameters:
-            parameter.grad = None  # what has no gradient is left alone by the optimizer, moments included
+            parameter.grad = None  # without a gradient the optimizer leaves it alone, moments included
         for buffer, before in self._kept:
             buffer.copy_(before)
         self._in_a_row += 1
@@ -134,7 +134,7 @@ class NonFinite(Callback):
         arrived = self._pending[0].arrived
         if arrived is None or (len(self._pending) > 1 and sum(len(each.batches) for each in self._pending) > AHEAD):
             return True
-        # When a flag arrives is chance, and processes that tell each other about it must read it in the same step.
+        # Flags arrive at random times, but processes that communicate about them must read them in the same step.
         return trainer.world_size == 1 and bool(arrived.query())  # type: ignore[no-untyped-call]
 
     def _read_oldest(self, trainer: Trainer) -> None:
@@ -146,9 +146,9 @@ class NonFinite(Callback):
             raise SaunetError(f"{self._describe(trainer, oldest)}; {_ADVICE}")
 
     def _describe(self, trainer: Trainer, step: _Step) -> str:
-        """Keep the bad batches and say which they are; all processes come here at the same time."""
+        """Keep and name the bad batches; all processes get here at the same time."""
         loss, _, *own = step.flags.tolist()
-        # Where only a gradient is bad, any batch of the step may be the reason.
+        # If only a gradient is bad, any batch of the step may be the cause.
         said = [self._keep(trainer, step, index) for index, bad in enumerate(own) if bad or not loss]
         if trainer.world_size > 1:
             gathered: list[list[str]] = [[] for _ in range(trainer.world_size)]
@@ -177,4 +177,4 @@ class NonFinite(Callback):
         return f"{said}; kept as {path}"
 
 
-_ADVICE = "look at the images, lower optim.lr, or train with trainer.precision=32"
+_ADVICE = "check the images, lower optim.lr, or train with trainer.precision=32"

@@ -1,4 +1,4 @@
-"""How a network is optimized: optimizer, learning rates, schedule, averaging and freezing as one small recipe."""
+"""The training recipe: optimizer, learning rates, schedule, averaging and freezing."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from torch.optim.lr_scheduler import LRScheduler
 from saunet.errors import ConfigError, in_range, one_of, positive, suggest
 
 OPTIMIZER_STATE = ("lr", "encoder_lr", "betas", "weight_decay", "fused")
-"""Settings that live on in a checkpoint's optimizer state: a resumed run keeps the checkpoint's."""
-OTHER_SETTINGS = "to train on with other settings, start from its weights with init_from= instead of resume="
+"""Settings stored in a checkpoint's optimizer state: a resumed run keeps the checkpoint's values."""
+OTHER_SETTINGS = "to continue with other settings, start from its weights with init_from= instead of resume="
 
 
 @dataclass(frozen=True)
@@ -30,19 +30,20 @@ class Recipe:
     Args:
         optimizer: ``adam`` or ``adamw``.
         lr: Learning rate at the start; the highest one with ``one_cycle``.
-        betas: Adam's decay rates.
+        betas: Adam's decay rates (beta1, beta2).
         weight_decay: Weight decay (decoupled for ``adamw``).
         schedule: ``step``: multiply by ``gamma`` at each milestone; ``cosine``: fall to zero at the end; ``one_cycle``:
             rise from 1/25 of ``lr`` over ``warmup`` and fall to 1/10000 of that, both along a cosine; ``constant``.
-        milestones: Where ``step`` falls, as fractions of the training: 0.75 is epoch 60 of 80.
+        milestones: Where ``step`` lowers the rate, as fractions of the training: 0.75 is epoch 60 of 80.
         gamma: Factor at each milestone.
-        warmup: Fraction of the training over which the rate rises, linearly from zero but for ``one_cycle``.
-        encoder_lr: Learning rate of the depth encoder, which often starts from public weights; ``lr`` if None.
+        warmup: Fraction of the training over which the rate rises, linearly from zero except for ``one_cycle``.
+        encoder_lr: Learning rate of the depth encoder, which often starts from public weights; None means ``lr``.
         freeze: Parts that are not trained, by name: ``depth.encoder``, ``pose``, ``depth.encoder.stages.0``. Their
-            normalization statistics stay too.
-        freeze_statistics: Parts that are trained while their batch normalization keeps its running statistics, by name.
-        ema: Decay of the moving average of the weights, such as 0.999; the average is what is validated and saved. 0
-            keeps none.
+            normalization statistics are frozen too.
+        freeze_statistics: Parts, by name, that are trained but keep the running statistics of their batch
+            normalization.
+        ema: Decay of the moving average of the weights, such as 0.999; the average is validated and saved. 0 turns it
+            off.
         fused: One kernel for the whole optimizer step; by default on a CPU, where it takes a quarter of the time.
     """
 
@@ -70,7 +71,7 @@ class Recipe:
             positive("optim.encoder_lr", self.encoder_lr)
         if len(self.betas) != 2 or not all(0 <= beta < 1 for beta in self.betas):
             raise ConfigError(
-                f"optim.betas is {list(self.betas)}; two numbers in [0, 1) are needed, such as [0.9, 0.999]"
+                f"optim.betas is {list(self.betas)}; it must be two numbers in [0, 1), such as [0.9, 0.999]"
             )
         if not all(0 < milestone < 1 for milestone in self.milestones):
             raise ConfigError(
@@ -82,12 +83,14 @@ class Recipe:
                 f"optim.warmup is {self.warmup}; it is a fraction of the training, at least 0 and below 1"
             )
         if self.schedule == "one_cycle" and self.warmup == 0:
-            raise ConfigError("optim.schedule=one_cycle rises over optim.warmup, which is 0; set it, such as 0.3")
+            raise ConfigError(
+                "optim.schedule=one_cycle rises over optim.warmup, which is 0; set it, for example to 0.3"
+            )
         if in_range("optim.ema", self.ema, 0, 1) == 1:
-            raise ConfigError("optim.ema is 1, so the average would never move; use a number below, such as 0.999")
+            raise ConfigError("optim.ema is 1, so the average would never move; use a smaller number, such as 0.999")
 
     def factor(self, progress: float) -> float:
-        """Return the learning rate relative to ``lr`` when a fraction ``progress`` (0 to 1) of the training is done."""
+        """Return the learning rate relative to ``lr`` after a fraction ``progress`` (0 to 1) of the training."""
         if progress < self.warmup:
             risen = progress / self.warmup
             if self.schedule == "one_cycle":
@@ -102,20 +105,22 @@ class Recipe:
         return falling if self.schedule == "cosine" else end + (1 - end) * falling
 
     def frozen(self, model: nn.Module) -> list[nn.Module]:
-        """Return the parts of a model that are not trained, by the names in ``freeze``."""
+        """Return the parts of a model that ``freeze`` names."""
         return _parts(model, "freeze", self.freeze)
 
     def fixed(self, model: nn.Module) -> list[nn.Module]:
-        """Return the parts that stay in evaluation: frozen ones, and batch normalization of fixed statistics."""
+        """Return the parts that stay in evaluation mode: frozen ones, and batch normalization with fixed statistics."""
         named = _parts(model, "freeze_statistics", self.freeze_statistics)
         norms = [module for part in named for module in part.modules() if isinstance(module, _BatchNorm)]
         return self.frozen(model) + norms
 
     def groups(self, model: nn.Module) -> list[dict[str, Any]]:
-        """Return the trainable parameters of a model, the depth encoder's apart where it has a rate of its own."""
+        """Return the trainable parameters of a model, with the depth encoder's separate if it has its own rate."""
         trainable = {name: parameter for name, parameter in model.named_parameters() if parameter.requires_grad}
         if not trainable:
-            raise ConfigError(f"optim.freeze is {list(self.freeze)}, which leaves nothing to train; leave a part out")
+            raise ConfigError(
+                f"optim.freeze is {list(self.freeze)}, which leaves nothing to train; remove a part from it"
+            )
         if self.encoder_lr is None:
             return [{"params": list(trainable.values())}]
         encoder, rest = (
@@ -133,7 +138,7 @@ class Recipe:
         tensors = itertools.chain.from_iterable(each["params"] if isinstance(each, dict) else [each] for each in groups)
         on_cpu = self.fused is None and all(each.device.type == "cpu" for each in tensors)
         optimizer = kind(groups, self.lr, betas, weight_decay=self.weight_decay, fused=self.fused or on_cpu or None)
-        if on_cpu:  # there is no scaler on a CPU, and with one the kernel would have to know it before clipping
+        if on_cpu:  # a CPU has no scaler; with one, the kernel would need its scale before clipping
             vars(optimizer)["_step_supports_amp_scaling"] = False
         scheduler = RecipeSchedule(optimizer, self, max(total_steps, 1))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
@@ -143,13 +148,13 @@ class Recipe:
         return {key: list(value) if isinstance(value, tuple | list) else value for key, value in asdict(self).items()}
 
     def resumed_from(self, before: Mapping[str, Any]) -> str | None:
-        """Say in a sentence what becomes of settings that differ from those of a resumed checkpoint, if any do."""
+        """Describe in a sentence what happens to settings that differ from a resumed checkpoint's; None if none do."""
         now = self.to_plain()
         changed = [key for key in now if key in before and before[key] != now[key]]
         for key in ("optimizer", "freeze", "encoder_lr"):
             if key in changed and (key != "encoder_lr" or None in (before[key], now[key])):
                 raise ConfigError(
-                    f"optim.{key} is {now[key]} and the checkpoint was trained with {before[key]}, so its optimizer "
+                    f"optim.{key} is {now[key]} but the checkpoint was trained with {before[key]}, so its optimizer "
                     "state does not fit; keep the setting, or start a new training from its weights with init_from= "
                     "instead of resume="
                 )
@@ -185,16 +190,16 @@ class RecipeSchedule(LRScheduler):
         return [float(rate) * factor for rate in self.base_lrs]
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the position in the schedule; what the schedule is comes from the config."""
+        """Return the position in the schedule; the schedule itself comes from the config."""
         return {key: value for key, value in super().state_dict().items() if key not in ("recipe", "total_steps")}
 
 
 class MovingAverage(WeightAveraging):
     """Exponential moving average of a model's parameters and buffers, which Lightning validates and saves.
 
-    The first steps weigh more than ``decay`` says, so that the fresh weights are soon forgotten: after n steps the
-    decay is at most (1 + n) / (10 + n). Tensors that are not floating-point (a counter) are copied. A checkpoint
-    holds the average as ``state_dict`` and the weights that are trained as ``current_model_state``.
+    The first steps weigh more than ``decay`` says, so the fresh weights are soon forgotten: after n steps the decay is
+    at most (1 + n) / (10 + n). Tensors that are not floating-point (a counter) are copied. A checkpoint holds the
+    average as ``state_dict`` and the trained weights as ``current_model_state``.
     """
 
     def __init__(self, decay: float) -> None:
@@ -208,10 +213,11 @@ class MovingAverage(WeightAveraging):
         return dict(self._average_model.module.state_dict())
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        self._device = trainer.strategy.root_device  # where the model will be, but is not yet
+        self._device = trainer.strategy.root_device  # the model is not on this device yet
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
-            # At 0, the first step would be copied instead of averaged; on the CPU, reading it waits for no device.
+            # At 0, the first step would be copied instead of averaged; on the CPU, reading it does not wait for a
+            # device.
             self._average_model.n_averaged = torch.ones((), dtype=torch.long)
 
     def update(self, model: LightningModule) -> None:
@@ -220,10 +226,10 @@ class MovingAverage(WeightAveraging):
         self._average_model.update_parameters(model)
 
     def on_train_batch_end(self, *_: Any) -> None:
-        """Do nothing: callbacks that came before this one would have saved an average without the last step."""
+        """Do nothing: callbacks called before this one would have saved an average without the last step."""
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Leave the module its own weights; whoever wants the average loads a checkpoint."""
+        """Leave the module with its own weights; for the average, load a checkpoint."""
 
     def _update(self, averages: Any, weights: Any, _: Any) -> None:
         assert self._average_model is not None

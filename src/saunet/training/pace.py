@@ -1,4 +1,4 @@
-"""What sets the pace of a training: threads, waiting for the loader, and the one setting to change first."""
+"""What limits the speed of a training: threads, waiting for the loader, and the first setting to change."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from saunet.errors import DataError, in_range, positive
 from saunet.threads import SETTINGS, Usage, available_cores, free
 
 _ENOUGH = 20
-"""Steps from which a training says what set its pace."""
+"""A training reports what limited its speed from this many steps on."""
 _LOOK = 0.5
 """Seconds over which the use of the cores is measured before the first step."""
 _SAMPLES = 3
 _AUGMENT = 0.2
-"""Share of a step from where augmentation is worth a word."""
+"""Augmentation is mentioned from this fraction of a step on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,13 +36,13 @@ class Pace:
 
     step: float
     waiting: float
-    """For the loader."""
+    """Waiting for the loader."""
     augment: float
     """Device transforms."""
     decode: float
-    """To read a sample's frames, in one process."""
+    """Reading a sample's frames, in one process."""
     rest: float
-    """For what else makes a sample: resizing, ground truth."""
+    """Making the rest of a sample: resizing, ground truth."""
 
     def __str__(self) -> str:
         loader, augment = self.waiting / self.step, self.augment / self.step
@@ -56,7 +56,7 @@ def _ms(seconds: float) -> str:
 
 
 def measure(step: float, waiting: float, data: DepthDataModule, batch_size: int, device: torch.device) -> Pace:
-    """Add to a step's seconds what its parts cost, by making some samples anew in this process.
+    """Split a step's seconds into its parts, by making some samples again in this process.
 
     Raises:
         DataError: if a sample cannot be read.
@@ -91,7 +91,7 @@ def _seconds(call: Callable[[], object], device: torch.device | None = None) -> 
 def first_change(
     pace: Pace, *, share: float, workers: int, cacheable: bool, device: str, precision: str, compiled: bool
 ) -> str:
-    """Return the setting that gains most, where waiting for the loader counts from a share of the time on."""
+    """Return the setting that gains most; waiting for the loader counts only above a fraction of the time."""
     cores = available_cores()
     if pace.waiting > share * pace.step:
         if workers < cores:
@@ -111,7 +111,7 @@ def first_change(
 
 @dataclass(frozen=True, slots=True)
 class Loading:
-    """How fast images came and how fast they could have been used, over some steps of one process."""
+    """How fast images arrived and how fast they could have been used, over some steps of one process."""
 
     images: int
     seconds: float
@@ -127,32 +127,32 @@ class Loading:
 
     @property
     def reached(self) -> float:
-        """Images a second that arrived."""
+        """Images per second that arrived."""
         return self.images / self.seconds if self.seconds > 0 else 0.0
 
     @property
     def needed(self) -> float:
-        """Images a second that the model could use if none were waited for."""
+        """Images per second that the model could use without waiting."""
         return self.images / max(self.seconds - self.waited, 1e-9)
 
 
 class LoaderMonitor(Callback):
-    """Log the loader's images a second and its share of the time, and say once when it is the bottleneck.
+    """Log the loader's images per second and waiting time, and report once when it is the bottleneck.
 
-    At the end it says where the time of a step went and what to change first.
-    The first step of an epoch, before which worker processes start and validation runs, is left out. Time that the
-    loader needs beside a busy device costs nothing and is not counted: only what the training step waits for is.
+    At the end it reports where a step's time went and what to change first.
+    The first step of an epoch is left out, because worker processes start and validation runs before it. Loading while
+    the device is busy costs nothing and is not counted; only the time that the training step waits is.
 
     Args:
-        every_n_steps: Steps over which is measured, of several epochs where these are shorter.
-        share: Part of the time from where the loader is called a bottleneck.
+        every_n_steps: Steps per measurement, across several epochs if these are shorter.
+        share: Fraction of the time above which the loader counts as the bottleneck.
     """
 
     def __init__(self, every_n_steps: int = 50, share: float = 0.1) -> None:
         self.every_n_steps = int(positive("every_n_steps", every_n_steps))
         self.share = in_range("share", share, 0, 1)
         self._since: tuple[float, float] | None = None
-        """When the step before ended, and what had been waited by then; None before the first step of an epoch."""
+        """When the previous step ended, and the waiting time until then; None before the first step of an epoch."""
         self._measured = Loading(0, 0.0, 0.0)
         self._steps = 0
         self._all = Loading(0, 0.0, 0.0)
@@ -160,7 +160,7 @@ class LoaderMonitor(Callback):
         self._said = False
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Measure no pause between epochs; what was measured before it counts on."""
+        """Do not measure the pause between epochs; earlier measurements still count."""
         self._since = None
 
     def on_train_batch_end(
@@ -186,12 +186,12 @@ class LoaderMonitor(Callback):
             rank_zero_info(sentence(loading, trainer))
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say what set the pace, unless there were too few steps to know."""
+        """Report what limited the speed, unless there were too few steps to know."""
         data = getattr(trainer, "datamodule", None)
         if self._all_steps < _ENOUGH or not trainer.is_global_zero or not isinstance(data, DepthDataModule):
             return
         step, waiting = (total / self._all_steps for total in (self._all.seconds, self._all.waited))
-        with contextlib.suppress(DataError):  # a file that is gone by now is no reason to fail a finished training
+        with contextlib.suppress(DataError):  # a file that is gone by now must not fail a finished training
             pace = measure(step, waiting, data, share(data.batch_size, trainer.world_size), pl_module.device)
             change = first_change(
                 pace,
@@ -206,13 +206,13 @@ class LoaderMonitor(Callback):
 
 
 class Threads(Callback):
-    """Compute with as many threads as find a core, measured before the first step and again while training.
+    """Compute with as many threads as there are free cores, measured before the first step and during training.
 
-    More threads than free cores wait for each other most of the time. The user's ``OMP_NUM_THREADS`` or
-    ``MKL_NUM_THREADS`` is left alone, and there are never more threads than torch had before.
+    More threads than free cores wait for each other most of the time. If ``OMP_NUM_THREADS`` or ``MKL_NUM_THREADS`` is
+    set, it is left alone. There are never more threads than torch had before.
 
     Args:
-        every: Seconds over which the use of the cores is measured again.
+        every: Seconds between measurements of the cores' use.
     """
 
     def __init__(self, every: float = 20.0) -> None:
@@ -230,7 +230,8 @@ class Threads(Callback):
         began = Usage.now()
         time.sleep(_LOOK)
         self._since = Usage.now()
-        # The load average remembers a minute, in which this program may have worked itself; a moment may be unlucky.
+        # The load average covers a minute, in which this program may have been busy itself; a single moment may be
+        # unlucky.
         taken = min(self._since.taken_since(began), os.getloadavg()[0]) if began and self._since else 0.0
         cores = available_cores()
         self._use(free(cores, taken))
@@ -247,7 +248,7 @@ class Threads(Callback):
             self._use(free(available_cores(), self._since.taken_since(since)))
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Give the process back the threads that it had."""
+        """Restore the process's number of threads."""
         if self._before[0]:
             torch.set_num_threads(self._before[0])
             cv2.setNumThreads(self._before[1])
@@ -265,7 +266,7 @@ def count(threads: int) -> str:
 
 
 def sentence(loading: Loading, trainer: Trainer) -> str:
-    """Say that the loader is the bottleneck, with its figures and what to do."""
+    """Report that the loader is the bottleneck, with its figures and what to do."""
     workers = getattr(trainer.train_dataloader, "num_workers", 0)
     cores = available_cores()
     each = " on this process" if trainer.world_size > 1 else ""

@@ -1,4 +1,4 @@
-"""Where a training starts from: nowhere, the weights of another model, or the middle of itself."""
+"""Where a training starts: from scratch, from another model's weights, or from its own checkpoint."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from saunet.training.module import SelfSupervisedDepth
 
 BOUND = {"seed": "seed", "batch_size": "data.batch_size", "train_split": "training frames (SHA-256 of their names)"}
-"""What decides the order of the data, with its name in a message."""
+"""The settings that decide the order of the data, with their names in messages."""
 
 
 def resume_path(resume: str | None, output_dir: str | Path) -> str | None:
@@ -31,7 +31,7 @@ def resume_path(resume: str | None, output_dir: str | Path) -> str | None:
         last = Path(output_dir) / "checkpoints" / "last.ckpt"
         return str(last.resolve()) if last.is_file() else None
     if resume in ("true", "True"):
-        raise ConfigError("resume is 'true'; set resume=auto for the run's own last.ckpt, or name a checkpoint")
+        raise ConfigError("resume is 'true'; set resume=auto for the run's own last.ckpt, or give a checkpoint")
     return str(Path(resume).expanduser().resolve()) if resume else None
 
 
@@ -40,24 +40,24 @@ def check_unused(output_dir: str | Path) -> None:
     found = sorted((Path(output_dir) / "checkpoints").glob("*.ckpt"))
     if found:
         raise ConfigError(
-            f"{output_dir} holds {found[0].name} of an earlier run; continue it by resume=auto, choose another "
+            f"{output_dir} holds {found[0].name} of an earlier run; continue it with resume=auto, choose another "
             "folder, or replace it with overwrite=true"
         )
 
 
 def check_resume(model: SelfSupervisedDepth, checkpoint: Checkpoint, data: Any) -> int:
-    """Check that a training can be resumed, before the trainer finds out in its own words; return the steps done."""
+    """Check that a training can be resumed, before the trainer fails with its own message; return the steps done."""
     missing = _missing(checkpoint)
     if missing:
         raise CheckpointError(
-            f"{checkpoint.path} has no {missing}, so the training cannot be resumed where it was; give the last.ckpt "
-            f"of a run, or start a new training from its weights with init_from={checkpoint.path}"
+            f"{checkpoint.path} has no {missing}, so the training cannot be resumed where it stopped; give the "
+            f"last.ckpt of a run, or start a new training from its weights with init_from={checkpoint.path}"
         )
     checkpoint.record.check_same_training(model.record)
     before, now = (getattr(each.intrinsics, "mode", "fixed") for each in (checkpoint.record, model))
     if before != now:
         raise CheckpointError(
-            f"the checkpoint was trained with model.intrinsics={before} and this run has {now}; give the same, or "
+            f"the checkpoint was trained with model.intrinsics={before} but this run has {now}; give the same, or "
             f"start a new training from its weights with init_from={checkpoint.path}"
         )
     load_weights(model.depth, checkpoint.weights("depth"), "depth network")
@@ -80,16 +80,16 @@ def _missing(checkpoint: Checkpoint) -> str | None:
 
 
 def continuation(checkpoint: Mapping[str, Any], model: SelfSupervisedDepth, data: Any) -> list[str]:
-    """Check that a resumed training sees the same samples in the same order; say what it changes, in sentences."""
+    """Check that a resumed training sees the same samples in the same order; report what it changes."""
     training, now = checkpoint.get("saunet_training", {}), model.training_state(data)["settings"]
     before = training.get("settings", {})
     for key, name in BOUND.items():
         if key in before and key in now and before[key] != now[key]:
             was, is_ = (str(each)[:16] for each in (before[key], now[key]))
             raise CheckpointError(
-                f"the checkpoint was trained with {name} {was} and this run has {is_}, so it cannot be resumed where "
-                "it was; give the same settings, or start a new training from its weights with init_from= instead of "
-                "resume="
+                f"the checkpoint was trained with {name} {was} but this run has {is_}, so it cannot be resumed where "
+                "it stopped; give the same settings, or start a new training from its weights with init_from= "
+                "instead of resume="
             )
     old = {"objective": before.get("objective", {}), "model": checkpoint.get("saunet", {}).get("model", {})}
     new = {"objective": now.get("objective", {}), "model": model.record.get("model", {})}
@@ -98,7 +98,7 @@ def continuation(checkpoint: Mapping[str, Any], model: SelfSupervisedDepth, data
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
-    """Say in one sentence which settings of networks and objective a resumed training changes; None for no change."""
+    """Return a sentence about the networks' and objective's settings that a resumed training changes; None if none."""
     found = [each for name in now if name in before for each in _differences(before[name], now[name], name)]
     return f"the resumed run uses the new {', '.join(found)}; {OTHER_SETTINGS}" if found else None
 
@@ -112,7 +112,7 @@ def _differences(before: Any, now: Any, name: str) -> Iterator[str]:
             yield f"{name} {kinds[1]} (it was {kinds[0]})"
             return
         for key in now:
-            if key in before and key != "weights":  # what the networks started from is behind them
+            if key in before and key != "weights":  # their starting weights no longer matter
                 yield from _differences(before[key], now[key], f"{name}.{key}")
     else:
         was, is_ = (list(each) if isinstance(each, tuple) else each for each in (before, now))
@@ -126,7 +126,7 @@ def validation_due(checkpoint: Mapping[str, Any]) -> bool:
 
 
 def owe_validation(loops: dict[str, Any]) -> None:
-    """Change the recorded state of Lightning's loops to that of a run which was stopped in its validation.
+    """Change the recorded state of Lightning's loops to that of a run stopped during its validation.
 
     Lightning saves after a step as if no validation followed, and would resume with the next step.
     """
@@ -139,10 +139,10 @@ def owe_validation(loops: dict[str, Any]) -> None:
 
 @rank_zero_only
 def keep_rows(logger: Logger, checkpoint: Mapping[str, Any]) -> None:
-    """Keep what a resumed run logged as CSV before; Lightning's logger would begin the file afresh.
+    """Keep the CSV log of a resumed run; Lightning's logger would start a new file.
 
-    Rows after the last step of the checkpoint are dropped, as they will be logged again; so is the validation after it
-    if that is still due. Its own row is made up for where a kill came before it was logged.
+    Rows after the checkpoint's last step are dropped, because they will be logged again; so is the validation after it
+    if that is still due. The last step's own row is added if the run was killed before logging it.
     """
     if not isinstance(logger, CSVLogger):
         return
@@ -155,7 +155,7 @@ def keep_rows(logger: Logger, checkpoint: Mapping[str, Any]) -> None:
         warnings.filterwarnings("ignore", message=".*will be deleted when the new ones are saved.*")
         writer = logger.experiment
     steps, due = int(checkpoint["global_step"]), validation_due(checkpoint)
-    whole = (row for row in rows if row.get("step", "").isdecimal())  # a kill can cut the last one
+    whole = (row for row in rows if row.get("step", "").isdecimal())  # a kill can truncate the last one
     kept = [row for row in whole if int(row["step"]) < steps]
     last = [row for row in kept if int(row["step"]) == steps - 1]
     again = [row for row in last if due and any(key[:4] == "val/" for key in row)]
@@ -167,10 +167,10 @@ def keep_rows(logger: Logger, checkpoint: Mapping[str, Any]) -> None:
 
 
 def warm_start(model: SelfSupervisedDepth, source: str | Path) -> str:
-    """Give a new training the weights of any saunet model that `saunet.load` reads, as many as fit by name and shape.
+    """Start a new training from the weights of any saunet model that `saunet.load` reads, as far as name and shape fit.
 
     Returns:
-        What was taken and what was not, in one sentence.
+        One sentence about which weights were used and which were not.
     """
     checkpoint = read_model(source)
     parts: list[tuple[str, nn.Module | None]] = [("depth", model.depth), ("pose", model.pose)]
@@ -185,28 +185,28 @@ def warm_start(model: SelfSupervisedDepth, source: str | Path) -> str:
         fitting = {key: given[key] for key in own if key in given and given[key].shape == own[key].shape}
         if name == "depth" and not fitting:
             raise CheckpointError(
-                f"nothing of {source} fits the depth network (it has '{next(iter(given), 'no weights')}' where the "
+                f"no weights in {source} fit the depth network (it has '{next(iter(given), 'no weights')}' where the "
                 f"model has '{next(iter(own))}'); choose the same model/encoder and model/decoder"
             )
         network.load_state_dict(fitting, strict=False)
-        nothing = (
-            f"no {name} network{' that fits this one, which' if given else '; this one'} starts from fresh weights"
-        )
+        nothing = f"no {name} network{' that fits' if given else ''}; this one starts from fresh weights"
         taken.append(_taken(name, own, given, fitting) if fitting else nothing)
     theirs, ours = checkpoint.record.to_plain()["model"], model.record.get("model", {})
     for end in ("min_depth", "max_depth"):
         if ours.get(end, theirs[end]) != theirs[end]:
-            taken.append(f"its {end} is {theirs[end]:g} and here {ours[end]:g}, so the same weights give other depths")
+            taken.append(
+                f"its {end} is {theirs[end]:g} but {ours[end]:g} here, so the same weights give different depths"
+            )
     for part in ("encoder", "decoder"):
         taken += [
-            f"its {part} has {key} {was} and here {now}, so the same weights give other depths"
+            f"its {part} has {key} {was} but {now} here, so the same weights give different depths"
             for key, was, now in _other_behavior(theirs[part], ours.get(part, theirs[part]))
         ]
     return f"starting from {source}: {'; '.join(taken)}"
 
 
 def _other_behavior(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield settings of the same component that change what its weights compute and not their shapes."""
+    """Yield settings of the same component that change what its weights compute but not their shapes."""
     if theirs["_target_"] == ours["_target_"]:
         for key, parameter in Spec(ours).parameters.items():
             was, now = (node.get(key, parameter.default) for node in (theirs, ours))
@@ -215,7 +215,7 @@ def _other_behavior(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> Itera
 
 
 def _taken(name: str, own: Mapping[str, Tensor], given: Mapping[str, Tensor], fitting: Mapping[str, Tensor]) -> str:
-    """Say how much of a network was taken, and of the rest the first tensor."""
+    """Describe how much of a network was used, and name the first tensor of the rest."""
     if len(fitting) == len(own) == len(given):
         return f"all {len(own)} tensors of the {name} network"
 
@@ -225,5 +225,5 @@ def _taken(name: str, own: Mapping[str, Tensor], given: Mapping[str, Tensor], fi
     text = f"{len(fitting)} of {len(own)} tensors of the {name} network"
     rest, unused = ([key for key in some if key not in others] for some, others in ((own, fitting), (given, own)))
     if rest:
-        text += f" (left as they were: {first(rest, ', another shape' if rest[0] in given else ', not in it')})"
+        text += f" (left unchanged: {first(rest, ', of another shape' if rest[0] in given else ', not in it')})"
     return f"{text} (unused: {first(unused)})" if unused else text

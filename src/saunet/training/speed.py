@@ -1,8 +1,8 @@
-"""Switches that change how fast or in how little memory a training runs, and nothing of what it learns.
+"""Switches for the speed and memory of a training that do not change what it learns.
 
 Mixed precision, gradient accumulation and the number of devices are the trainer's (``trainer.precision``,
 ``trainer.accumulate_grad_batches``, ``trainer.devices``), the fused optimizer is the recipe's (``optim.fused``), and
-the memory format of convolutions goes by the device.
+the memory format of convolutions depends on the device.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Speed:
     Args:
         compile: Compile networks, view synthesis and losses with ``torch.compile``; the first steps take minutes.
         checkpoint_activations: Keep only the inputs of each network block, of an encoder's first layers, and of each
-            level of a skip decoder, and compute the rest again for the gradient: about a third more work for much less
+            level of a skip decoder, and recompute the rest for the gradient: about a third more work for much less
             memory.
     """
 
@@ -38,7 +38,7 @@ class Speed:
     checkpoint_activations: bool = False
 
     def apply(self, model: Any, device: torch.device) -> None:
-        """Prepare a `SelfSupervisedDepth` to train on a device, in place; names of weights stay as they are."""
+        """Prepare a `SelfSupervisedDepth` to train on a device, in place; weight names do not change."""
         parts: list[nn.Module] = [part for part in (model.depth, model.pose) if isinstance(part, nn.Module)]
         for part in parts:
             lay_out(part, training_format(part, device))
@@ -53,10 +53,10 @@ class Speed:
 
 
 def recomputable(network: nn.Module) -> list[tuple[nn.Module, str]]:
-    """Return the modules of a network, and the methods of each, whose results can be computed again.
+    """Return the modules of a network whose results can be recomputed, with the methods that do so.
 
-    They are `StemEncoder.begin`, `SkipDecoder.level`, and what a network repeats: the entries of its innermost lists
-    and sequences that hold several layers each.
+    They are `StemEncoder.begin`, `SkipDecoder.level`, and a network's repeated blocks: the entries of its innermost
+    lists and sequences that hold several layers each.
     """
     if isinstance(network, SkipDecoder):
         return [(network, "level")]

@@ -1,4 +1,4 @@
-"""Ends in good order: a run that is asked to stop saves first, and one that loses a process says so and ends."""
+"""Orderly ends: a run that is asked to stop saves first, and one that loses a process reports it and ends."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LAST = "last.ckpt"
 
 
 def way_on(folder: str | Path) -> str:
-    """Return how a run with this checkpoint folder is resumed, as the end of a sentence."""
+    """Return how to resume a run with this checkpoint folder, as the end of a sentence."""
     last = Path(folder) / LAST
     if not last.is_file():
         return "no checkpoint was written yet, so start again"
@@ -40,12 +40,12 @@ class GracefulStop(Callback):
     """On SIGTERM, SIGHUP, Ctrl-C, or a batch system's SIGUSR1: finish the step, save ``last.ckpt``, end with a message.
 
     All processes of a run stop after the same step, whichever of them was asked. A second Ctrl-C ends at once. A
-    validation that is under way or due is finished first, and so is an epoch after its last step: a training that has
-    none left is complete then, and ends as such.
+    validation that is running or due is finished first, and so is an epoch after its last step: a training with no step
+    left is then complete, and ends that way.
 
     Args:
-        folder: Where ``last.ckpt`` goes.
-        every_n_steps: How often several processes ask each other; they also do at the end of an epoch.
+        folder: Where ``last.ckpt`` is saved.
+        every_n_steps: Steps between exchanges among several processes; they also exchange at the end of an epoch.
     """
 
     def __init__(self, folder: str, every_n_steps: int = 4) -> None:
@@ -58,11 +58,11 @@ class GracefulStop(Callback):
         self._before: dict[int, Any] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Listen, in place of the trainer, which would stop between two steps without saving."""
+        """Handle signals instead of the trainer, which would stop between two steps without saving."""
         if threading.current_thread() is not threading.main_thread():
             return
         wanted = [signal.SIGTERM, signal.SIGINT]
-        if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup sets it
+        if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # set by nohup
             wanted.append(signal.SIGHUP)
         if "SLURM_JOB_ID" in os.environ and hasattr(signal, "SIGUSR1"):
             wanted.append(signal.SIGUSR1)
@@ -71,7 +71,7 @@ class GracefulStop(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Save if anybody was asked to stop, where no accumulated gradient is lost."""
+        """Save if any process was asked to stop, at a step where no accumulated gradient is lost."""
         if (batch_idx + 1) % trainer.accumulate_grad_batches and not trainer.is_last_batch:
             return
         number = self._agreed or self.received or 0
@@ -85,16 +85,16 @@ class GracefulStop(Callback):
             distributed.all_reduce(asked, distributed.ReduceOp.MAX)
             number = int(asked)
         self._agreed = number
-        if number:  # before a validation that is due too: whoever asked may not wait for its end
+        if number:  # before a validation that is due too: the sender of the signal may not wait for its end
             self._save(trainer)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Take what was measured into the checkpoint, with the next step or the end of the epoch."""
+        """Save the validation's results with the next step or at the end of the epoch."""
         if self._agreed and not self._went_on:  # once: there may be a validation after every step
             self._saved, self._went_on = False, True
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save with all that belongs to the epoch."""
+        """Save with everything that belongs to the epoch."""
         if self._agreed:
             self._save(trainer)
 
@@ -103,14 +103,14 @@ class GracefulStop(Callback):
         self._saved = True
 
     def _stop(self, trainer: Trainer, *_: Any, **__: Any) -> None:
-        """Stop before another step or epoch, when the last step is in the log."""
+        """Stop before another step or epoch, once the last step is logged."""
         if not self._saved:
             return
         self._restore()
         number = self._agreed
         name = signal.Signals(number).name
         message = f"stopped by {name} after step {trainer.global_step}, everything is saved; {way_on(self.folder)}"
-        # Where one process starts the others, it takes a bad end of theirs for a crash.
+        # If one process starts the others, it treats their nonzero exit as a crash.
         raise Stopped(message, 128 + number if trainer.is_global_zero else 0)
 
     on_train_batch_start = on_train_epoch_start = _stop
@@ -125,13 +125,13 @@ class GracefulStop(Callback):
             return
         try:
             print(f"\n{_answer(number)}", file=sys.stderr, flush=True)
-        except OSError:  # the terminal is gone: whatever writes there, such as the bar, must not fail before the saving
+        except OSError:  # the terminal is gone: writing there, as the bar does, must not fail before saving
             nowhere = os.open(os.devnull, os.O_WRONLY)
             for stream in (1, 2):
                 os.dup2(nowhere, stream)
 
     def _restore(self, *_: Any, **__: Any) -> None:
-        """Listen no longer."""
+        """Stop handling signals."""
         before, self._before = self._before, {}
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -146,13 +146,13 @@ def _answer(number: int) -> str:
 class ProcessWatch(Callback):
     """End the whole run with one sentence when one of its processes dies, instead of waiting for it for ever.
 
-    For runs whose processes the trainer starts (``trainer=ddp``); torchrun and SLURM look after theirs themselves.
-    Torchrun's own watch is no replacement there: it starts the processes itself, gives the others 30 s after a SIGTERM
-    that a process inside a collective call cannot follow, and leaves ``run.json`` at "running". Lightning's kills all
-    processes, this one included, without a word.
+    For runs whose processes the trainer starts (``trainer=ddp``); torchrun and SLURM watch over theirs themselves.
+    Torchrun's own watch cannot replace this one: it starts the processes itself, gives the others 30 s after a SIGTERM
+    that a process inside a collective call cannot handle, and leaves ``run.json`` at "running". Lightning's watch kills
+    all processes, this one included, without a message.
 
     Args:
-        folder: The run's folder, whose record is told.
+        folder: The run's folder, to note the end in its record.
         checkpoints: Where ``last.ckpt`` is.
     """
 
@@ -162,7 +162,7 @@ class ProcessWatch(Callback):
         self._own_end = False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Begin to watch: the first process its children, the children their parent."""
+        """Start watching: the first process watches its children, the children their parent."""
         started: list[Popen[bytes]] = list(getattr(trainer.strategy.launcher, "procs", None) or [])
         environment = getattr(trainer.strategy, "cluster_environment", None)
         if started:
@@ -177,7 +177,7 @@ class ProcessWatch(Callback):
         self._own_end = True
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Let the watch speak if what went wrong here is only that another process is gone."""
+        """Let the watch report if the only error here is that another process is gone."""
         if isinstance(exception, SaunetError | SystemExit | KeyboardInterrupt):
             self._own_end = True
         elif self._thread is not None:
@@ -191,12 +191,12 @@ class ProcessWatch(Callback):
                 if code:
                     if code > 0 and self._ends_by_itself():
                         return
-                    how = f"was killed (signal {-code})" if code < 0 else f"ended with code {code}, see its message"
+                    how = f"was killed (signal {-code})" if code < 0 else f"ended with code {code} (see its message)"
                     self._end(f"process {rank} of {len(started) + 1} {how}, so the run ends", started)
             time.sleep(0.2)
 
     def _ends_by_itself(self) -> bool:
-        """Wait a moment: what ended another process may be ending this one too, with a better message."""
+        """Wait a moment: the cause of another process's end may be ending this one too, with a better message."""
         time.sleep(1)
         return self._own_end
 
@@ -213,11 +213,11 @@ class ProcessWatch(Callback):
         PRINTED.info(f"saunet train: {sentence}")
         for process in started:
             process.kill()
-        os._exit(1)  # the main thread waits inside a collective call, which no exception reaches
+        os._exit(1)  # the main thread is blocked in a collective call, where no exception can reach it
 
 
 def _silence_lightnings_watch() -> None:
-    """Keep Lightning's own watch from killing this process before it has said why."""
+    """Keep Lightning's own watch from killing this process before it has reported why."""
     for thread in threading.enumerate():
         if thread.name == "child-process-observer":
             thread._child_processes = []  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Train: typed options in, a run folder out. Everything is checked before anything is written."""
+"""Train: typed options in, a run's folder out. Everything is checked before anything is written."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from saunet.training.speed import Speed
 from saunet.training.stopping import way_on
 
 PRECISIONS = ("32-true", "32", "16-mixed", "16", "bf16-mixed", "bf16")
-"""Precisions in which a training runs: images and losses stay in float32."""
+"""Allowed precisions; images and losses stay in float32."""
 TRAINER: Mapping[str, Any] = {
     "accelerator": "auto",
     "devices": 1,
@@ -48,11 +48,11 @@ TRAINER: Mapping[str, Any] = {
     "enable_model_summary": False,
     "use_distributed_sampler": False,  # our samplers are sharded already, and exact: no sample is repeated or dropped
 }
-"""What the trainer is given unless the options say otherwise."""
+"""Arguments of the trainer unless the options say otherwise."""
 CALLBACKS: Mapping[str, tuple[str, dict[str, str]]] = {
     "progress": ("callbacks.Progress", {}),
     "best": ("callbacks.BestCheckpoint", {"folder": "checkpoints"}),
-    "last": ("callbacks.LastCheckpoint", {"folder": "checkpoints"}),  # knows the best of the epoch that it closes
+    "last": ("callbacks.LastCheckpoint", {"folder": "checkpoints"}),  # knows the best of the epoch it closes
     "stop": ("stopping.GracefulStop", {"folder": "checkpoints"}),
     "processes": ("stopping.ProcessWatch", {"folder": "", "checkpoints": "checkpoints"}),
     "non_finite": ("nonfinite.NonFinite", {"folder": "nonfinite"}),
@@ -61,12 +61,12 @@ CALLBACKS: Mapping[str, tuple[str, dict[str, str]]] = {
     "threads": ("pace.Threads", {}),
     "pictures": ("callbacks.PicturePanel", {"folder": "pictures"}),
 }
-"""The usual callbacks by name, with the folders that they are given, below the run's own."""
+"""The default callbacks by name, with their folders inside the run's folder."""
 LOGGERS = {"csv": "CSVLogger", "tensorboard": "TensorBoardLogger"}
 POINTS = 20
-"""A short training logs at least this many rows of its curves, unless it was told how often to log."""
+"""A short training logs at least this many rows of its curves, unless told how often to log."""
 DRAWN_FROM = 10
-"""Steps of a training from which its curves are worth a picture."""
+"""A training's curves are drawn from this many steps on."""
 _TRUSTED = ("lightning.", "torch.", "saunet.")
 """Packages that nested nodes of callbacks, loggers and the trainer may name."""
 
@@ -74,7 +74,7 @@ _TRUSTED = ("lightning.", "torch.", "saunet.")
 @checked
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """A training: its parts, and where it goes.
+    """Options of a training: its parts, and where results are saved.
 
     Args:
         data: Data module.
@@ -83,19 +83,20 @@ class TrainOptions:
         output_dir: The run's folder.
         optim: Optimizer and schedule.
         speed: Speed switches.
-        trainer: Arguments of `lightning.Trainer`; for those left out see `TRAINER`.
-        callbacks: By name: a callback, a mapping with ``_target_`` and its parameters, or None; the usual ones if None.
-        logger: The same for loggers; CSV and TensorBoard if None.
-        seed: Decides order, augmentation and fresh weights.
-        name: Of the run.
-        monitor: What chooses ``best.ckpt``.
-        protocol: Of the validation; the data's own if None.
-        resume: Checkpoint of this training to continue from; ``auto`` for the folder's ``last.ckpt``, if there is one.
-        init_from: Checkpoint whose weights a new training starts from, of saunet or of another system.
+        trainer: Arguments of `lightning.Trainer`; `TRAINER` has the defaults of the others.
+        callbacks: Name -> a callback, a mapping with ``_target_`` and its parameters, or None; the default ones if
+            None.
+        logger: Name -> a logger, in the same form; CSV and TensorBoard if None.
+        seed: Seed of data order, augmentation and fresh weights.
+        name: The run's name.
+        monitor: The metric that chooses ``best.ckpt``.
+        protocol: Protocol of the validation; the data's own if None.
+        resume: Checkpoint of this training to resume from; ``auto`` is the folder's ``last.ckpt``, if there is one.
+        init_from: Checkpoint, from saunet or another system, whose weights a new training starts from.
         overwrite: Replace the checkpoints that an earlier run left in the folder.
 
     Raises:
-        ConfigError: for values with which no training can run.
+        ConfigError: for values that no training can run with.
 
     Examples:
         >>> parts = {"encoder": "resnet18", "decoder": "unet", "pose": "posecnn"}
@@ -140,7 +141,7 @@ class TrainOptions:
             )
 
     def _check_trainer(self, trainer: Mapping[str, Any]) -> None:
-        """Check what Lightning's trainer takes in silence and stumbles over later."""
+        """Check settings that Lightning's trainer accepts silently and fails on later."""
         known = list(inspect.signature(Trainer).parameters)
         for key in trainer:
             if not key.startswith("_") and key not in known:
@@ -154,18 +155,19 @@ class TrainOptions:
         one_of("trainer.precision", precision, PRECISIONS)
         if trainer.get("overfit_batches"):
             raise ConfigError(
-                f"trainer.overfit_batches is {trainer['overfit_batches']}, which loses the position in the data order "
-                "that a training keeps; use trainer.limit_train_batches with few frames instead"
+                f"trainer.overfit_batches is {trainer['overfit_batches']}, which would lose the training's position "
+                "in the data order; use trainer.limit_train_batches with few frames instead"
             )
         if self.optim.fused and not precision.startswith("32") and trainer.get("gradient_clip_val"):
             raise ConfigError(
-                f"optim.fused=true, trainer.precision={precision} and trainer.gradient_clip_val do not go together: "
+                f"optim.fused=true, trainer.precision={precision} and trainer.gradient_clip_val cannot be combined: "
                 "gradients would be clipped before the fused optimizer unscales them; set optim.fused=false, or "
                 "leave one of the others out"
             )
         if trainer.get("max_epochs") == -1 and trainer.get("max_steps", -1) == -1:
             raise ConfigError(
-                "trainer.max_epochs is -1: a training without end has no schedule; set it, or trainer.max_steps"
+                "trainer.max_epochs is -1, but an endless training has no learning-rate schedule; set it, or "
+                "trainer.max_steps"
             )
         if trainer.get("enable_progress_bar") is False and (self.callbacks is None or self.callbacks.get("progress")):
             raise ConfigError(
@@ -190,13 +192,13 @@ class TrainOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainResult:
-    """Where a training's results are, and what made them."""
+    """The results of a training, with its data and model."""
 
     folder: Path
     best: Path | None
     """The best checkpoint."""
     cost: float | None
-    """The best monitored value as what a search minimizes: its negative where more is better."""
+    """The best monitored value as a cost for searches: negated if larger is better."""
     data: DepthDataModule
     model: SelfSupervisedDepth
 
@@ -208,13 +210,13 @@ def train(
     overrides: Sequence[str] = (),
     describe: Describe = lambda error: None,
 ) -> TrainResult:
-    """Train a depth network on driving video; ``run.json`` in the run's folder says how that went.
+    """Train a depth network on driving video; ``run.json`` in the run's folder records how it went.
 
     Args:
         options: The training.
-        choices: What was chosen for each part by name, such as ``{"data": "kitti"}``, for the record.
-        overrides: What the command line said, for the record.
-        describe: Says in one sentence what went wrong, or None for a defect of the program.
+        choices: The choice for each part by name, such as ``{"data": "kitti"}``, for the record.
+        overrides: The overrides of the command line, for the record.
+        describe: Turns an error into one sentence, or None for a bug.
 
     Raises:
         SaunetError: if the options do not fit together, or the data or checkpoints cannot be used. Nothing is written.
@@ -231,8 +233,8 @@ def train(
         check_unused(folder)
     resume = resume_path(options.resume, folder)
     if resume and options.init_from:  # of an experiment, perhaps
-        rank_zero_info(f"init_from={options.init_from} is not used: a training that continues has its own weights")
-    checkpoint = read_checkpoint(resume) if resume else None  # before the data are set up, which takes its time
+        rank_zero_info(f"init_from={options.init_from} is not used: a resumed training has its own weights")
+    checkpoint = read_checkpoint(resume) if resume else None  # before the data are set up, which takes time
     seed_everything(options.seed, workers=True, verbose=False)
     learned = options.model.intrinsics == "learned"
     data = (options.data.fitted(guess_camera=True) if learned else options.data).build()
@@ -272,12 +274,12 @@ def train(
             if resume or started:
                 say(f"resuming from {resume}" if resume else str(started))
             if due and 0 <= trainer.max_steps <= steps:
-                say("the validation after the last step was cut short; saunet evaluate makes up for it")
+                say("the validation after the last step was cut short; run saunet evaluate to make up for it")
             try:
                 trainer.fit(model, datamodule=data, ckpt_path=resume, weights_only=True)
             except RuntimeError as error:
                 if trainer.world_size > 1 and re.search(r"Connection|NCCL|Gloo|gloo|store", str(error)):
-                    lost = "the connection to another process of this run broke, most likely because it died"
+                    lost = "the connection to another process of this run was lost, most likely because it died"
                     raise SaunetError(f"{lost}; {way_on(folder / 'checkpoints')}") from error
                 raise
             except SystemExit as stop:
@@ -290,7 +292,7 @@ def train(
                 rank_zero_info(model.intrinsics.told(found))
     if resume and trainer.global_step == steps:
         more = "trainer.max_steps=N" if 0 <= trainer.max_steps <= steps else "epochs=N"
-        say(f"nothing was left to train: it was complete after step {steps}; {more} continues to a later end")
+        say(f"nothing was left to train: it was complete after step {steps}; {more} trains longer")
     elif told := _ended_early(trainer):
         rank_zero_info(told)
     if trainer.is_global_zero:
@@ -304,7 +306,7 @@ def train(
 
 
 def _ended_early(trainer: Trainer) -> str:
-    """Return which setting ended a training before its ``max_steps``; empty if none did."""
+    """Return a sentence about the setting that ended a training before its ``max_steps``; empty if none did."""
     if trainer.global_step >= trainer.max_steps or not 0 < (trainer.max_epochs or 0) <= trainer.current_epoch:
         return ""
     short = trainer.limit_train_batches not in (None, 1.0)
@@ -314,26 +316,26 @@ def _ended_early(trainer: Trainer) -> str:
 
 
 def _draw(folder: Path) -> None:
-    """Draw how the training went; what prevents it is said, for the training itself has ended well."""
+    """Draw the curves of the training; a failure is only reported, because the training itself has succeeded."""
     from saunet.reporting.run import write_results
 
     try:
         write_results(folder)
     except SaunetError as reason:
-        say(f"no picture of the results: {reason}")
+        say(f"no results.png was drawn: {reason}")
 
 
 def assemble(options: TrainOptions, data: DepthDataModule, pretrained: bool = True) -> SelfSupervisedDepth:
-    """Build networks, objective, recipe and metrics: the one place where all parts meet.
+    """Build networks, objective, recipe and metrics into the module to train.
 
-    With ``pretrained`` they start from the public weights that the model names; a resumed training has its own.
+    With ``pretrained`` they start from the public weights that the model names; a resumed training has its own weights.
     """
     pose = _pose(options.model.pose, data)
     objective = options.objective.build()
     if data.track_motion and pose is not None and "tracked_motion" not in getattr(objective, "terms", {}):
         raise ConfigError(
-            "data.track_motion is true, so the pose network learns from tracked points alone, and the objective has no "
-            "such term; add +objective.extra.tracked_motion.weight=1"
+            "data.track_motion is true, so the pose network learns from tracked points alone, but the objective has "
+            "no term for them; add +objective.extra.tracked_motion.weight=1"
         )
     measured = ["val/loss", *(f"val/{name}" for name in (*ERROR_NAMES, *getattr(objective, "terms", {}))), "train/loss"]
     one_of("monitor", options.monitor, measured)
@@ -359,7 +361,7 @@ def assemble(options: TrainOptions, data: DepthDataModule, pretrained: bool = Tr
     rules = protocol(options.protocol or data.protocol)
     if not rules.accepts(data.ground_truth):
         raise ConfigError(
-            f"protocol '{rules.name}' is defined on '{rules.ground_truth}' ground truth and the data give "
+            f"protocol '{rules.name}' is defined on '{rules.ground_truth}' ground truth but the data give "
             f"'{data.ground_truth}'; leave protocol unset, or choose the matching ground truth"
         )
     recipe, metrics, seed, plain = options.optim, DepthMetrics(rules), options.seed, record.to_plain()
@@ -369,7 +371,7 @@ def assemble(options: TrainOptions, data: DepthDataModule, pretrained: bool = Tr
 
 
 def _pose(pose: Spec | None, data: DepthDataModule) -> Spec | None:
-    """Return the pose network for what there is to synthesize the target from."""
+    """Return the pose network that fits the data's source images."""
     if not data.offsets and not data.stereo:
         raise ConfigError(
             "data.offsets is empty and data.stereo is false, so there is no source image to learn from; "
@@ -379,14 +381,15 @@ def _pose(pose: Spec | None, data: DepthDataModule) -> Spec | None:
         return None
     if pose is None:
         raise ConfigError(
-            f"model.pose is null but the data give neighbors in time at {list(data.offsets)}, whose motion has to be "
-            "learned; choose a model/pose, or learn from a stereo pair alone with data.stereo=true data.offsets=[]"
+            f"model.pose is null but the data give neighbors in time at {list(data.offsets)}, and their motion must "
+            "be learned; choose a model/pose, or learn from a stereo pair alone with data.stereo=true "
+            "data.offsets=[]"
         )
     offsets = pose.get("offsets", data.offsets)
     if list(offsets) != list(data.offsets):
         raise ConfigError(
-            f"model.pose.offsets is {list(offsets)} but the data give frames at {list(data.offsets)}; "
-            "set data.offsets only, the pose network follows"
+            f"model.pose.offsets is {list(offsets)} but the data give frames at {list(data.offsets)}; set "
+            "data.offsets only; the pose network follows"
         )
     return pose.changed(offsets=list(data.offsets))
 
@@ -451,12 +454,12 @@ def _part(key: str, node: Any, kind: type) -> Any:
     except (ImportError, AttributeError, ValueError) as reason:
         raise ConfigError(f"{key} asks for '{path}', which cannot be imported: {reason}") from reason
     if kind is not object and not (inspect.isclass(target) and issubclass(target, kind)):
-        raise ConfigError(f"{key} asks for '{path}', which is no {kind.__name__}")
+        raise ConfigError(f"{key} asks for '{path}', which is not a {kind.__name__}")
     values = {each: _part(f"{key}.{each}", value, object) for each, value in node.items() if each[:1] != "_"}
     try:
         return target(**values)
     except ModuleNotFoundError as reason:
-        what = key.replace(".", "=", 1)  # as the command line chose it
+        what = key.replace(".", "=", 1)  # the choice of the command line
         raise ConfigError(
             f"{what} needs a package that is not installed; run `pip install 'saunet[track]'`"
         ) from reason
