@@ -71,9 +71,9 @@ def test_intrinsics_that_cannot_be_right_are_refused(tmp_path):
     [
         ("0 0 0 0 0 0 0 0 0 0 0 0", r"P_rect_02 has K .*; expected \[\[fx, skew, cx\]"),
         ("-50 0 30 3 0 50 10 0 0 0 1 0", "the lengths must be positive"),
-        ("1e-3 0 30 3 0 50 10 0 0 0 1 0", "a focal length is some 0.3 to 3 image widths"),
+        ("1e-3 0 30 3 0 50 10 0 0 0 1 0", "a focal length is about 0.3 to 3 image widths"),
         ("100 0 60 3 0 100 20 0 0 0 1 0", "the center must lie inside"),  # of images twice as large
-        ("25 0 15 3 0 25 5 0 0 0 1 0", "near a corner it is that of images of another size"),  # half as large
+        ("25 0 15 3 0 25 5 0 0 0 1 0", "a center near a corner belongs to images of another size"),  # half as large
     ],
 )
 def test_a_k_that_cannot_belong_to_the_images_is_refused_before_it_is_solved(tmp_path, numbers, message):

@@ -75,8 +75,11 @@ def test_an_unknown_camera_is_guessed_where_that_is_allowed(tmp_path):
         ("image_size: [640, 480]\nK: [500, 500, 700, 240]\n", "the center must lie inside"),
         ("image_size: [640, 480]\nK: [0.8, 1.0, 0.5, 0.5]\n", "or normalized \\(then set normalized: true\\)"),
         ("image_size: [621, 187]\nK: [721, 721, 609, 173]\n", "the center must lie inside, not near the left or"),
-        ("image_size: [1242, 374]\nK: [180, 180, 152, 43]\n", "a focal length is some 0.3 to 3 image widths"),
-        ("image_size: [1242, 374]\nK: [360, 360, 304, 86]\n", "near a corner it is that of images of another size"),
+        ("image_size: [1242, 374]\nK: [180, 180, 152, 43]\n", "a focal length is about 0.3 to 3 image widths"),
+        (
+            "image_size: [1242, 374]\nK: [360, 360, 304, 86]\n",
+            "a center near a corner belongs to images of another size",
+        ),
         ("image_size: [640, 480]\nK: [500, 1" + "0" * 400 + ", 320, 240]\n", "an integer of 401 digits"),
         ("image_size: [640, 480]\nK: [500, 1" + "0" * 5000 + ", 320, 240]\n", "camera.yaml cannot be read as YAML"),
         ("normalized: true\nK: [500, 500, 320, 240]\n", "normalized K has fx 500 and center 320, 240"),

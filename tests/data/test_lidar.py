@@ -79,7 +79,7 @@ def test_unknown_kind_is_refused():
 
 def test_broken_scans_are_named(tmp_path):
     (tmp_path / "a.bin").write_bytes(b"x" * 20)
-    with pytest.raises(DataError, match=r"a.bin has 20 bytes, not a multiple of the 16"):
+    with pytest.raises(DataError, match=r"a.bin has 20 bytes, not a multiple of 16"):
         read_scan(tmp_path / "a.bin")
     (tmp_path / "b.bin").touch()
     with pytest.raises(DataError, match=r"b.bin is empty"):

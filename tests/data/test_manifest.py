@@ -38,7 +38,7 @@ def test_what_is_written_is_read_and_applied(tmp_path, monkeypatch):
     other = NumberDrive("c", range(3))
     assert list(manifest.apply(Selection(other, range(3)), (-1, 1)).frames) == [0, 1, 2]
     monkeypatch.setattr(Numbered, "numbering", "fps=5")
-    with pytest.raises(DataError, match=r"m.json was made for 'a' with fps=10 and it is now read with fps=5"):
+    with pytest.raises(DataError, match=r"m.json was made for 'a' with fps=10 and is now read with fps=5"):
         manifest.apply(Selection(drive, range(10)), (-1, 1))
 
 
@@ -85,7 +85,7 @@ def test_a_manifest_of_other_recordings_is_refused_and_of_some_warned_of(tmp_pat
         data = module(tmp_path / "raw", manifest=str(tmp_path / "m.json"), val_drives=[name(2).partition("/")[2]])
         data.setup(stage)
 
-    with pytest.raises(DataError, match=r"m.json names 2 recordings and none of them is trained on \(such as 'a'"):
+    with pytest.raises(DataError, match=r"m.json names 2 recordings, none of them in the training data \(such as 'a'"):
         setup(["b", "a"])
     with pytest.warns(UserWarning, match=r"names 2 recordings, and 1 of them are not trained on \(such as 'b'; here"):
         setup(["b", f"{name(1)} l"])
@@ -105,11 +105,13 @@ def test_a_mixture_checks_its_own_manifest_and_those_of_its_sources(tmp_path):
     inside.setup("fit")
     assert "1 static (manifest)" in inside.summary("train")
     outside = datamodules.build("mixed", sources={"town": module(tmp_path / "raw")}, **own, **size)
-    with pytest.raises(DataError, match=r"none of them is trained on .* here they are called 'town/"):
+    with pytest.raises(DataError, match=r"none of them in the training data .* here they are called 'town/"):
         outside.setup("fit")
     strange = {"format": 1, "leave_out": {"town/x": {"static": [3]}}}
     (tmp_path / "m.json").write_text(json.dumps(strange))
-    with pytest.raises(DataError, match=r"none of them is trained on \(such as 'town/x'; here they are called '2011"):
+    with pytest.raises(
+        DataError, match=r"none of them in the training data \(such as 'town/x'; here they are called '2011"
+    ):
         datamodules.build("mixed", sources={"town": module(tmp_path / "raw", **own)}, **size).setup("fit")
 
 

@@ -107,12 +107,12 @@ def test_what_does_not_go_together_is_refused(tmp_path):
 )
 def test_what_a_source_is_told_and_the_mixture_decides_is_refused(tmp_path, key, value, ours):
     town = datamodules.build("kitti", root=str(tmp_path), split="all", **{key: value})
-    told = rf"data.sources.x.{key} is .* and the mixture's is {ours}; set data.{key} only, which holds for all sources"
+    told = rf"data.sources.x.{key} is .* but the mixture's is {ours}; set only data.{key}, which applies to all sources"
     with pytest.raises(ConfigError, match=told):
         datamodules.build("mixed", sources={"x": town}, **SIZE)
     assert datamodules.build("mixed", sources={"x": town}, **{**SIZE, key: value})
     pair = datamodules.build("kitti", root=str(tmp_path), split="all", stereo=True)
-    with pytest.raises(ConfigError, match=r"data.sources.x.stereo is True and the mixture's is False; leave it out"):
+    with pytest.raises(ConfigError, match=r"data.sources.x.stereo is True but the mixture's is False; leave it out"):
         datamodules.build("mixed", sources={"x": pair}, **SIZE)
 
 

@@ -61,7 +61,7 @@ def test_evaluation_sees_each_sample_once_in_equally_many_batches(count, world_s
 
 
 def test_a_batch_that_the_devices_do_not_divide_is_refused():
-    with pytest.raises(ConfigError, match=r"batch_size is 10; it is the sum over all 4 devices .* such as 8"):
+    with pytest.raises(ConfigError, match=r"batch_size is 10; it is the total over all 4 devices .* such as 8"):
         TrainBatches(Numbers(range(99)), 10, 0, 0, 4)
 
 

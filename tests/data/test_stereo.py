@@ -159,7 +159,7 @@ def test_frames_without_a_stereo_view_are_left_out_and_counted(kitti_root: Path,
 
 def test_one_camera_alone_has_no_stereo_view() -> None:
     drive = NumberDrive()
-    with pytest.raises(DataError, match=r"'day/drive l' is a recording of one camera.*set data.stereo=false"):
+    with pytest.raises(DataError, match=r"'day/drive l' comes from one camera.*set data.stereo=false"):
         other_view(drive)
     assert math.isnan(measured_distance(NumberDrive(truth=False), 0, 1))
 

@@ -208,15 +208,18 @@ def test_clips_are_held_out_and_tested_by_name_and_condition(tmp_path):
     assert len(names(data, "predict")) == 6
     assert [drive.condition for drive in data.drives()] == [None, None, None, "night"]
     assert data.overlap() is None
-    assert "validation and test are the same 6 frames" in module(tmp_path / "r", val_clips=["day/0"]).overlap()
+    assert (
+        "validation, which chooses best.ckpt, and test are the same 6 frames"
+        in module(tmp_path / "r", val_clips=["day/0"]).overlap()
+    )
     share = module(tmp_path / "r", val_share=0.3).overlap()
     for words in (
         "validation share 'day/0', 'day/1'",
-        "validation and test are the same",
+        "validation, which chooses best.ckpt, and test are the same",
         "data.val_clips=[NAME] and data",
     ):
         assert words in share
-    with pytest.raises(ConfigError, match=r"val_clips and test_clips both name night; name each in one of them"):
+    with pytest.raises(ConfigError, match=r"val_clips and test_clips both name night; name each in only one of them"):
         module(tmp_path / "r", val_clips=["day/0", "night"], test_clips=["n*"]).setup("fit")
     with pytest.raises(ConfigError, match=r"hold out all clips \(day/0, .*leave one to train on"):
         module(tmp_path / "r", val_clips=["day/*"], test_clips=["n*"]).setup("fit")
@@ -224,7 +227,7 @@ def test_clips_are_held_out_and_tested_by_name_and_condition(tmp_path):
     assert [drive.name for drive in only.drives()] == ["night"]
     with pytest.raises(ConfigError, match=r"conditions is 'nihgt'; did you mean 'night'"):
         module(tmp_path / "r", conditions=["nihgt"]).drives()
-    with pytest.raises(ConfigError, match=r"val_clips names 'x', which fits no clip; clips: day/0, day/1"):
+    with pytest.raises(ConfigError, match=r"val_clips names 'x', which matches no clip; clips: day/0, day/1"):
         module(tmp_path / "r", val_clips=["x"]).setup("fit")
 
 

@@ -72,7 +72,7 @@ def test_a_drive_without_truth_gives_an_empty_target_depth_and_no_depth():
 
 
 def test_a_missing_pose_is_named():
-    with pytest.raises(DataError, match=r"'day/drive l' has no pose at frame 1"):
+    with pytest.raises(DataError, match=r"'day/drive l' has no pose for frame 1"):
         dataset([NumberDrive(truth=False)], with_pose=True)[0]
 
 

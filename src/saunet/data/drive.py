@@ -1,4 +1,4 @@
-"""What the library may ask of a recording: the one contract between data sets and everything that reads them."""
+"""What a recording provides: the interface between data sets and everything that reads them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 GAP = 1.5
-"""Steps of time over this many median ones are gaps."""
+"""A time step longer than this many median steps is a gap."""
 
 
 @dataclass(frozen=True, slots=True)
 class LensModel:
-    """The lens of a recorded picture that is undistorted as it is read (see docs/cameras.md)."""
+    """The lens of recorded pictures that are undistorted as they are read (see docs/cameras.md)."""
 
     model: str
     """Such as ``pinhole`` or ``fisheye``."""
@@ -30,7 +30,7 @@ class LensModel:
 
 
 class Drive(ABC):
-    """One continuous recording of one camera: what every data set is reduced to before training sees it.
+    """One continuous recording of one camera; every data set is presented to training as a list of these.
 
     Subclass it and implement `name`, `indices`, `image` and `intrinsics`. Everything else has a default that says
     "unknown" (None, False, an empty string); override what the data set knows. Frames are addressed by their index in
@@ -49,14 +49,14 @@ class Drive(ABC):
         for attribute in ("protocol", "ground_truth"):
             if attribute in vars(cls):
                 raise TypeError(
-                    f"{cls.__name__} has the attribute '{attribute}', which nothing reads in a Drive: how a data set "
-                    "is evaluated is an attribute of its DepthDataModule; move it there"
+                    f"{cls.__name__} has the attribute '{attribute}', which is ignored in a Drive: evaluation "
+                    "settings are attributes of the DepthDataModule; move it there"
                 )
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """Readable and unique in the data set, such as ``2011_09_26/2011_09_26_drive_0001_sync l``."""
+        """Readable name, unique in the data set, such as ``2011_09_26/2011_09_26_drive_0001_sync l``."""
 
     @property
     @abstractmethod
@@ -72,7 +72,7 @@ class Drive(ABC):
         """Return K, 3 x 3, in pixels of `image` (integer coordinates are pixel centers)."""
 
     def has_depth(self, index: int) -> bool:
-        """Return whether `depth` gives a map; override it where that is known without reading one."""
+        """Return whether `depth` gives a map; override it if that is known without reading one."""
         return self.depth(index) is not None
 
     def depth(self, index: int) -> NDArray[np.float32] | None:
@@ -80,7 +80,7 @@ class Drive(ABC):
         return None
 
     def depth_key(self, index: int) -> str | None:
-        """Return a hash of all that `depth` is computed from, so that it can be cached; None if it is just read."""
+        """Return a hash of everything `depth` is computed from, to cache it; None if it is just read."""
         return None
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
@@ -93,13 +93,13 @@ class Drive(ABC):
 
     @property
     def timestamps(self) -> NDArray[np.float64] | None:
-        """`time` of each of `indices`, NaN where it is unknown; None if no time is known."""
+        """`time` of each of `indices`, NaN if unknown; None if no time is known."""
         times = np.array([self.time(index) for index in self.indices], dtype=np.float64)
         return None if np.isnan(times).all() else times
 
     @property
     def fps(self) -> float | None:
-        """Frames per second as recorded; by default that of the median step of `timestamps`; None if unknown."""
+        """Frames per second as recorded, by default from the median step of `timestamps`; None if unknown."""
         times, numbers = self.timestamps, [self.recorded(index) for index in self.indices]
         if times is None or len(times) < 2:
             return None
@@ -108,9 +108,9 @@ class Drive(ABC):
 
     @property
     def gaps(self) -> frozenset[int]:
-        """Indices of frames after which time is missing, so that no window may bridge it.
+        """Indices of frames followed by a gap in time, which no window may bridge.
 
-        By default those followed by a step of `timestamps` over `GAP` times the median one.
+        By default those followed by a step of `timestamps` longer than `GAP` times the median step.
         """
         times = self.timestamps
         if times is None or len(times) < 3:
@@ -120,7 +120,7 @@ class Drive(ABC):
 
     @property
     def duplicates(self) -> Sequence[float]:
-        """Times of recorded frames that repeat the picture before them and got no index; empty if there are none."""
+        """Times of recorded frames that repeat the previous picture and have no index; empty if there are none."""
         return ()
 
     def speed(self, index: int) -> float | None:
@@ -128,15 +128,15 @@ class Drive(ABC):
         return None
 
     def distance(self, first: int, second: int) -> float | None:
-        """Return the meters traveled between two frames, at least 0; None if unknown.
+        """Return the distance traveled between two frames in meters, at least 0; None if unknown.
 
-        By default the straight line between their poses; without poses, the speed summed over the time of the frames
-        between.
+        By default the straight line between their poses; without poses, speed integrated over the time between the
+        frames.
         """
         T_world_first, T_world_second = self.pose(first), self.pose(second)
         if T_world_first is not None and T_world_second is not None:
             return float(np.linalg.norm(T_world_second[:3, 3] - T_world_first[:3, 3]))
-        if self.speed(first) is None:  # before every index is listed, which may read a folder
+        if self.speed(first) is None:  # before listing every index, which may read a folder
             return None
         between = [index for index in self.indices if min(first, second) <= index <= max(first, second)]
         known = [(self.time(index), self.speed(index)) for index in between]
@@ -147,7 +147,7 @@ class Drive(ABC):
         return float((np.diff(times) * np.abs(speeds[1:] + speeds[:-1]) / 2).sum())
 
     def stereo(self) -> Drive | None:
-        """Return the recording of the other camera of a rectified pair, which shares K and indices; None without one.
+        """Return the recording of a rectified pair's other camera, with the same K and indices; None if there is none.
 
         Raises:
             DataError: if there is a second camera, but its files are missing or broken.
@@ -165,7 +165,7 @@ class Drive(ABC):
 
     @property
     def folder(self) -> Path | None:
-        """Folder of the recording, beside which depth maps may be stored; None if it has none."""
+        """Folder of the recording; depth maps may be stored beside it. None if it has none."""
         return None
 
     @property
@@ -174,12 +174,12 @@ class Drive(ABC):
         return None
 
     def recorded(self, index: int) -> int:
-        """Return the number of a frame in the file it comes from, from 0, where `indices` count only chosen frames."""
+        """Return a frame's number in its original file, from 0; it differs if `indices` count only chosen frames."""
         return index
 
     @property
     def numbering(self) -> str:
-        """Settings that decide which frame an index stands for; empty if none do."""
+        """Settings that decide which frame an index means; empty if none do."""
         return ""
 
     @property
@@ -189,7 +189,7 @@ class Drive(ABC):
 
     @property
     def lens(self) -> LensModel | None:
-        """The lens that `recorded_image` shows and `image` does not; None if images are as recorded."""
+        """The lens that `recorded_image` shows and `image` corrects; None if images are as recorded."""
         return None
 
     def recorded_image(self, index: int) -> NDArray[np.uint8]:
@@ -198,17 +198,17 @@ class Drive(ABC):
 
     @property
     def scene_mask(self) -> NDArray[np.bool_] | None:
-        """Where frames show the scene and not the own vehicle, h x w; None if everywhere."""
+        """True where frames show the scene, not the recording vehicle, h x w; None if everywhere."""
         return None
 
     @property
     def has_scene_mask(self) -> bool:
-        """Whether `scene_mask` gives one; override it where that is known without reading one."""
+        """Whether `scene_mask` gives one; override it if that is known without reading one."""
         return self.scene_mask is not None
 
     @property
     def origin(self) -> str:
-        """Whatever beside the image files decides the pixels of a frame (camera, crop), as text; empty if nothing."""
+        """Whatever besides the image files decides a frame's pixels (camera, crop), as text; empty if nothing does."""
         return ""
 
     @property
@@ -218,12 +218,12 @@ class Drive(ABC):
 
     @property
     def condition(self) -> str | None:
-        """Weather or light, such as ``night``, by which results are grouped; None if unknown."""
+        """Weather or light, such as ``night``, to group results by; None if unknown."""
         return None
 
 
 class DriveProxy(Drive):
-    """A recording that passes every question on to another; a subclass overrides what differs."""
+    """A recording that delegates everything to another; a subclass overrides what differs."""
 
     def __init__(self, drive: Drive) -> None:
         self._drive = drive
@@ -254,6 +254,6 @@ def _passed_on(name: str, member: Any) -> Any:
     return ask
 
 
-for _name, _member in vars(Drive).items():  # the rest of the contract, so that no member can be forgotten
+for _name, _member in vars(Drive).items():  # the rest of the interface, so that no member is forgotten
     if not _name.startswith("_") and _name not in vars(DriveProxy):
         setattr(DriveProxy, _name, _passed_on(_name, _member))

@@ -1,4 +1,4 @@
-"""Points of a laser scanner and depth maps from them, whatever the data set."""
+"""Points of a laser scanner and depth maps from them, for any data set."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from saunet.io.images import read_bytes
 
 
 def read_scan(path: Path, columns: int = 4) -> Float32[ndarray, "n 3"]:
-    """Return the x, y, z of a scan's points, meters, from a file of so many 32-bit numbers for each."""
+    """Return the x, y, z of a scan's points, meters, from a file with ``columns`` 32-bit numbers per point."""
     data = read_bytes(path)
     if data.size % (4 * columns):
         raise DataError(
-            f"{path} has {data.size} bytes, not a multiple of the {4 * columns} bytes of a point; copy the file again"
+            f"{path} has {data.size} bytes, not a multiple of {4 * columns}, the bytes per point; copy the file again"
         )
     points: Float32[ndarray, "n 3"] = data.view(np.float32).reshape(-1, columns)[:, :3]
     known = np.isfinite(points).all(axis=1)
@@ -37,7 +37,7 @@ def points_to_depth(
     K: Float[ndarray, "3 3"],
     size: tuple[int, int],
 ) -> Float32[ndarray, "h w"]:
-    """Project points in front of a camera; where several share a pixel the nearest stays.
+    """Project points in front of a camera; the nearest of several in a pixel wins.
 
     Args:
         points: In the camera's frame (x right, y down, z forward), meters.
@@ -56,6 +56,6 @@ def points_to_depth(
 def scatter(
     rows: Float[ndarray, " n"], columns: Float[ndarray, " n"], values: Float[ndarray, " n"], size: tuple[int, int]
 ) -> Float32[ndarray, "h w"]:
-    """Put values at whole pixels of a map of zeros, without those outside; the smallest of a pixel stays."""
+    """Put values at whole pixels of a map of zeros, dropping those outside; the smallest in a pixel wins."""
     inside = (columns >= 0) & (columns < size[1]) & (rows >= 0) & (rows < size[0])
     return nearest_map(rows[inside].astype(np.int64), columns[inside].astype(np.int64), values[inside], size)

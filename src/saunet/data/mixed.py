@@ -1,4 +1,4 @@
-"""Several data sets as one: trained on together, evaluated together and each by itself."""
+"""Several data sets as one: trained on together, evaluated together and separately."""
 
 from __future__ import annotations
 
@@ -19,26 +19,27 @@ from saunet.registry import datamodules
 
 SHARED: tuple[str, ...] = ("height", "width", "offsets", "batch_size", "workers", "crop_margin", "seed")
 SHARED += ("target_depth", "with_pose", "stereo", "on_error", "guess_camera")
-"""Settings that belong to the mixture; its sources take them over."""
+"""Settings that belong to the mixture and apply to all sources."""
 
 
 @datamodules.register("mixed")
 class MixedDataModule(DepthDataModule):
-    """Several named data sets as one, such as KITTI and your own clips; all images get one size, each keeps its own K.
+    """Several named data sets as one, such as KITTI and your own clips; images get one size, and each keeps its own K.
 
     On the command line: ``data=mixed +data@data.sources.town=kitti +data@data.sources.clips=video`` and then
-    ``data.sources.town.root=...``. What every data set has (size, offsets, batch, augmentation) is set for the mixture.
-    With ``with_speed`` of one source alone, its batches carry the way traveled and those of others say it is unknown.
+    ``data.sources.town.root=...``. Settings that every data set has (size, offsets, batch, augmentation) are set for
+    the mixture. If only one source has ``with_speed``, its samples have the distance traveled, and those of others mark
+    it unknown.
 
     Args:
-        sources: Name -> data module; names start the names of samples.
+        sources: Name -> data module; sample names begin with these names.
         train: Names of the sources to train and validate on; all if empty.
         test: Names of the sources to test and predict; all if empty.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
-        ConfigError: if there is no source, a name is unknown, a source contradicts the mixture, or their ground truths
-            are of different kinds.
+        ConfigError: if there is no source, a name is unknown, a source contradicts the mixture, or their ground truth
+            is of different kinds.
     """
 
     cacheable = False
@@ -76,7 +77,7 @@ class MixedDataModule(DepthDataModule):
 
     @property
     def camera_height(self) -> float | None:
-        """Meters from the road to the camera, where all sources in use agree; else None."""
+        """Meters from the road to the camera if all sources in use agree, else None."""
         names = {*self._names["train"], *self._names["test"]}
         heights = {self.sources[name].camera_height for name in names}
         return heights.pop() if len(heights) == 1 else None
@@ -93,7 +94,7 @@ class MixedDataModule(DepthDataModule):
             source.prepare_data()
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return the frames of all sources that serve a split; a drive's name starts with its source's."""
+        """Return the frames of all sources of a split; a drive's name begins with its source's."""
         selections = []
         for name in self._names["train" if split in ("train", "val") else "test"]:
             source = self.sources[name]
@@ -116,11 +117,11 @@ class MixedDataModule(DepthDataModule):
             self.sources[name]._check_manifests(own)
 
     def _fitted(self, name: str, source: DepthDataModule) -> DepthDataModule:
-        """Give a source the mixture's settings; refuse those it was given that contradict."""
+        """Apply the mixture's settings to a source; refuse contradicting ones."""
         if source.maps or source.copies:
             raise ConfigError(
-                f"data.sources.{name} reads stored maps or a cache of small images, which a mixture does not; "
-                "leave dense, teacher and cache out"
+                f"data.sources.{name} reads stored maps or a cache of small images, which a mixture does not "
+                "support; leave dense, teacher and cache out"
             )
         parameters = schema.parameters(type(source))
         presets = [entry.preset for entry in datamodules if entry.target is type(source)]
@@ -131,8 +132,8 @@ class MixedDataModule(DepthDataModule):
             defaults = [tuple(each) if isinstance(each, list) else each for each in defaults]
             if key in parameters and given not in (ours, *defaults):
                 has = key in schema.parameters(type(self))
-                advice = f"set data.{key} only, which holds for all sources" if has else "leave it out"
-                raise ConfigError(f"data.sources.{name}.{key} is {given} and the mixture's is {ours}; {advice}")
+                advice = f"set only data.{key}, which applies to all sources" if has else "leave it out"
+                raise ConfigError(f"data.sources.{name}.{key} is {given} but the mixture's is {ours}; {advice}")
         for key in SHARED:
             setattr(source, key, getattr(self, key))
         return source
@@ -151,7 +152,7 @@ class _Named(DriveProxy):
 
 
 def _distance(with_speed: frozenset[str], drive: Drive, first: int, second: int) -> float:
-    """Return the meters traveled where the drive's source was asked for them, else NaN."""
+    """Return the meters traveled if the drive's source has ``with_speed``, else NaN."""
     return measured_distance(drive, first, second) if drive.name.partition("/")[0] in with_speed else math.nan
 
 
@@ -164,7 +165,7 @@ def _truth(sources: Sequence[DepthDataModule]) -> tuple[str, str]:
         return "camera_z", kinds["camera_z"]
     if len(kinds) > 1:
         raise ConfigError(
-            f"the sources have ground truth of different kinds ({', '.join(sorted(kinds))}), which no protocol mixes; "
-            "set data.sources.NAME.depth alike, or name the sources to evaluate with data.test"
+            f"the sources have ground truth of different kinds ({', '.join(sorted(kinds))}), which no protocol can "
+            "mix; give all sources the same data.sources.NAME.depth, or name the sources to evaluate with data.test"
         )
     return next(iter(kinds.items()))

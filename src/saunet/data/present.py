@@ -1,4 +1,4 @@
-"""Whatever data sets lie below one folder, to evaluate a model on each of them."""
+"""All data sets found below one folder, to evaluate a model on each of them."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from saunet.registry import Entry, Spec, datamodules
 
 @datamodules.register("all_present")
 class PresentDataModule(DepthDataModule):
-    """Every data set with depth that is there, for ``saunet evaluate`` only, each with its own split and protocol.
+    """Every data set with depth that is present, for ``saunet evaluate`` only, each with its own split and protocol.
 
-    Below ``root`` a data set is looked for in the folder of its name, such as ``kitti``, or else where its own files
-    show that they are its own: at the root or up to two folders below.
+    A data set is looked for in the folder of its name below ``root``, such as ``kitti``, or recognized by its files at
+    the root or up to two folders below.
 
     Args:
-        root: Folder of the data sets; None looks at ``roots`` alone.
-        roots: Data sets that are elsewhere, name -> root, such as ``{kitti: /data/kitti}``.
-        sets: Names of the data sets to look for; all that are registered if empty.
+        root: Folder of the data sets; None uses only ``roots``.
+        roots: Data sets elsewhere, name -> root, such as ``{kitti: /data/kitti}``.
+        sets: Names of the data sets to look for; all registered ones if empty.
         settings: Settings of single data sets, such as ``{kitti: {test_split: eigen_benchmark_test}}``.
         **loading: Loader settings, as in `LoadOptions`, for all of them.
 
@@ -62,7 +62,7 @@ class PresentDataModule(DepthDataModule):
         )
 
     def candidates(self) -> Iterator[tuple[str, Spec, bool]]:
-        """Yield each data set to try: its name, where to look, and whether it was named or has a folder of its name."""
+        """Yield each data set to try: its name, where to look, and whether it was named or has its own folder."""
         if self.root is None and not self.roots:
             raise ConfigError("data=all_present needs data.root=FOLDER, or data.roots={NAME: FOLDER, ...}")
         if self.root is not None and not Path(self.root).expanduser().is_dir():
@@ -83,12 +83,12 @@ class PresentDataModule(DepthDataModule):
 
 def _mapping(key: str, given: Any) -> dict[str, Any]:
     if given is not None and not isinstance(given, Mapping):
-        raise ConfigError(f"{key} is {given!r}; give it by data set, such as data.{key}={{kitti: ...}}")
+        raise ConfigError(f"{key} is {given!r}; give it per data set, such as data.{key}={{kitti: ...}}")
     return dict(given or {})
 
 
 def _entries() -> dict[str, Entry]:
-    """Return the data sets that read files with depth; of several names of one class the one without a preset."""
+    """Return the data sets that read files with depth; for several names of one class, the one without a preset."""
     found: dict[str, Entry] = {}
     for entry in sorted(datamodules, key=lambda entry: (len(entry.preset), entry.name)):
         target = entry.target

@@ -44,7 +44,7 @@ class ForeignOptions:
         run_code: Run a TorchScript file, which is a program: only if you trust whoever made it.
 
     Raises:
-        ConfigError: if a value is out of range or a word unknown.
+        ConfigError: if a value is out of range or a choice is unknown.
 
     Examples:
         >>> saunet.ForeignOptions(preset="midas", height=256, width=512).output is None

@@ -98,7 +98,7 @@ def test_without_splits_the_end_is_held_out_and_sizes_may_differ(tmp_path):
     assert len(data.datasets["test"]) == 2  # 7 and 8; 9 has no depth
     assert "1 without ground truth" in data.summary("test")
     assert next(data.batches("test", "cpu"))["depth_size"].tolist() == [[31, 40], [32, 40]]
-    with pytest.raises(ConfigError, match="val_drives names 'night', which fits no drive"):
+    with pytest.raises(ConfigError, match="val_drives names 'night', which matches no drive"):
         module(tmp_path, val_drives=["night"]).setup("test")
 
 

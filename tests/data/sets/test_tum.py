@@ -109,7 +109,7 @@ def test_what_is_missing_or_broken_is_one_sentence(tmp_path):
     with pytest.raises(DataError, match=r"no rgb\.txt at .*unpack the sequences' \.tgz"):
         module(tmp_path).setup("fit")
     folder = write_sequence(tmp_path)
-    with pytest.raises(ConfigError, match=r"val_drives names 'x', which fits no drive; drives: rgbd_dataset"):
+    with pytest.raises(ConfigError, match=r"val_drives names 'x', which matches no drive; drives: rgbd_dataset"):
         module(tmp_path, val_drives=["x"]).setup("fit")
     (folder / "groundtruth.txt").write_text("1305031102.0 1 2 3 0 0 0\n")
     with pytest.raises(DataError, match=r"groundtruth\.txt, line 1: expected the numbers timestamp tx"):

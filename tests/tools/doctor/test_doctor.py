@@ -148,7 +148,10 @@ def test_a_clip_that_stands_is_named_as_the_cause_and_no_manifest_is_advised(tmp
     data = saunet.Spec.of("data", "video", **settings)
     found = saunet.doctor(saunet.DoctorOptions(data=data, output_dir=tmp_path / "out"))
     assert not found.usable
-    assert "show no motion (doubled or standing): give longer clips that move, or set data.static=keep" in str(found)
+    assert (
+        "show no motion (duplicates or a standing car): give longer clips with motion, or set data.static=keep"
+        in str(found)
+    )
     assert "train with data.manifest" not in str(found)
 
 

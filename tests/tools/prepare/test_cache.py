@@ -177,7 +177,7 @@ def test_what_cannot_work_is_one_sentence(tree, tmp_path):
     settings = folder / "cache.json"
     settings.write_text(settings.read_text().replace('"version": 1', '"version": 7'))
     for use in (lambda: build_cache(recordings, folder, SMALL), lambda: ImageCache(folder)):
-        with pytest.raises(DataError, match="has version 7 and this is for 1; delete it and make it again"):
+        with pytest.raises(DataError, match="has version 7, but version 1 is required; delete it and make it again"):
             use()
     with pytest.raises(DataError, match="is not empty and not a cache"):
         build_cache(recordings, tree, SMALL)
@@ -204,7 +204,7 @@ def test_frames_of_two_sizes_are_named_or_skipped(tree, tmp_path):
     odd = tree / name(1) / "image_02" / "data" / "0000000002.png"
     cv2.imwrite(str(odd), np.zeros((22, 60, 3), np.uint8))
     recordings = kitti_recordings(tree, ["left"])
-    with pytest.raises(DataError, match=r"0000000002\.png is 60x22 .* where the frames of '.*' are 60x20"):
+    with pytest.raises(DataError, match=r"0000000002\.png is 60x22 .* but the frames of '.*' are 60x20"):
         build_cache(recordings, tmp_path / "cache", SMALL)
     report = build_cache(recordings, tmp_path / "cache", SMALL, on_error="skip")
     assert len(report.failures) == 1
@@ -245,7 +245,9 @@ def test_copies_of_changed_originals_are_made_again(tree, tmp_path):
     cv2.imwrite(str(original), np.full((10, 30, 3), 100, np.uint8))
     for number in (0, 1, 3, 4, 5):
         cv2.imwrite(str(original.with_name(f"{number:010d}.png")), np.full((10, 30, 3), 100, np.uint8))
-    with pytest.raises(DataError, match=r"come from images of 20x60 and they are 10x30 .* now; delete .*0001_sync.l "):
+    with pytest.raises(
+        DataError, match=r"were made from images of 20x60 .* which are now 10x30; delete .*0001_sync.l "
+    ):
         build_cache(kitti_recordings(tree, ["left"]), folder, SMALL)
 
 

@@ -139,7 +139,7 @@ def test_maps_made_differently_are_not_mixed(tree):
         densify(improved)
     info = tree / name(1) / "depth_linear" / "l" / "maps.json"
     info.write_text(info.read_text().replace('"version": 1', '"version": 9'))
-    with pytest.raises(DataError, match="have version 9 and this is for 1"):
+    with pytest.raises(DataError, match="have version 9, but version 1 is required"):
         densify(recordings)
 
 

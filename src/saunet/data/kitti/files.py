@@ -1,7 +1,7 @@
 """KITTI's files: calibration, laser scans, OXTS records and time stamps.
 
-The calibration counts pixels from one, which is why the field's LiDAR maps lie one pixel up and left of u and v.
-Everywhere else integer coordinates are pixel centers counted from zero; `zero_based` goes from one to the other.
+The calibration counts pixels from one, so the field's LiDAR maps lie one pixel up and left of u and v. Everywhere else,
+integer coordinates are pixel centers counted from zero; `zero_based` converts.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _LIDAR_KEYS = {"R": (3, 3), "T": (3,)}
 
 
 def read_matrices(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
-    """Read the lines ``KEY: numbers`` of a calibration file as matrices of the shapes that are asked for."""
+    """Read the lines ``KEY: numbers`` of a calibration file as matrices of the requested shapes."""
     try:
         lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     except FileNotFoundError as reason:
-        raise DataError(f"no calibration at {path}; copy the calibration, a download of its own, there") from reason
+        raise DataError(f"no calibration at {path}; copy KITTI's calibration, a separate download, there") from reason
     except OSError as reason:
         raise DataError(f"cannot read calibration {path}: {reason.strerror or reason}") from reason
     found: dict[str, Array] = {}
@@ -46,7 +46,7 @@ def read_matrices(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str
         if key in shapes:
             where = f"{path}, line {number} ({key})"
             if key in found:
-                raise DataError(f"{where}: this key is given twice; delete the wrong line")
+                raise DataError(f"{where}: this key appears twice; delete the wrong line")
             found[key] = _numbers(text, shapes[key], where)
             if shapes[key] == (3, 3):
                 check_rotation(found[key], where)
@@ -86,7 +86,7 @@ class KittiCalibration:
         """Return the motion between rectified cameras, 4 x 4, meters: maps points of ``source`` to points of ``to``."""
         T = np.eye(4)
         for camera, sign in ((to, 1), (source, -1)):
-            self.intrinsics(camera)  # P = K [I | t] is solved for t: K must be one
+            self.intrinsics(camera)  # P = K [I | t] is solved for t, so K must be valid
             P = self.projections[camera]
             T[:3, 3] += sign * np.linalg.solve(P[:, :3], P[:, 3])
         return T
@@ -103,7 +103,7 @@ class KittiCalibration:
 
 
 def zero_based(K: Array) -> Array:
-    """Return K for pixels counted from zero, given one for pixels counted from one."""
+    """Convert K for pixels counted from one to pixels counted from zero."""
     moved = K.copy()
     moved[:2, 2] -= 1
     return moved
@@ -148,7 +148,7 @@ def lidar_depth(
     size: tuple[int, int],
     kind: Literal["camera_z", "lidar_x"] = "camera_z",
 ) -> NDArray[np.float32]:
-    """Project a scan into a camera as the Eigen evaluation does, h x w; where several points share a pixel the nearest.
+    """Project a scan into a camera as the Eigen evaluation does, h x w; the nearest of several points in a pixel wins.
 
     ``camera_z`` is depth along the camera's axis, ``lidar_x`` the scanner's own x (the classic numbers). Points behind
     the scanner (x < 0) or the camera (z <= 0) are dropped. The calibration counts pixels from one, so a point lands on

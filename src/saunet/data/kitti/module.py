@@ -25,33 +25,36 @@ _PROTOCOLS = {"camera_z": "eigen_camera_z", "lidar_x": "eigen_lidar_x", "improve
 @datamodules.register("kitti")
 @datamodules.register("kitti_dense", dense="linear")
 class KittiDataModule(DepthDataModule):
-    """KITTI raw recordings: real street video with the true intrinsics of each camera and date, and LiDAR depth.
+    """KITTI raw recordings: real street video with LiDAR depth and the calibrated intrinsics of each camera and date.
 
-    What the root lacks (drives, frames, sides, scans) is left out and reported; nothing left is an error.
+    Missing drives, frames, sides and scans are left out and reported; it is an error if nothing is left.
 
     Args:
-        root: Folder of the recordings: holding the date folders, above or below them.
+        root: Folder of the recordings: the one with the date folders, one above it, or one of the date folders.
         split: Training and validation frames: ``eigen_zhou_by_drive``, ``eigen_zhou_random``, ``eigen_full``; ``all``
             for every frame found; a file in Monodepth2's format, or a folder with train_files.txt and val_files.txt.
         test_split: Test frames: ``eigen_test``, ``eigen_benchmark_test``, ``all``, or a file. By default ``eigen_test``
-            with a named split, test_files.txt of a folder, and else the held-out frames. Frames need ground truth.
-        val_drives: Drives to hold out, in place of what the split would; ``2011_09_26_drive_0001_sync`` names one.
-        val_share: Share to hold out of ``all`` or of a file: whole drives where there are ten, else the drives' tails.
+            for a named split, test_files.txt of a folder, and otherwise the held-out frames. Frames without ground
+            truth are left out.
+        val_drives: Drives to hold out instead of those of the split, such as ``2011_09_26_drive_0001_sync``.
+        val_share: Fraction to hold out of ``all`` or a file: whole drives if there are ten or more, else the drives'
+            ends.
         cameras: ``left``, ``right`` or both.
-        static: Frames of a standing car in training and validation: ``keep`` them; drop those whose OXTS ``speed`` is
-            under 0.5 m/s (without OXTS, by flow); or drop those whose median optical ``flow`` to the frame before is
-            under half a pixel at 320 pixels width. Flow reads every frame once at set-up.
-        depth: Ground truth: LiDAR depth as ``camera_z`` or ``lidar_x`` (evaluation only), or ``improved``.
+        static: Frames of a standing car in training and validation: ``keep`` them; drop those with an OXTS ``speed``
+            below 0.5 m/s (without OXTS, by flow); or drop those whose median optical ``flow`` to the previous frame is
+            below half a pixel at 320 pixels width. Flow reads every frame once at set-up.
+        depth: Kind of ground truth: LiDAR depth as ``camera_z`` or ``lidar_x`` (evaluation only), or ``improved``.
         annotated: Folder of the unpacked data_depth_annotated archive, for ``improved``; by default the maps are looked
-            for in the drives' folders, and in the archive's layout below the folder of the dates and the one above.
-        dense: Dense depth maps as that target in place of the sparse scan: ``linear`` or ``colorization``, made
+            for in the drives' folders, and in the archive's layout below the folder with the dates and the one above
+            it.
+        dense: Dense depth maps as the target instead of the sparse scan: ``linear`` or ``colorization``, made
             beforehand by ``saunet prepare densify``; ``none`` uses the scan.
         teacher: Batches carry another model's depth, made beforehand by ``saunet prepare teacher``.
         maps: Folder of these maps; None: beside the recordings.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
-        ConfigError: if a parameter is out of range or a word unknown.
+        ConfigError: if a parameter is out of range or a choice is unknown.
     """
 
     camera_height = CAMERA_HEIGHT
@@ -112,7 +115,7 @@ class KittiDataModule(DepthDataModule):
         else:
             frames = self._test(raw)
         self._check_drives(raw, split, frames)
-        # Losses compare with the camera's depth, whatever the evaluation reads.
+        # Losses always compare with the camera's depth, whatever the evaluation uses.
         kind: DepthKind = "camera_z" if split == "train" and self._depth == "lidar_x" else self._depth
         numbers: dict[tuple[str, str], list[int]] = {}
         for frame in frames:
@@ -153,7 +156,7 @@ class KittiDataModule(DepthDataModule):
             maps.check(wanted, f"saunet prepare {what} root={self.root}{folder}")
 
     def listed(self, split: str) -> list[str]:
-        """Return the names of all images that a split lists, in its order, also those that the root lacks."""
+        """Return the names of all images that a split lists, in its order, including those missing below the root."""
         if split != "test":
             return super().listed(split)
         return [str(frame) for frame in self._test(self._raw or KittiRaw(self.root, self.annotated))]

@@ -59,7 +59,7 @@ class OdometrySequence(Drive):
         native = next((each for center, each in _SIZES.items() if np.abs(K[:2, 2] - center).max() < 0.05), self._size)
         self._K = scaled(zero_based(K), native, self._size, self._images, path)
         check_intrinsics(K, *native, f"{path}: {key}")
-        # P = K [I | t] maps points of camera 0, so t is where camera 0 lies seen from this camera
+        # P = K [I | t] maps points of camera 0, so t is the position of camera 0 seen from this camera
         self._T_cam_cam0 = np.eye(4)
         self._T_cam_cam0[:3, 3] = np.linalg.solve(K, matrices[key][:, 3])
         poses = root / "poses" / f"{sequence}.txt"
@@ -74,7 +74,7 @@ class OdometrySequence(Drive):
 
     @property
     def origin(self) -> str:
-        return self._given[2]  # of which the name says only left or right
+        return self._given[2]  # whose name says only left or right
 
     @property
     def frame_size(self) -> tuple[int, int]:
@@ -134,12 +134,12 @@ class KittiOdometryDataModule(DepthDataModule):
         root: Folder that holds ``sequences`` and ``poses``.
         train_sequences: Sequences to train on.
         test_sequences: Sequences to test and predict.
-        val_share: Share of each training sequence, its end, that validates.
+        val_share: Fraction of each training sequence, at its end, to validate on.
         camera: ``color_left``, ``color_right``, ``gray_left`` or ``gray_right``.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
-        ConfigError: if a parameter is out of range or a word unknown.
+        ConfigError: if a parameter is out of range or a choice is unknown.
     """
 
     neighbors = ("train", "val", "test")

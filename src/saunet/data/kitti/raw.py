@@ -56,7 +56,7 @@ class KittiDrive(Drive):
         one_of("depth kind", depth_kind, DEPTH_KINDS)
         self.depth_kind: DepthKind = depth_kind
         self._folder, self._side, self.calibration = folder, side, calibration
-        self._annotated = annotated  # the drive's folder in the archive of annotated depth maps, if that lies apart
+        self._annotated = annotated  # the drive's folder in the archive of annotated depth maps, if that is elsewhere
         self._clock = folder / f"image_{self.number:02d}" / "timestamps.txt"
         self._files = frame_files(folder / f"image_{self.number:02d}" / "data")
         self._indices = sorted(self._files)
@@ -86,7 +86,7 @@ class KittiDrive(Drive):
     def _intrinsics(self) -> NDArray[np.float64]:
         K = self.calibration.intrinsics(self.number)
         example, (height, width) = self._common_size
-        if self.number not in self.calibration.sizes:  # or else it was checked against that size
+        if self.number not in self.calibration.sizes:  # otherwise it was checked against that size already
             where = f"{self.calibration.path}: P_rect_{self.number:02d} (without S_rect)"
             check_intrinsics(self.calibration.projections[self.number][:, :3], height, width, where)
         native = self.native_size
@@ -186,7 +186,7 @@ class KittiRaw:
     """The KITTI raw recordings below a folder.
 
     ``annotated`` is the folder of the unpacked data_depth_annotated archive; by default it is looked for below the
-    folder that holds the dates, and below the one above it.
+    folder with the dates and the one above it.
     """
 
     def __init__(self, root: str | Path, annotated: str | Path | None = None) -> None:
@@ -223,7 +223,7 @@ class KittiRaw:
         return {path.name: path for path in reversed(found)}
 
     def drive(self, name: str, camera: str = "left", depth_kind: DepthKind = "camera_z") -> KittiDrive:
-        """Return a drive by its name ``<date>/<drive>``; one that is not on disk has no frames."""
+        """Return a drive by its name ``<date>/<drive>``; it has no frames if it is not on disk."""
         date, annotated = name.partition("/")[0], None
         folder = self.drives.get(name, self._dates.get(date, self.root / date) / name.rpartition("/")[2])
         if depth_kind == "improved" and not (folder / "proj_depth").is_dir():

@@ -1,7 +1,7 @@
-"""Which KITTI frames belong to which split: the published tables, a user's files, or a share held out.
+"""Which KITTI frames belong to which split: the published tables, a user's files, or a held-out fraction.
 
-The published division of the Eigen-Zhou frames into training and validation is a random draw per frame that follows no
-rule, and most of its validation frames have a training neighbor. So the built-in default holds out whole drives
+The published division of the Eigen-Zhou frames into training and validation was drawn frame by frame and follows no
+rule, so most of its validation frames have a training neighbor. The built-in default therefore holds out whole drives
 (`eigen_zhou_by_drive`); `eigen_zhou_random` draws a seeded tenth of the frames; and the published lists themselves are
 read from files in Monodepth2's ``folder index side`` format.
 """
@@ -54,7 +54,7 @@ def eigen_test() -> list[Frame]:
 
 
 def eigen_benchmark_test() -> list[Frame]:
-    """Return the 652 test frames of Eigen with improved ground truth: five frames or more from the ends of a drive."""
+    """Return Eigen's 652 test frames with improved ground truth: those at least five frames from a drive's ends."""
     length = {row.drive: row.frames for row in eigen_table()["eigen_test"]}
     return [frame for frame in eigen_test() if 5 <= frame.number <= length[frame.drive] - 6]
 
@@ -80,7 +80,7 @@ TRAINING: Mapping[str, Callable[[int], Parts]] = {
     "eigen_zhou_by_drive": lambda seed: hold_out_drives(eigen_zhou(), VAL_DRIVES),
     "eigen_zhou_random": lambda seed: hold_out_random(eigen_zhou(), 0.1, seed),
 }
-"""Name of a training split -> its training and validation frames for a seed."""
+"""Name of a training split -> a function of the seed that gives its training and validation frames."""
 TEST: Mapping[str, Callable[[], list[Frame]]] = {"eigen_test": eigen_test, "eigen_benchmark_test": eigen_benchmark_test}
 """Name of a test split -> its frames."""
 
@@ -97,7 +97,7 @@ _LINE = "'<date>/<drive> <frame number> <l or r>'"
 
 
 def read_split(path: Path) -> list[Frame]:
-    """Read a list in Monodepth2's format: a line ``<date>/<drive> <frame> <l or r>`` each."""
+    """Read a list in Monodepth2's format: lines ``<date>/<drive> <frame> <l or r>``."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as reason:

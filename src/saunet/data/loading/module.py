@@ -1,6 +1,6 @@
 """The base of all data modules: selections of frames in, batches on the device out.
 
-A data set subclasses `DepthDataModule`, names its own parameters beside the shared ones, and implements `select`.
+A data set subclasses `DepthDataModule`, adds its own parameters to the shared ones, and implements `select`.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ class DepthDataModule(LightningDataModule):
     """Loaders of frame windows, and the transforms that run on the device.
 
     Args:
-        target_depth: Training batches carry the target's depth (zeros where unknown), for losses that use it.
-        with_pose: Batches carry the true motion.
-        stereo: Training and validation batches carry the other camera of the pair as one more source, placed by the
-            calibration, which makes depth metric; with ``offsets: []`` it is the only one.
+        target_depth: Put the target's depth into training batches (0 where unknown), for losses that use it.
+        with_pose: Put the true motion into batches.
+        stereo: Add the other camera of the pair to training and validation batches as one more source. Its calibrated
+            position makes depth metric. With ``offsets: []`` it is the only source.
         cache: Folder of smaller copies made by ``saunet prepare cache``; training and validation read images from it.
         **loading: Fields of `LoadOptions`.
 
     Attributes:
-        neighbors: Splits whose samples carry source frames; by default ``train`` and ``val``.
-        protocol: Evaluation protocol where none is asked for; ``campus`` fits data without depth.
+        neighbors: Splits whose samples have source frames; by default ``train`` and ``val``.
+        protocol: Default evaluation protocol; ``campus`` fits data without depth.
         ground_truth: Kind of depth to evaluate on: ``lidar_x``, ``camera_z``, ``improved``, ``exact`` or ``none``.
         cacheable: Whether ``saunet prepare cache`` can make smaller copies of its images.
         root: Folder of its files; None if it reads none.
@@ -70,19 +70,19 @@ class DepthDataModule(LightningDataModule):
     """
 
     neighbors: Sequence[str] = ("train", "val")
-    """Splits whose samples carry source frames."""
+    """Splits whose samples have source frames."""
     protocol: str = "eigen_camera_z"
-    """Name of the evaluation protocol that fits this data set's ground truth; ``campus`` where there is none."""
+    """Name of the evaluation protocol that fits this data set's ground truth; ``campus`` if there is none."""
     ground_truth: str = "camera_z"
-    """What kind of depth evaluation batches carry: ``lidar_x``, ``camera_z``, ``improved``, ``exact`` or ``none``."""
+    """Kind of depth in evaluation batches: ``lidar_x``, ``camera_z``, ``improved``, ``exact`` or ``none``."""
     cacheable: bool = True
     """Whether ``saunet prepare cache`` can make copies for it."""
     root: str | None = None
-    """Where its files are; None if it reads none."""
+    """Folder of its files; None if it reads none."""
     static: str | None = None
-    """What becomes of frames without motion, where a parameter of this name decides it; None without one."""
+    """What happens to frames without motion, if a parameter of this name decides it; None otherwise."""
     recognizable: bool = True
-    """Whether its files are arranged as those of no other data set, so that it can be found among others."""
+    """Whether its file layout is unlike any other data set's, so that it can be recognized."""
 
     @property
     def camera_height(self) -> float | None:
@@ -122,21 +122,21 @@ class DepthDataModule(LightningDataModule):
         return (self.protocol,)
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return the frames of ``train``, ``val``, ``test`` or ``predict``; the one thing a data set must say.
+        """Return the frames of ``train``, ``val``, ``test`` or ``predict``; the only method a data set must implement.
 
-        Nothing at all for ``val`` means training without validation.
+        Return nothing for ``val`` to train without validation.
         """
-        raise NotImplementedError(f"{type(self).__name__} does not say which frames belong to '{split}'")
+        raise NotImplementedError(f"{type(self).__name__} does not define the frames of '{split}'")
 
     def overlap(self) -> str | None:
-        """Say in one sentence which splits share recordings, and what keeps them apart; None if that is in order.
+        """Return a sentence about splits that share recordings, and how to separate them; None if none do.
 
-        A data set without published splits overrides it.
+        Override it in a data set without published splits.
         """
         return None
 
     def setup(self, stage: str | None = None) -> None:
-        """Find the windows of the splits that a stage needs, and report what is used and what is left out."""
+        """Find the windows of the splits that a stage needs, and report which frames are used and left out."""
         fresh = "train" not in self.datasets
         for split in STAGES[str(getattr(stage, "value", stage))] if stage else ("train", "val", "test", "predict"):
             self.setup_split(split)
@@ -145,14 +145,14 @@ class DepthDataModule(LightningDataModule):
             self._check_manifests({drive.name for dataset in read for drive in dataset.drives})
 
     def setup_split(self, split: str) -> None:
-        """Find the windows of one split, unless that is done."""
+        """Find the windows of one split, unless done already."""
         selections = [] if split in self.datasets else [Selection(*each) for each in self.select(split)]
         if selections or (split != "val" and split not in self.datasets):
             self.datasets[split] = self._dataset(split, [self._usable(split, each) for each in selections])
             rank_zero_info(self.summary(split))
 
     def teardown(self, stage: str | None = None) -> None:
-        """Say what ``on_error=skip`` passed over."""
+        """Report what ``on_error=skip`` skipped."""
         skipped = self.skipped()
         if skipped:
             more = ", ..." if len(skipped) > 5 else ""
@@ -164,7 +164,7 @@ class DepthDataModule(LightningDataModule):
         return dataset.skipped() if isinstance(dataset, SkippingWindows) else []
 
     def summary(self, split: str) -> str:
-        """Return what a split uses and leaves out, readable, with the fingerprint of its frames."""
+        """Return a readable summary of what a split uses and leaves out, with the fingerprint of its frames."""
         dataset, usage = self.datasets[split], self.usage[split]
         reasons = Counter[str]()
         for drive in usage:
@@ -172,7 +172,7 @@ class DepthDataModule(LightningDataModule):
         sources = sum(drive.used > 0 for drive in usage)
         total = Usage(f"{split} ({sources} of {len(usage)} drives)", len(dataset), reasons)
         lines = [str(drive) for drive in usage if len(usage) <= 8 or not drive.used]
-        more = [f"... and {len(lines) - 12} drives more"] if len(lines) > 12 else []
+        more = [f"... and {len(lines) - 12} more drives"] if len(lines) > 12 else []
         return "\n  ".join([f"{total}; sha256 {dataset.fingerprint()[:16]}", *lines[:12], *more])
 
     def fingerprints(self) -> dict[str, str]:
@@ -184,7 +184,7 @@ class DepthDataModule(LightningDataModule):
             self.manifest.check(names)
 
     def _usable(self, split: str, selection: Selection) -> Selection:
-        """Leave out what the manifest names, and what cannot be read where that is to be skipped."""
+        """Leave out the manifest's frames and, if these are to be skipped, unreadable ones."""
         offsets = self.offsets if split in self.neighbors else ()
         if self.manifest is not None and split in ("train", "val"):
             selection = self.manifest.apply(selection, offsets)
@@ -209,7 +209,9 @@ class DepthDataModule(LightningDataModule):
             still = reasons["doubled"] + reasons["static"]
             if still > reasons.total() / 2:
                 keep = ", or set data.static=keep" if self.static not in (None, "keep") else ""
-                advice = f"{still} frames show no motion (doubled or standing): give longer clips that move{keep}"
+                advice = (
+                    f"{still} frames show no motion (duplicates or a standing car): give longer clips with motion{keep}"
+                )
             raise DataError(f"split '{split}' has no usable frame ({found}); {advice}")
         if split == "train" and self.odometer is not None:
             self._check_distances(self.odometer, selections, windows)
@@ -234,7 +236,7 @@ class DepthDataModule(LightningDataModule):
     def _check_distances(
         self, odometer: Odometer, selections: Sequence[Selection], windows: Sequence[tuple[int, int]]
     ) -> None:
-        """Refuse data that know no way traveled at all, where the velocity term would train nothing."""
+        """Refuse data without any known distance traveled, with which the velocity term would train nothing."""
         for place, frame in windows:
             for offset in self.offsets:
                 try:
@@ -244,7 +246,7 @@ class DepthDataModule(LightningDataModule):
                     if self.on_error != "skip":
                         raise
         raise DataError(
-            f"with_speed is true but no training frame of {self.root or type(self).__name__} has a speed with its "
+            f"with_speed is true but no training frame of {self.root or type(self).__name__} has a speed and its "
             "time, or a pose; add them, or set data.with_speed=false"
         )
 
@@ -255,11 +257,11 @@ class DepthDataModule(LightningDataModule):
     def _recordings(
         self, split: str, selections: Sequence[Selection], windows: Sequence[tuple[int, int]]
     ) -> list[Drive]:
-        """Return the recordings; training and validation read the cache, so that tests do not depend on it."""
+        """Return the recordings; only training and validation read the cache, so tests do not depend on it."""
         if self.copies is None or split not in ("train", "val"):
             return [selection.drive for selection in selections]
         needed: dict[int, set[int]] = {position: set() for position, _ in windows}
-        if self.on_error == "raise":  # else a copy that is missing is a sample to skip
+        if self.on_error == "raise":  # otherwise a missing copy counts as a sample to skip
             for position, frame in windows:
                 needed[position].update(frame + offset for offset in (0, *self.offsets))
         copies = {place: self.copies.drive(selections[place].drive, frames) for place, frames in needed.items()}
@@ -272,7 +274,7 @@ class DepthDataModule(LightningDataModule):
         return ResumableLoader(self.datasets["train"], sampler=sampler, **self._loading())
 
     def val_dataloader(self) -> DataLoader[Any] | list[Any]:
-        """Return validation batches, each sample once; an empty list where the data set holds nothing out."""
+        """Return validation batches, each sample once; an empty list if the data set holds nothing out."""
         return self._eval_loader("val") if "val" in self.datasets or "train" not in self.datasets else []
 
     def test_dataloader(self) -> DataLoader[Any]:
@@ -286,9 +288,9 @@ class DepthDataModule(LightningDataModule):
     def batches(
         self, split: str, device: str | torch.device, place: tuple[int, int] | None = None
     ) -> Iterator[EvalBatch]:
-        """Yield a split's batches as the networks want them, on a device: evaluation without a trainer.
+        """Yield a split's batches ready for the networks, on a device: evaluation without a trainer.
 
-        With a place, a process's number and the number of processes, they are every so manieth sample.
+        With ``place`` (this process's number and the number of processes), each process gets its part of the samples.
         """
         loader = self._eval_loader(split)
         if place is not None:
@@ -301,7 +303,7 @@ class DepthDataModule(LightningDataModule):
             yield self.prepare(move_data_to_device(batch, torch.device(device)))
 
     def ground_truths(self, split: str, most: int = 500) -> Iterator[Float[torch.Tensor, "1 h w"]]:
-        """Yield the true depth of a split's frames at native size, meters, 0 where unknown; skips those without any."""
+        """Yield the true depth of a split's frames that have some, at native size, meters, 0 where unknown."""
         dataset = self._set_up(split)
         for position, frame in (dataset.windows[place] for place in evenly(len(dataset), most)):
             depth = dataset.drives[position].depth(frame)
@@ -317,7 +319,7 @@ class DepthDataModule(LightningDataModule):
         return [dataset.name(index) for index in range(len(dataset))]
 
     def on_after_batch_transfer(self, batch: FrameBatch, dataloader_idx: int) -> TrainBatch | EvalBatch:
-        """Turn bytes into images on the device; samples that carry random numbers are augmented."""
+        """Turn bytes into images on the device; samples that come with random numbers are augmented."""
         return self.augment(batch) if "draws" in batch else self.prepare(batch)  # type: ignore[no-any-return]
 
     def _eval_loader(self, split: str) -> DataLoader[Any]:
@@ -347,7 +349,7 @@ def surroundings(
     odometer: Odometer | None = None,
     most: int = 100,
 ) -> Iterator[EvalBatch]:
-    """Yield frames of a split one by one, as the networks want them, with the sources that measuring scale needs."""
+    """Yield frames of a split one by one, ready for the networks, with the sources needed to measure scale."""
     dataset = data._set_up(split)
     wanted: dict[int, list[int]] = {}
     for position, frame in dataset.windows:

@@ -14,7 +14,7 @@ from saunet.errors import ConfigError, in_range, one_of, positive
 
 @dataclass(frozen=True, kw_only=True)
 class LoadOptions:
-    """How frames become batches; every data module takes these as keywords.
+    """How frames become batches; every data module takes these settings as keywords.
 
     Args:
         height: Image height in pixels.
@@ -22,19 +22,19 @@ class LoadOptions:
         offsets: Time offsets of the source frames.
         batch_size: Samples per step over all devices together.
         workers: Loader processes per device, at most one per core.
-        crop_margin: Training frames are loaded this much larger (0.1 = 10 %) and a random window is cut; K follows.
+        crop_margin: Load training frames this much larger (0.1 = 10 %) and cut out a random window; K follows.
         flip_prob: Probability of mirroring in training.
         color_jitter_prob: Probability of color jitter in training.
-        track_motion: Take the camera's motion from tracked points instead of the pose network, which then learns it
+        track_motion: Take the camera's motion from tracked points instead of the pose network, which learns from it
             through ``objective.extra.tracked_motion``; see `saunet.geometry.tracks.tracked_motion`.
-        with_speed: Batches carry the way traveled between the frames, for the velocity term: from speeds and
-            times, or from poses.
-        guess_camera: Start from 60 degrees of view where the camera is unknown and its frames do not tell it; else such
-            data are refused. ``model.intrinsics=learned`` sets it.
-        seed: Decides order, augmentation, and what is held out at random.
-        manifest: File of frames to leave out of training and validation, as the doctor writes it.
-        on_error: A file that cannot be read: ``raise`` stops and names it; ``skip`` names and counts it and carries
-            on: in training with another sample, while the frames of other splits are all read beforehand.
+        with_speed: Put the distance traveled between frames into batches, from speeds and times or from poses, for the
+            velocity term.
+        guess_camera: Start from a 60 degree field of view if the camera is unknown and its frames do not tell;
+            otherwise such data are refused. ``model.intrinsics=learned`` sets it.
+        seed: Seed of the order, the augmentation, and what is held out at random.
+        manifest: File of frames to leave out of training and validation, written by ``saunet doctor``.
+        on_error: What to do with an unreadable file: ``raise`` stops and names it; ``skip`` names and counts it and
+            continues. Training then uses another sample; the frames of other splits are all read beforehand.
 
     Raises:
         ConfigError: if a value is out of range.

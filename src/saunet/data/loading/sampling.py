@@ -1,4 +1,4 @@
-"""Which sample goes where: samplers of whole batches, the same for any number of devices, and a loader that resumes.
+"""Samplers of whole batches that are the same for any number of devices, and a loader that can resume.
 
 A sampler yields lists of items, one list a batch, to a loader with ``batch_size=None``.
 """
@@ -21,7 +21,7 @@ from saunet.data.loading.windows import Item
 from saunet.errors import ConfigError, SaunetError
 from saunet.threads import available_cores
 
-AHEAD = 4  # batches that each loader process keeps ready: enough that one slow file, or a validation, is not felt
+AHEAD = 4  # batches that each loader process keeps ready: enough to hide one slow file or a validation
 
 
 class TrainBatches(DistributedSampler[Any]):
@@ -47,7 +47,7 @@ class TrainBatches(DistributedSampler[Any]):
 
     @property
     def first(self) -> int:
-        """The batch that the next epoch begins with: where a resumed one was left, and only if it is that epoch."""
+        """The batch with which the next epoch begins: where a resumed run stopped, if it is that epoch."""
         return self.start if self.start_epoch in (None, self.epoch) else 0
 
     def __iter__(self) -> Iterator[list[Item]]:
@@ -64,8 +64,8 @@ class TrainBatches(DistributedSampler[Any]):
 class EvalBatches(DistributedSampler[Any]):
     """Every sample exactly once over all devices, in order, and the same number of batches on each.
 
-    Equal numbers of batches keep collective operations of a step (buffer broadcast) in time with each other; the sizes
-    of batches differ by one where they must.
+    Equal numbers of batches keep the collective operations of a step (buffer broadcast) in sync; batch sizes differ by
+    at most one.
     """
 
     def __init__(self, dataset: Dataset[Any], batch_size: int, rank: int = 0, world_size: int = 1) -> None:
@@ -86,7 +86,7 @@ class EvalBatches(DistributedSampler[Any]):
 
 
 def evenly(count: int, most: int) -> list[int]:
-    """Return the places of at most ``most`` of ``count`` things, spread evenly from the first to the last."""
+    """Return the positions of at most ``most`` of ``count`` items, spread evenly from the first to the last."""
     return [int(place) for place in np.linspace(0, count - 1, min(most, count)).round()]
 
 
@@ -94,18 +94,18 @@ def share(batch_size: int, world_size: int) -> int:
     if batch_size < 1 or batch_size % world_size:
         nearest = max(1, round(batch_size / world_size)) * world_size
         raise ConfigError(
-            f"batch_size is {batch_size}; it is the sum over all {world_size} devices "
-            f"and must be a positive multiple of their number, such as {nearest}"
+            f"batch_size is {batch_size}; it is the total over all {world_size} devices and must be a positive "
+            f"multiple of their number, such as {nearest}"
         )
     return batch_size // world_size
 
 
 GRACE = 30
-"""Seconds that a loader's process still works after it was told to end; the one that needs it ends it before."""
+"""Seconds that a loader process keeps working after it was told to end; its user ends it earlier."""
 
 
 def processes(wanted: int) -> dict[str, Any]:
-    """Return the settings of a `torch.utils.data.DataLoader` for so many processes, but at most one a core."""
+    """Return the settings of a `torch.utils.data.DataLoader` for this many processes, at most one per core."""
     workers = min(wanted, available_cores())
     return {
         "num_workers": workers,
@@ -117,10 +117,10 @@ def processes(wanted: int) -> dict[str, Any]:
 
 
 def _prepare(worker: int) -> None:
-    """Compute with one thread, and continue for a while if the process group is told to end: the first process saves.
+    """Use one thread, and keep working for a while after the process group is told to end: the first process saves.
 
-    It may be in the middle of an epoch or of a validation, and needs what is under way. It alone speaks: its handler of
-    Ctrl-C, which a terminal sends to the whole group, is not kept here.
+    That process may be in the middle of an epoch or a validation, and needs the batches in progress. Only it reports:
+    its handler of Ctrl-C, which a terminal sends to the whole group, is not kept here.
     """
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
@@ -138,15 +138,15 @@ def _end_at_the_second(number: int, frame: object) -> None:
 def _end_later(number: int, frame: object) -> None:
     if not hasattr(signal, "alarm"):  # Windows
         os._exit(0)
-    signal.signal(signal.SIGALRM, lambda *_: os._exit(0))  # without the alarm that torch gives for its processes
+    signal.signal(signal.SIGALRM, lambda *_: os._exit(0))  # without torch's error about its processes
     signal.alarm(GRACE)
 
 
 class Loader(DataLoader[Any]):
-    """A loader whose processes report a bad file in one sentence, and that knows how long it was waited for."""
+    """A loader that reports a bad file in one sentence, and measures how long its user waits."""
 
     waited = 0.0
-    """Seconds that its user has waited for batches so far."""
+    """Seconds spent waiting for batches so far."""
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
         try:
@@ -159,13 +159,13 @@ class Loader(DataLoader[Any]):
                     return
                 yield batch
         except SaunetError as error:
-            # torch prefixes what a loader process raised with its traceback, of which the last line is the error
+            # torch puts a loader process's traceback into the message; its last line is the error
             name = f"{type(error).__module__}.{type(error).__qualname__}: "
             raise type(error)(str(error).rpartition(name)[2].strip()) from error
 
 
 class ResumableLoader(Loader):
-    """A loader over `TrainBatches` that can be saved in the middle of an epoch and resume with the next batch."""
+    """A loader over `TrainBatches` that can be saved in the middle of an epoch and resumes with the next batch."""
 
     _done = 0
 
@@ -176,9 +176,9 @@ class ResumableLoader(Loader):
             yield batch
 
     def state_dict(self) -> dict[str, int]:
-        """Return how many batches of which epoch were handed out; 0 after the last.
+        """Return the epoch and how many of its batches were handed out; 0 after the last.
 
-        The epoch counts where a limit ends it early: the next one must not begin in its middle.
+        An epoch that a limit ends early counts as complete: the next one must not begin in the middle.
         """
         return {"batches": self._done % max(1, len(self)), "epoch": self.sampler.epoch}  # type: ignore[attr-defined]
 

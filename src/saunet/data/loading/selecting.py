@@ -25,11 +25,11 @@ from saunet.io.plain import read_json
 
 FORMAT = 1  # version of the layout of a manifest
 UNREADABLE = "unreadable"
-"""The reason in a manifest that also forbids a frame as a neighbor; all others only forbid it as a target."""
-MIN_SPEED = 0.5  # meters a second under which a car counts as standing
+"""The reason in a manifest that also rules out a frame as a neighbor; all others only rule it out as a target."""
+MIN_SPEED = 0.5  # meters per second below which a car counts as standing
 FLOW_WIDTH = 320
-"""Images are made this wide before flow is measured, so that thresholds mean the same for every camera."""
-MIN_FLOW = 0.5  # pixels of median flow, at 320 pixels width, under which a frame counts as static
+"""Images are resized to this width before flow is measured, so that thresholds mean the same for every camera."""
+MIN_FLOW = 0.5  # pixels of median flow, at 320 pixels width, below which a frame counts as static
 
 
 class Frame(NamedTuple):
@@ -44,13 +44,13 @@ class Frame(NamedTuple):
 
 
 BETWEEN = "between training and validation"
-"""Why frames are left out that neighbors of training and validation frames would share."""
+"""Reason for leaving out frames that training and validation windows would share."""
 Parts = tuple[list[Frame], list[Frame]]
 """Training and validation frames."""
 
 
 def parse_ranges(text: str) -> list[int]:
-    """Return the numbers of ``"0-6/3,9"``: 0, 3, 6, 9 (a-b/s is a, a+s, ... up to and with b)."""
+    """Return the numbers of ``"0-6/3,9"``: 0, 3, 6, 9 (a-b/s is a, a+s, ..., up to and including b)."""
     numbers: list[int] = []
     for part in filter(None, text.strip().split(",")):
         first, dash, rest = part.partition("-")
@@ -60,7 +60,7 @@ def parse_ranges(text: str) -> list[int]:
 
 
 def hold_out_drives(frames: Sequence[Frame], drives: Iterable[str]) -> Parts:
-    """Put the frames of the named drives into validation; a name may be the end of ``<date>/<drive>``."""
+    """Move the frames of the named drives to validation; a name may be the end of ``<date>/<drive>``."""
     held, known = set(), sorted({frame.drive for frame in frames})
     for name in drives:
         fitting = [drive for drive in known if drive == name or drive.endswith(f"/{name}")]
@@ -71,7 +71,7 @@ def hold_out_drives(frames: Sequence[Frame], drives: Iterable[str]) -> Parts:
 
 
 def hold_out_random(frames: Iterable[Frame], share: float, seed: int) -> Parts:
-    """Put a seeded random share of the frames, each camera for itself, into validation."""
+    """Move a seeded random fraction of the frames, each camera separately, to validation."""
     ordered = sorted(frames)
     drawn = np.random.default_rng(seed).permutation(len(ordered))[: math.ceil(share * len(ordered))]
     chosen = {ordered[place] for place in drawn}
@@ -79,10 +79,9 @@ def hold_out_random(frames: Iterable[Frame], share: float, seed: int) -> Parts:
 
 
 def hold_out_tails(frames: Sequence[Frame], share: float, gap: int) -> Parts:
-    """Put the last share of each drive into validation, and leave out ``gap`` frames before it.
+    """Move the last fraction of each drive to validation, and leave out ``gap`` frames before it.
 
-    With a gap as long as the farthest neighbors of both sides, no validation window shares a frame with a training
-    window.
+    If the gap spans the farthest neighbors of both sides, no validation window shares a frame with a training window.
     """
     numbers: dict[str, set[int]] = {}
     for frame in frames:
@@ -96,10 +95,10 @@ def hold_out_tails(frames: Sequence[Frame], share: float, gap: int) -> Parts:
 
 
 def hold_out(frames: Sequence[Frame], share: float, gap: int, seed: int) -> Parts:
-    """Hold out whole drives, drawn by seed, where there are ten or more; the tails of all drives where there are fewer.
+    """Hold out whole drives, drawn by seed, if there are ten or more; otherwise the ends of all drives.
 
-    Drives are added until they hold the share; a drive that would exceed twice the share is passed over. ``gap`` frames
-    are left out between a training part and a held-out tail.
+    Drives are added until they make up the fraction ``share``; a drive that would exceed twice that is skipped. ``gap``
+    frames are left out between a training part and a held-out end.
     """
     counts = Counter(frame.drive for frame in frames)
     if len(counts) < 10:
@@ -119,14 +118,14 @@ class Division(NamedTuple):
 
     train: list[Frame]
     val: list[Frame]
-    test: list[Frame]  # those of ``val`` where no recordings are named for it
+    test: list[Frame]  # those of ``val`` if no recordings are named for it
     unused: Mapping[str, int]  # recording -> frames between its training and its validation part
-    settings: tuple[str, str]  # which name recordings for validation and test
+    settings: tuple[str, str]  # the settings that name recordings for validation and test
 
     def of(self, split: str) -> dict[str, list[int]]:
         """Return recording -> frame numbers of ``train``, ``val``, ``test`` or ``predict``.
 
-        Training names recordings that are too short for a training part too, without a frame, so that they are counted.
+        Training includes recordings too short for a training part, without frames, so that they are counted.
         """
         numbers: dict[str, list[int]] = {}
         for frame in {"train": self.train, "val": self.val}.get(split, self.test):
@@ -136,7 +135,7 @@ class Division(NamedTuple):
         return numbers
 
     def overlap(self) -> str | None:
-        """Say in one sentence what splits share, and how to keep them apart; None if they share nothing."""
+        """Return a sentence about what splits share, and how to separate them; None if they share nothing."""
         val, test = (f"data.{setting}" for setting in self.settings)
         held = {frame.drive for frame in self.val}
         shared = sorted({frame.drive for frame in self.train} & held)
@@ -146,33 +145,33 @@ class Division(NamedTuple):
             told.append(f"training and validation share {names} (validation has the end of each)")
             fix.append(f"{val}=[NAME]")
         if self.val and {*self.val} == {*self.test}:
-            told.append(f"validation and test are the same {len(self.val)} frames, on which best.ckpt is chosen")
+            told.append(f"validation, which chooses best.ckpt, and test are the same {len(self.val)} frames")
             fix.append(f"{test}=[{'ANOTHER' if fix else 'NAME'}]")
         if not told:
             return None
         whole = f"hold out whole recordings with {' and '.join(fix)}"
-        return f"{'; '.join(told)}: for scores that hold on other roads, {whole}"
+        return f"{'; '.join(told)}: for scores that also hold on other roads, {whole}"
 
 
 def divide(
     frames: Mapping[str, Sequence[int]], held: Mapping[str, Sequence[str]], share: float, gap: int, seed: int
 ) -> Division:
-    """Divide recordings: into those named for validation and test, or by holding out a share; see `hold_out`.
+    """Divide recordings: into those named for validation and test, or by holding out a fraction; see `hold_out`.
 
     Args:
         frames: Recording -> frame numbers.
-        held: What the setting that names recordings for validation is called, then that for test -> names or patterns.
-        share: To hold out where none are named for validation.
-        gap: Frames left out before a held-out tail.
-        seed: Decides what is drawn.
+        held: Name of the setting for validation, then of that for test -> names or patterns of recordings.
+        share: Fraction to hold out if none are named for validation.
+        gap: Frames left out before a held-out end.
+        seed: Seed of the random choice.
     """
     (val_setting, val_names), (test_setting, test_names) = held.items()
     test = matching(test_names, list(frames), test_setting)
     for pattern in val_names:
         if set(both := matching([pattern], list(frames), val_setting)) <= set(test):
             raise ConfigError(
-                f"{val_setting} and {test_setting} both name {', '.join(both)}; name each in one of them, or leave "
-                f"{test_setting} out, to test on what validates"
+                f"{val_setting} and {test_setting} both name {', '.join(both)}; name each in only one of them, or "
+                f"leave {test_setting} out to test on the validation frames"
             )
     named = [name for name in matching(val_names, list(frames), val_setting) if name not in test]
 
@@ -187,14 +186,14 @@ def divide(
 
 
 def matching(patterns: Sequence[str], names: Sequence[str], setting: str) -> list[str]:
-    """Return the names that fit any of the patterns, such as ``night_*``; one that fits none is an error."""
+    """Return the names that match any of the patterns, such as ``night_*``; a pattern without a match is an error."""
     found: list[str] = []
     for pattern in patterns:
         fitting = [name for name in names if name == pattern or fnmatchcase(name, pattern)]
         if not fitting:
             what = setting.rpartition("_")[2]
             raise ConfigError(
-                f"{setting} names '{pattern}', which fits no {what[:-1]}; {what}: {', '.join(names[:20]) or 'none'}"
+                f"{setting} names '{pattern}', which matches no {what[:-1]}; {what}: {', '.join(names[:20]) or 'none'}"
             )
         found += (name for name in fitting if name not in found)
     return found
@@ -202,7 +201,7 @@ def matching(patterns: Sequence[str], names: Sequence[str], setting: str) -> lis
 
 @dataclass(frozen=True)
 class Manifest:
-    """Frames to leave out of training and validation: what ``saunet doctor`` writes and ``data.manifest=`` reads."""
+    """Frames to leave out of training and validation, written by ``saunet doctor`` and read by ``data.manifest=``."""
 
     leave_out: Mapping[str, Mapping[str, Sequence[int]]]  # drive -> reason -> frame numbers
     numbering: Mapping[str, str] = field(default_factory=dict)
@@ -211,7 +210,7 @@ class Manifest:
     test_only: Set[str] = frozenset()
 
     def check(self, names: Set[str]) -> None:
-        """Check that the manifest is of these drives; warn where some of its drives are not among them."""
+        """Check that the manifest belongs to these drives; warn if some of its drives are not among them."""
         mine = self.leave_out.keys() - self.test_only
         strange = sorted(mine - names)
         if not strange:
@@ -219,22 +218,22 @@ class Manifest:
         listed = f"such as '{strange[0]}'" + (f"; here they are called '{min(names)}'" if names else "")
         if len(strange) == len(mine):
             raise DataError(
-                f"{self.path} names {len(mine)} recordings and none of them is trained on ({listed}...); make it with "
-                "saunet doctor and the data settings of this run, or set data.manifest=null"
+                f"{self.path} names {len(mine)} recordings, none of them in the training data ({listed}...); make it "
+                "with saunet doctor and the data settings of this run, or set data.manifest=null"
             )
         rank_zero_warn(
-            f"{self.path} names {len(mine)} recordings, and {len(strange)} of them are not trained on ({listed}...); "
-            "if they should be, run saunet doctor again with the data settings of this run"
+            f"{self.path} names {len(mine)} recordings, and {len(strange)} of them are not in the training data "
+            f"({listed}...); if they should be, run saunet doctor again with the data settings of this run"
         )
 
     def apply(self, selection: Selection, offsets: Sequence[int]) -> Selection:
-        """Return a selection without the frames to leave out, counted by reason."""
+        """Return a selection without the frames to leave out, which are counted by reason."""
         name, numbering = selection.drive.name, selection.drive.numbering
         if self.numbering.get(name, numbering) != numbering:
             raise DataError(
-                f"{self.path} was made for '{name}' with {self.numbering[name] or 'other settings'} and it is now read "
-                f"with {numbering or 'other settings'}, which counts its frames differently; "
-                "run saunet doctor again with the settings of this run, or set data.manifest=null"
+                f"{self.path} was made for '{name}' with {self.numbering[name] or 'other settings'} and is now read "
+                f"with {numbering or 'other settings'}, which numbers its frames differently; run saunet doctor "
+                "again with the settings of this run, or set data.manifest=null"
             )
         kept, left_out = list(selection.frames), dict(selection.left_out)
         for reason, numbers in self.leave_out.get(name, {}).items():
@@ -271,7 +270,7 @@ def read_manifest(path: str | Path) -> Manifest:
     leave_out, numbered = plain.get("leave_out"), plain.get("numbering", {})
     if not isinstance(leave_out, dict) or not isinstance(numbered, dict) or not all(map(_is_entry, leave_out.values())):
         raise DataError(
-            f"{path}: 'leave_out' must map each drive to reasons and these to lists of frame numbers, such as "
+            f"{path}: 'leave_out' must map each drive to reasons, and each reason to frame numbers, such as "
             '{"clip l": {"static": [4, 5]}}'
         )
     test_only = frozenset(map(str, plain.get("test_only") or ()))
@@ -296,7 +295,7 @@ def median_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
 def optical_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the optical flow between two images, h x w x 2, in pixels of an image 320 pixels wide.
 
-    Gray images are taken as they are: those of `gray`, so that none is converted twice, or of another width.
+    Gray images are used as they are: those from `gray`, so that none is converted twice, or of another width.
     """
     before, after = gray(first), gray(second)
     flow = np.zeros((*before.shape, 2), np.float32)
@@ -305,7 +304,7 @@ def optical_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray
 
 
 def gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an RGB image as a gray one, 320 pixels wide; a gray image itself."""
+    """Return an RGB image in gray, 320 pixels wide; a gray image unchanged."""
     if image.ndim == 2:
         return image
     height = max(32, round(image.shape[0] * FLOW_WIDTH / image.shape[1]))
@@ -314,7 +313,7 @@ def gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def static_by_flow(drive: Drive, frames: Sequence[int], min_flow: float, *, skip_unreadable: bool = False) -> set[int]:
-    """Return the frames that look like the frame before them (after them for the first), each image decoded once."""
+    """Return the frames that look like the previous frame (the first: like the next), decoding each image once."""
     existing, wanted = set(drive.indices), set(frames)
     static: set[int] = set()
     last: tuple[int, NDArray[np.uint8]] | None = None
@@ -325,7 +324,7 @@ def static_by_flow(drive: Drive, frames: Sequence[int], min_flow: float, *, skip
         except DataError:
             if not skip_unreadable:
                 raise
-            existing.discard(frame)  # the frame after it is then judged as a first one
+            existing.discard(frame)  # the next frame is then judged like a first one
             continue
         small = gray(image)
         if last is not None and last[0] == frame - 1 and median_flow(last[1], small) < min_flow:
@@ -337,9 +336,9 @@ def static_by_flow(drive: Drive, frames: Sequence[int], min_flow: float, *, skip
 
 
 def moving(selection: Selection, *, by_speed: bool, skip_unreadable: bool = False) -> Selection:
-    """Return a selection without the frames in which the car stands, and their count as ``static``.
+    """Return a selection without the frames in which the car stands still, counted as ``static``.
 
-    They teach nothing, since nothing moves between neighbors.
+    Nothing can be learned from them, because nothing moves between neighbors.
     """
     drive, existing = selection.drive, set(selection.drive.indices)
     frames = [frame for frame in selection.frames if frame in existing]
@@ -352,12 +351,12 @@ def moving(selection: Selection, *, by_speed: bool, skip_unreadable: bool = Fals
 
 
 def has_speed(selection: Selection, skip_unreadable: bool = False) -> bool:
-    """Return whether the speed is known in any of the frames."""
+    """Return whether the speed is known for any of the frames."""
     return any(_speed(selection.drive, frame, skip_unreadable) is not None for frame in selection.frames)
 
 
 def _speed(drive: Drive, frame: int, skip_unreadable: bool) -> float | None:
-    """Return the speed in m/s; None where it is unknown, with ``skip_unreadable`` also for a broken record."""
+    """Return the speed in m/s; None if unknown, and with ``skip_unreadable`` also for a broken record."""
     try:
         return drive.speed(frame)
     except DataError as error:
@@ -368,7 +367,7 @@ def _speed(drive: Drive, frame: int, skip_unreadable: bool) -> float | None:
 
 
 def with_truth(selection: Selection) -> Selection:
-    """Return a selection without the frames that have no ground truth; frames that do not exist stay, to be counted."""
+    """Return a selection without the frames that have no ground truth; missing frames stay, to be counted."""
     existing = set(selection.drive.indices)
     have = [f for f in selection.frames if f not in existing or selection.drive.has_depth(f)]
     lost = len(selection.frames) - len(have)
@@ -384,7 +383,7 @@ def with_poses(selection: Selection, offsets: Sequence[int]) -> Selection:
 
 
 def readable(selection: Selection, offsets: Sequence[int], with_depth: bool) -> Selection:
-    """Return a selection without the frames that cannot be read, themselves or a neighbor, each decoded once."""
+    """Return a selection without frames that, or whose neighbors, cannot be read; each is decoded once."""
     drive, window = selection.drive, (0, *offsets)
     broken = set()
     for frame in sorted({each + offset for each in selection.frames for offset in window}.intersection(drive.indices)):

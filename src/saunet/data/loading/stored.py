@@ -1,10 +1,10 @@
-"""What is made of recordings beforehand and kept in files: depth maps, smaller copies of images, projected LiDAR.
+"""Files made from recordings beforehand: depth maps, smaller copies of images, projected LiDAR.
 
 - Depth maps of a recording lie in ``depth_<kind>/<side>/<frame>.png``, beside its images or under the same name in a
-  folder of their own, as KITTI stores depth (16 bits, 256 steps a unit); ``maps.json`` says how they were made.
-- ``cache.json`` of an image cache says what all copies have in common; ``frames.json`` of each recording lists its
-  frames, and is written last, so that a recording without it is not finished.
-- A LiDAR map is named by a hash of all that it depends on, so that there is nothing to invalidate.
+  folder of their own, as KITTI stores depth (16 bits, 256 steps per unit); ``maps.json`` says how they were made.
+- ``cache.json`` of an image cache holds what all copies have in common; ``frames.json`` of each recording lists its
+    frames and is written last, so a recording without it is incomplete.
+- A LiDAR map is named by a hash of everything it depends on, so nothing ever needs invalidating.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _place(name: str) -> tuple[Path, str]:
 
 
 class DepthMaps:
-    """Depth maps of one kind: dense depth from LiDAR, or what another model predicts."""
+    """Depth maps of one kind: dense depth from LiDAR, or another model's predictions."""
 
     def __init__(self, kind: MapKind, folder: str | Path | None = None) -> None:
         one_of("kind of depth maps", kind, (*DENSE_KINDS, "teacher"))
@@ -54,7 +54,7 @@ class DepthMaps:
         below, side = _place(drive.name)
         base = drive.folder if self.folder is None else self.folder / below
         if base is None:
-            raise DataError(f"'{drive.name}' has no folder beside which depth maps could lie; set data.maps")
+            raise DataError(f"'{drive.name}' has no folder to store depth maps beside; set data.maps")
         return base / f"depth_{self.kind}" / side
 
     def path(self, drive: Drive, frame: int) -> Path:
@@ -64,7 +64,7 @@ class DepthMaps:
         return {int(path.stem) for path in self.home(drive).glob("*.png") if path.stem.isdecimal()}
 
     def read(self, drive: Drive, frame: int) -> NDArray[np.float32] | None:
-        """Return a frame's map, h x w, 0 where unknown; None where there is none."""
+        """Return a frame's map, h x w, 0 where unknown; None if there is none."""
         path = self.path(drive, frame)
         if not path.is_file():
             return None
@@ -82,18 +82,18 @@ class DepthMaps:
             raise DataError(f"{path} is missing or damaged; delete {path.parent} and make its maps again") from reason
         if not (math.isfinite(factor) and factor > 0):
             raise DataError(
-                f"{path}: factor is {factor:g}; stored depth is true depth times it, so it must be a positive number: "
-                f"delete {path.parent} and make its maps again"
+                f"{path}: factor is {factor:g}; stored depth is true depth times this factor, so it must be a "
+                f"positive number: delete {path.parent} and make its maps again"
             )
         if version != VERSION:
             raise DataError(
-                f"the depth maps in {path.parent} have version {version} and this is for {VERSION}; "
-                "delete the folder and make its maps again"
+                f"the depth maps in {path.parent} have version {version}, but version {VERSION} is required; delete "
+                "the folder and make its maps again"
             )
         return dict(info)
 
     def claim(self, drive: Drive, made_from: Mapping[str, Any], factor: float = 1.0) -> float:
-        """Write down how a recording's maps are made, before the first; maps there must be made the same way."""
+        """Record how a recording's maps are made, before the first one; existing maps must be made the same way."""
         path = self.home(drive) / MAPS
         made = json.loads(json.dumps(dict(made_from)))
         if path.exists():
@@ -118,13 +118,13 @@ class DepthMaps:
         if lacking:
             raise DataError(
                 f"{len(lacking)} of {sum(len(frames) for _, frames in wanted)} frames have no {self.kind} depth map, "
-                f"the first {lacking[0]}; make them: {command}"
+                f"such as {lacking[0]}; make them: {command}"
             )
 
 
 @dataclass(frozen=True, slots=True)
 class CacheSettings:
-    """What all copies of a cache have in common."""
+    """Settings that all copies of a cache have in common."""
 
     height: int
     width: int
@@ -142,7 +142,7 @@ class CacheSettings:
 
 
 class ImageCache:
-    """A folder of smaller copies, decoded in a fraction of the time; made by ``saunet prepare cache``."""
+    """A folder of smaller copies made by ``saunet prepare cache``, which decode in a fraction of the time."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder).expanduser()
@@ -152,7 +152,7 @@ class ImageCache:
         plain = self._json(path)
         if plain.get("version") != VERSION:
             raise DataError(
-                f"the cache at {self.folder} has version {plain.get('version')} and this is for {VERSION}; "
+                f"the cache at {self.folder} has version {plain.get('version')}, but version {VERSION} is required; "
                 "delete it and make it again with saunet prepare cache"
             )
         try:
@@ -178,19 +178,19 @@ class ImageCache:
         return plain
 
     def check_origin(self, drive: Drive, frames: dict[str, Any]) -> None:
-        """Check that copies were made from the images that a recording has now."""
+        """Check that copies were made from a recording's current images."""
         made_from, now = frames["native"], list(drive.frame_size or frames["native"])
         remedy = f"delete {self.home(drive)} and complete the cache: {self._command()}"
         if made_from != now:
             raise DataError(
-                f"the copies of '{drive.name}' in the cache come from images of {made_from[0]}x{made_from[1]} and they "
-                f"are {now[0]}x{now[1]} (height x width) now; {remedy}"
+                f"the copies of '{drive.name}' in the cache were made from images of {made_from[0]}x{made_from[1]} "
+                f"(height x width), which are now {now[0]}x{now[1]}; {remedy}"
             )
         if frames.get("origin", "") != drive.origin:
             raise DataError(
-                f"the copies of '{drive.name}' in the cache were made from other files, with another camera or with "
-                f"other settings (data.fps, parallax, static, crop, max_width), which changes what its frames are; use "
-                f"the same, or {remedy}"
+                f"the copies of '{drive.name}' in the cache were made from other files, another camera or other "
+                "settings (data.fps, parallax, static, crop, max_width), so they are other frames; use the same, or "
+                f"{remedy}"
             )
 
     def drive(self, drive: Drive, needed: Iterable[int] = ()) -> CachedDrive:
@@ -207,7 +207,7 @@ class ImageCache:
         return CachedDrive(drive, self, frames)
 
     def _command(self) -> str:
-        return f"saunet prepare cache root=... folder={self.folder} (data=... data.root=... where it is not KITTI raw)"
+        return f"saunet prepare cache root=... folder={self.folder} (data=... data.root=... if it is not KITTI raw)"
 
     @staticmethod
     def _json(path: Path) -> dict[str, Any]:
@@ -222,7 +222,7 @@ def _damaged(path: Path) -> DataError:
 
 
 class CachedDrive(DriveProxy):
-    """A recording whose images are the cache's; in everything else the recording itself."""
+    """A recording with its images from the cache, and everything else from the recording itself."""
 
     def __init__(self, drive: Drive, cache: ImageCache, frames: dict[str, Any]) -> None:
         super().__init__(drive)
@@ -253,15 +253,15 @@ class CachedDrive(DriveProxy):
 def check_enlarged(
     cache: ImageCache, drives: Iterable[CachedDrive], size: tuple[int, int], margin: tuple[int, int]
 ) -> None:
-    """Check that training does not enlarge copies of originals that are larger: detail that is there would be lost."""
+    """Check that training does not enlarge copies of larger originals: existing detail would be lost."""
     copies, loaded = (cache.settings.height, cache.settings.width), (size[0] + margin[0], size[1] + margin[1])
     room = [tuple(map(min, loaded, drive.originals)) for drive in drives]
     if not any(each[0] > copies[0] or each[1] > copies[1] for each in room):
         return
     told = (
-        f"the cache at {cache.folder} holds images of {copies[0]}x{copies[1]} (height x width) and training loads "
-        f"{loaded[0]}x{loaded[1]}, so that they are enlarged though the originals are larger; "
-        f"make another with height={loaded[0]} width={loaded[1]}, or set data.height, data.width or data.crop_margin"
+        f"the cache at {cache.folder} holds images of {copies[0]}x{copies[1]} (height x width) but training loads "
+        f"{loaded[0]}x{loaded[1]}, so they are enlarged although the originals are larger; make another with "
+        f"height={loaded[0]} width={loaded[1]}, or set data.height, data.width or data.crop_margin"
     )
     if any(min(each[0], size[0]) > copies[0] or min(each[1], size[1]) > copies[1] for each in room):
         raise ConfigError(told)
@@ -269,7 +269,7 @@ def check_enlarged(
 
 
 class CachedTruth(DriveProxy):
-    """A drive whose projected ground truth is kept in a folder; in everything else the drive itself."""
+    """A drive that keeps its projected ground truth in a folder, and is otherwise the drive itself."""
 
     def __init__(self, drive: Drive, folder: Path) -> None:
         super().__init__(drive)
@@ -285,18 +285,18 @@ class CachedTruth(DriveProxy):
         return depth
 
     def truth_path(self, index: int) -> Path | None:
-        """Return the file of a frame's map; None where the drive's ground truth is not computed."""
+        """Return the file of a frame's map; None if the drive's ground truth is not computed."""
         key = self._drive.depth_key(index)
         return None if key is None else self._folder / key[:2] / f"{key[2:32]}.npz"
 
 
 def cache_truths(drives: list[Drive], folder: str | Path) -> None:
-    """Replace the drives of a list by ones that keep what ground truth they compute."""
+    """Replace the drives of a list with ones that keep the ground truth they compute."""
     drives[:] = [CachedTruth(drive, Path(folder).expanduser()) for drive in drives]
 
 
 def _read_truth(path: Path) -> NDArray[np.float32] | None:
-    """Return a map; None where there is none, or one that a failing disk has damaged and that is made anew."""
+    """Return a map; None if there is none, or if a failing disk damaged it, so that it is made again."""
     try:
         stored = read_arrays(path)
         depth = np.zeros(tuple(stored["size"]), np.float32)

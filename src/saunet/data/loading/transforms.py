@@ -1,6 +1,6 @@
-"""From decoded bytes to network input, on the device: crop, flip and color, with intrinsics and truth that follow.
+"""From decoded bytes to network input, on the device: crop, flip and color; intrinsics and ground truth follow.
 
-The random numbers come with the batch (``draws``): a sample is augmented the same way on any number of devices or
+The random numbers come with the batch (``draws``): a sample is augmented the same way with any number of devices or
 workers, and nothing here waits for the device.
 """
 
@@ -26,13 +26,13 @@ Target = Literal["target_depth", "target_teacher", "target_mask"]
 TARGETS: tuple[Target, ...] = ("target_depth", "target_teacher", "target_mask")
 """Maps at the size of the frames, which follow crops and flips."""
 JITTER = 0.2  # factors of brightness, contrast and saturation are drawn from 1 ± this
-HUE = 0.1  # part of the color circle by which hue turns at most
+HUE = 0.1  # largest change of hue, as a fraction of the color circle
 
 
 def crop(
     maps: Shaped[Tensor, "b n c h w"], left: Int[Tensor, " b"], top: Int[Tensor, " b"], height: int, width: int
 ) -> Shaped[Tensor, "b n c {height} {width}"]:
-    """Cut one window a sample out of its maps."""
+    """Cut one window out of each sample's maps."""
     rows = top[:, None] + torch.arange(height, device=maps.device)
     columns = left[:, None] + torch.arange(width, device=maps.device)
     batch = torch.arange(len(maps), device=maps.device)
@@ -62,8 +62,8 @@ def jitter_color(
 ) -> Float[Tensor, "b n 3 h w"]:
     """Change the colors (RGB in [0, 1]) of the chosen samples; all frames of a sample change in the same way.
 
-    Brightness, contrast and saturation are factors; hue turns the color circle, in radians. The frames of a sample are
-    treated as one tall picture, so that they share even the mean gray that contrast turns around.
+    Brightness, contrast and saturation are factors; hue is a rotation of the color circle, in radians. The frames of a
+    sample are treated as one tall picture, so they even share the mean gray that contrast is relative to.
     """
     b, n, c, h, w = frames.shape
     tall = frames.transpose(1, 2).reshape(b, c, n * h, w)
@@ -76,9 +76,9 @@ def jitter_color(
 
 
 class Augment(nn.Module):
-    """`FrameBatch` with ``draws`` -> `TrainBatch`: random window, flip, colors; one draw for all frames of a sample.
+    """`FrameBatch` with ``draws`` -> `TrainBatch`: random window, flip and colors, the same for all frames of a sample.
 
-    The loss images keep their colors.
+    The images for the loss keep their colors.
     """
 
     def __init__(self, height: int, width: int, flip_prob: float = 0.5, color_jitter_prob: float = 0.5) -> None:
@@ -120,7 +120,7 @@ class Augment(nn.Module):
 
 
 class Prepare(nn.Module):
-    """`FrameBatch` -> `EvalBatch`: the window in the middle, nothing random; ground truth stays at its native size."""
+    """`FrameBatch` -> `EvalBatch`: the central window, nothing random; ground truth stays at its native size."""
 
     def __init__(self, height: int, width: int) -> None:
         super().__init__()
@@ -148,8 +148,8 @@ def _margin(frames: Tensor, height: int, width: int) -> tuple[int, int]:
     rows, columns = frames.shape[-2:]
     if rows < height or columns < width:
         raise DataError(
-            f"frames of {rows}x{columns} are smaller than the {height}x{width} images to be cut from them; "
-            "load them larger"
+            f"frames of {rows}x{columns} are smaller than the {height}x{width} images to cut from them; load them "
+            "larger"
         )
     return rows - height, columns - width
 

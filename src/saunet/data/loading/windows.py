@@ -1,6 +1,6 @@
-"""Frame windows as samples: a target frame, its neighbors in time, its stereo view, and what truth there is.
+"""Frame windows as samples: a target frame, its neighbors in time, its stereo view, and any ground truth.
 
-A window is usable when the frames at all offsets exist. What is left out is counted, never silently dropped.
+A window is usable if the frames at all offsets exist. Frames left out are counted, never silently dropped.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ from saunet.types import FrameBatch
 DRAWS = 8  # random numbers that come with each training sample; see `saunet.data.loading.transforms.Augment`
 Odometer = Callable[[Drive, int, int], float]
 """Gives the meters traveled between two frames of a drive, NaN where unknown."""
-_SAME_K = 0.5  # pixels by which the intrinsics of two cameras may differ and still be taken for one
-_PATIENCE = 100  # samples in a row that may be broken before it is the data set that is, not a file
+_SAME_K = 0.5  # pixels by which the intrinsics of two cameras may differ and still count as equal
+_PATIENCE = 100  # broken samples in a row after which the data set, not a single file, is considered broken
 
 
 POINTS = 128
-"""Tracked points of a window that come with a sample, at most."""
+"""Most tracked points of a window that come with a sample."""
 
 
 class Selection(NamedTuple):
-    """The frames of one drive that a split asks for."""
+    """The frames of one drive that a split uses."""
 
     drive: Drive
     frames: Sequence[int]  # numbers of the target frames wanted
     left_out: Mapping[str, int] = {}
-    """Frames already left out and why: ``{"static": 12}``."""
+    """Number of frames already left out, by reason: ``{"static": 12}``."""
 
 
 class Item(NamedTuple):
-    """What a training sampler asks of `WindowDataset`: which sample, and the seed of its random numbers."""
+    """A training sampler's request to `WindowDataset`: which sample, and the seed of its random numbers."""
 
     sample: int
     seed: int
@@ -81,7 +81,7 @@ def find_windows(
 ) -> tuple[list[tuple[int, int]], list[Usage]]:
     """Find the frames whose neighbors at all offsets exist, with no gap in time between them.
 
-    The windows are (position in ``selections``, frame number); there is one `Usage` per drive.
+    Windows are (position in ``selections``, frame number); there is one `Usage` per drive.
     """
     windows, usage = [], []
     first, last = min((0, *offsets)), max((0, *offsets))
@@ -108,15 +108,14 @@ def find_windows(
 
 
 class WindowDataset(Dataset[dict[str, Any]]):
-    """Samples of `saunet.types.FrameBatch`, one a window.
+    """Samples of `saunet.types.FrameBatch`, one per window.
 
-    ``dataset[i]`` is a sample; ``dataset[Item(i, seed)]`` adds the random numbers that augmentation uses, drawn from
-    the seed alone, so that they do not depend on workers or devices; a list of either is a list of samples, ready for
-    `collate`.
+    ``dataset[i]`` is a sample; ``dataset[Item(i, seed)]`` adds the random numbers for augmentation, drawn from the seed
+    alone and thus independent of workers and devices; a list of either is a list of samples, ready for `collate`.
 
-    ``windows`` are those of `find_windows`. Frames have the size asked for and ``margin`` (rows, columns) more, room
-    for a random crop. Ground truth (``with_depth``) comes at its native size; target depth and ``maps``, by key, at the
-    size of the frames, 0 where unknown. The stereo view is the last source.
+    ``windows`` come from `find_windows`. Frames have the requested size plus ``margin`` (rows, columns), room for a
+    random crop. Ground truth (``with_depth``) comes at its native size; target depth and ``maps``, by key, at the size
+    of the frames, 0 where unknown. The stereo view is the last source.
     """
 
     def __init__(
@@ -162,7 +161,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         return sample_name(self.drives[position].name, frame)
 
     def fingerprint(self) -> str:
-        """Return the SHA-256 of the sorted sample names, one a line: equal for equal sets of frames."""
+        """Return the SHA-256 of the sorted sample names, one per line: equal for equal sets of frames."""
         return fingerprint([self.name(index) for index in range(len(self))])
 
     def _sample(self, index: int) -> dict[str, Any]:
@@ -176,8 +175,8 @@ class WindowDataset(Dataset[dict[str, Any]]):
         for what, image in images.items():
             if image.ndim != 3 or image.shape != target.shape:
                 raise DataError(
-                    f"{what} of '{drive.name}' has shape {tuple(image.shape)} "
-                    f"where its neighbor {frame} has {tuple(target.shape)}; frames of a drive share one size"
+                    f"{what} of '{drive.name}' has shape {tuple(image.shape)} but its neighbor {frame} has "
+                    f"{tuple(target.shape)}; all frames of a drive must have one size"
                 )
         height, width = self.size
         frames = np.stack([resize(image, height, width).transpose(2, 0, 1) for image in images.values()])
@@ -222,7 +221,7 @@ class WindowDataset(Dataset[dict[str, Any]]):
         T_world_tgt, *T_world_src = (drive.pose(frame + offset) for offset in (0, *self.offsets))
         known = [pose for pose in T_world_src if pose is not None]
         if T_world_tgt is None or len(known) < len(T_world_src):
-            raise DataError(f"'{drive.name}' has no pose at frame {frame} or its neighbors; load it without poses")
+            raise DataError(f"'{drive.name}' has no pose for frame {frame} or its neighbors; load it without poses")
         return np.array([np.linalg.inv(pose) @ T_world_tgt for pose in known]).reshape(-1, 4, 4)
 
 
@@ -251,7 +250,7 @@ def tracked_poses(
     K: Float[torch.Tensor, "b 3 3"],
     depth: Float[torch.Tensor, "b 1 h w"],
 ) -> Float[torch.Tensor, "b s 4 4"]:
-    """Return what a pose network would, T_src_tgt in the unit of ``depth``, from tracked points; NaN where unknown."""
+    """Return T_src_tgt from tracked points, as a pose network would, in the unit of ``depth``; NaN if unknown."""
     frames = (torch.cat([target[:, None], sources], 1) * 255).round().byte().permute(0, 1, 3, 4, 2).cpu().numpy()
     found = [tracked_motions(*each) for each in zip(frames, K.double().cpu().numpy(), strict=True)]
     motions, points = (torch.stack(each).to(depth.device) for each in zip(*found, strict=True))
@@ -259,7 +258,7 @@ def tracked_poses(
 
 
 class SkippingWindows(WindowDataset):
-    """Training windows in which a sample that cannot be read is replaced by the next one, once named and counted.
+    """Training windows that name and count a sample that cannot be read, and replace it with the next one.
 
     The count is shared by all loader processes.
     """
@@ -289,7 +288,7 @@ class SkippingWindows(WindowDataset):
 
 
 def collate(samples: Sequence[Mapping[str, Any]] | Mapping[str, Any]) -> FrameBatch:
-    """Stack samples to a batch; ground truth of different sizes is padded with 0 at the bottom and right."""
+    """Stack samples into a batch; ground truth of different sizes is padded with 0 at the bottom and right."""
     rows = [samples] if isinstance(samples, Mapping) else list(samples)
     batch: dict[str, Any] = {}
     for key in dict.fromkeys(key for row in rows for key in row):
@@ -314,8 +313,8 @@ def _pad(maps: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor, torch.Tenso
 def resize_depth(depth: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
     """Resize a depth map without mixing values.
 
-    A sparse map (less than half of it known) moves each measurement to the pixel where it now falls, the nearest wins;
-    a dense map is sampled at the new pixel centers.
+    In a sparse map (less than half of it known) each measurement moves to the pixel where it now falls, and the nearest
+    wins. A dense map is sampled at the new pixel centers.
     """
     if depth.shape == (height, width):
         return np.ascontiguousarray(depth, dtype=np.float32)
@@ -331,7 +330,7 @@ def resize_depth(depth: NDArray[np.float32], height: int, width: int) -> NDArray
 def nearest_map(
     rows: NDArray[np.int64], columns: NDArray[np.int64], values: NDArray[Any], size: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Scatter values into a map of zeros, height x width; where several fall on one pixel the smallest stays."""
+    """Scatter values into a map of zeros, height x width; the smallest of several in a pixel wins."""
     order = np.argsort(-values, kind="stable")
     out = np.zeros(size, np.float32)
     out[rows[order], columns[order]] = values[order]
@@ -344,8 +343,8 @@ def other_view(drive: Drive) -> tuple[Drive, NDArray[np.float64]]:
     T_stereo_cam = None if other is None else drive.T_stereo_cam
     if other is None or T_stereo_cam is None:
         raise DataError(
-            f"'{drive.name}' is a recording of one camera, so it has no stereo view; set data.stereo=false, or use "
-            "data of two calibrated cameras"
+            f"'{drive.name}' comes from one camera, so it has no stereo view; set data.stereo=false, or use data of "
+            "two calibrated cameras"
         )
     return other, T_stereo_cam
 
@@ -364,13 +363,13 @@ def stereo_image(drive: Drive, index: int) -> tuple[NDArray[np.uint8], NDArray[n
 
 
 def measured_distance(drive: Drive, first: int, second: int) -> float:
-    """Return the meters traveled between two frames as the recording itself knows them; NaN where it does not."""
+    """Return the meters traveled between two frames according to the recording; NaN if unknown."""
     known = drive.distance(first, second)
     return math.nan if known is None else known
 
 
 def reach(offsets: Sequence[int]) -> int:
-    """Return how many frames the last frame of a window lies behind its first."""
+    """Return the number of frames from the first to the last frame of a window."""
     return max((0, *offsets)) - min((0, *offsets))
 
 

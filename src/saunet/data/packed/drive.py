@@ -1,4 +1,4 @@
-"""A recording in packed data: what a `Drive` says is stored, image and depth in shards, the rest in arrays."""
+"""A recording in packed data: images and depth in shards, everything else that a `Drive` provides in arrays."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class PackedDrive(Drive):
     def __init__(self, store: Store, facts: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
         self._store, self._facts, self._arrays = store, facts, arrays
         self.other: PackedDrive | None = None
-        """The other camera's recording, set by who loads both."""
+        """The other camera's recording, set by the loader of both."""
         self._indices: list[int] = arrays["indices"].tolist()
         self._distances = {(first, second): way for first, second, way in arrays["distances"].tolist()}
 
@@ -59,7 +59,7 @@ class PackedDrive(Drive):
         return self._indices
 
     def _at(self, key: str, index: int) -> Any:
-        """Return what is stored for a frame; one entry stands for all frames, and none for unknown."""
+        """Return the stored entry of a frame; a single entry applies to all frames, and none means unknown."""
         values = self._arrays.get(key)
         if values is None or len(values) == 1:
             return None if values is None else values[0]
@@ -152,9 +152,9 @@ class _Absent(Drive):
 
 
 def describe(drive: Drive, frames: Sequence[int], offsets: Sequence[int], ways: bool) -> tuple[dict[str, Any], Any]:
-    """Return the facts of a recording, and its arrays but those of images and maps; only ``frames`` are told of."""
+    """Return the facts of a recording's ``frames``, and its arrays except those of images and maps."""
     kept = set(frames)
-    if not frames:  # one that a split names and that is not there: nothing can be asked of it
+    if not frames:  # named by a split but missing, so it has no facts
         drive = _Absent(drive.name)
     T_stereo_cam, gaps = drive.T_stereo_cam, drive.gaps
     facts: dict[str, Any] = {
@@ -166,7 +166,7 @@ def describe(drive: Drive, frames: Sequence[int], offsets: Sequence[int], ways: 
         "condition": drive.condition,
         "frame_size": drive.frame_size,
     }
-    # A gap lies between frames, of which not all may be packed.
+    # The frames around a gap may not all be packed.
     lost = [max((frame for frame in frames if frame <= gap), default=None) for gap in gaps]
     facts |= {"gaps": sorted({frame for frame in lost if frame is not None})}
     facts |= {"T_stereo_cam": None if T_stereo_cam is None else T_stereo_cam.tolist()}

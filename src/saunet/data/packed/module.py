@@ -26,20 +26,20 @@ from saunet.io.plain import parse_json, read_arrays
 from saunet.registry import datamodules
 
 KEPT = ("protocol", "ground_truth", "target_depth", "with_pose", "stereo")
-"""Settings of the data module that was packed, which the packed data keep."""
+"""Settings of the original data module that packed data keep."""
 
 
 @datamodules.register("packed")
 class PackedDataModule(DepthDataModule):
     """A data set that ``saunet prepare pack`` wrote to a few large files, on a disk or in an object store.
 
-    Windows, splits, truth and what batches carry (depth, poses, the stereo view, another model's depth) are those of
-    the data module that was packed. Loader settings are free; ``seed`` decides order and augmentation.
+    Windows, splits, ground truth and the contents of batches (depth, poses, the stereo view, another model's depth) are
+    those of the data module that was packed. Loader settings are free; ``seed`` decides order and augmentation.
 
     Args:
         root: Folder of the packed data, or an address such as ``s3://bucket/name`` (extra ``stream``).
-        stream_cache: Folder on this machine for what was read from an address; None keeps nothing.
-        stream_cache_gb: Most that this folder takes.
+        stream_cache: Local folder that keeps what was read from an address; None keeps nothing.
+        stream_cache_gb: Largest size of that folder in gigabytes.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
@@ -65,7 +65,7 @@ class PackedDataModule(DepthDataModule):
         folder = Path(stream_cache).expanduser() if stream_cache else None
         self._store = Store(root if "://" in root else str(Path(root).expanduser().absolute()), folder, keep)
         self._facts: dict[str, Any] = {}
-        with contextlib.suppress(DataError):  # `select` says what is wrong once the data are needed
+        with contextlib.suppress(DataError):  # `select` reports the error once the data are needed
             self._open()
 
     @property
@@ -79,7 +79,7 @@ class PackedDataModule(DepthDataModule):
         return tuple(self._open()["protocols"])
 
     def _open(self) -> dict[str, Any]:
-        """Return the description, and take over its settings."""
+        """Return the description, and apply its settings."""
         if self._facts:
             return self._facts
         plain = parse_json(self._store.file(DESCRIPTION), f"{self.root}/{DESCRIPTION}", DataError)
@@ -99,8 +99,8 @@ class PackedDataModule(DepthDataModule):
         packed, wanted = ([0, *offsets] for offsets in (facts["offsets"], self.offsets))
         if min(wanted) < min(packed) or max(wanted) > max(packed):
             raise ConfigError(
-                f"offsets are {list(self.offsets)} and the data at {self.root} were packed for {facts['offsets']}; use "
-                "offsets within these, or pack them again with the larger ones"
+                f"offsets are {list(self.offsets)} but the data at {self.root} were packed for {facts['offsets']}; "
+                "use offsets within these, or pack them again with the larger ones"
             )
         drives = facts["splits"].get(split, [])
         arrays: dict[int, dict[str, NDArray[Any]]] = defaultdict(dict)
@@ -119,7 +119,7 @@ class PackedDataModule(DepthDataModule):
 
 
 class _PackedMaps(DepthMaps):
-    """Depth maps made beforehand, which lie in the pack."""
+    """Depth maps made beforehand, stored in the pack."""
 
     def __init__(self, key: str, kind: MapKind) -> None:
         super().__init__(kind)

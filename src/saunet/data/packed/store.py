@@ -1,7 +1,7 @@
-"""The files of a packed data set, wherever they are: shards, of which parts are read, and a description.
+"""The files of a packed data set, local or remote: shards that are read in parts, and a description.
 
-A shard is a tar archive without compression, so that any tool can look into it. What training reads are byte ranges
-of it: every order of samples costs the same, and nothing is downloaded that is not used.
+A shard is an uncompressed tar archive, so any tool can open it. Training reads byte ranges of it: every order of
+samples costs the same, and nothing unused is downloaded.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ DESCRIPTION, FORMAT = "pack.json", 1
 
 
 class Part(NamedTuple):
-    """Where bytes are: number of the shard, first byte and length."""
+    """Location of bytes: number of the shard, first byte and length."""
 
     shard: int
     start: int
@@ -33,9 +33,9 @@ def shard_name(number: int) -> str:
 class Store:
     """Reads whole files and parts of shards below a folder or an address such as ``s3://bucket/name``.
 
-    ``starts`` say where each shard begins in the pack. The first ``keep`` bytes of the pack are kept in the folder
-    ``cache`` once they were read: with shuffled epochs that serves as many reads as replacing the oldest would serve
-    few, and needs no agreement between processes.
+    ``starts`` has the position of each shard in the pack. The first ``keep`` bytes of the pack are kept in the folder
+    ``cache`` once they were read. With shuffled epochs that serves far more reads than replacing the oldest bytes
+    would, and processes need not coordinate.
     """
 
     def __init__(self, root: str, cache: Path | None = None, keep: int = 0) -> None:
@@ -79,9 +79,10 @@ class Store:
             return bytes(system.cat_file(f"{base}/{name}", start=start, end=end))
         except FileNotFoundError as reason:
             raise DataError(
-                f"{self.root}/{name} does not exist; set data.root to what saunet prepare pack has written completely"
+                f"{self.root}/{name} does not exist; set data.root to a complete folder written by saunet prepare pack"
             ) from reason
-        except Exception as reason:  # each kind of store has errors of its own
+        except Exception as reason:  # each kind of store has its own errors
             raise UnreadableError(
-                f"cannot read {self.root}/{name} ({type(reason).__name__}: {reason}); check connection and rights"
+                f"cannot read {self.root}/{name} ({type(reason).__name__}: {reason}); check the connection and "
+                "permissions"
             ) from reason

@@ -103,7 +103,7 @@ class CityscapesDataModule(FilesDataModule):
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
-        ConfigError: if a parameter is out of range or a word unknown.
+        ConfigError: if a parameter is out of range or a choice is unknown.
     """
 
     protocol = "cityscapes"

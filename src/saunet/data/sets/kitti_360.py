@@ -136,7 +136,7 @@ class Kitti360DataModule(FilesDataModule):
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
-        ConfigError: if a parameter is out of range or a word unknown.
+        ConfigError: if a parameter is out of range or a choice is unknown.
     """
 
     protocol = "kitti_360"

@@ -161,7 +161,7 @@ class NuScenesDataModule(FilesDataModule):
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
-        ConfigError: if a parameter is out of range or a word unknown.
+        ConfigError: if a parameter is out of range or a choice is unknown.
     """
 
     protocol = "nuscenes"

@@ -79,7 +79,7 @@ class TumDataModule(RecordingsDataModule):
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
-        ConfigError: if a parameter is out of range or a word unknown.
+        ConfigError: if a parameter is out of range or a choice is unknown.
     """
 
     protocol = "indoor"

@@ -57,7 +57,7 @@ class VirtualKittiDataModule(FilesDataModule):
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
-        ConfigError: if a parameter is out of range or a word unknown.
+        ConfigError: if a parameter is out of range or a choice is unknown.
     """
 
     protocol = "synthetic"

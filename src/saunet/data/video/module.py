@@ -292,7 +292,7 @@ class VideoDataModule(DepthDataModule):
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
-        ConfigError: if a parameter is out of range or a word unknown.
+        ConfigError: if a parameter is out of range or a choice is unknown.
     """
 
     neighbors = ("train", "val", "test")
