@@ -100,13 +100,13 @@ def test_a_missing_calibration_is_named(tmp_path):
     [
         ("R: 0 -1 0 0 0 -1 1 0 0", "R: 0 0 0 0 0 0 0 0 0", r"calib_velo_to_cam\.txt, line 2 \(R\).*not a rotation"),
         ("R: 0 -1 0 0 0 -1 1 0 0", "R: 0 -3 0 0 0 -3 3 0 0", r"calib_velo_to_cam\.txt, line 2 \(R\).*not a rotation"),
-        ("R: 0 -1 0 0 0 -1 1 0 0", "R: 0 1 0 0 0 -1 1 0 0", r"calib_velo_to_cam\.txt, line 2 \(R\).*mirrors"),
+        ("R: 0 -1 0 0 0 -1 1 0 0", "R: 0 1 0 0 0 -1 1 0 0", r"calib_velo_to_cam\.txt, line 2 \(R\).*reflection"),
         (
             "R_rect_00: 1 0 0 0 1 0 0 0 1",
             "R_rect_00: 2 0 0 0 2 0 0 0 2",
             r"calib_cam_to_cam\.txt, line 4.*not a rotation",
         ),
-        ("T: 0 0 0", "T: 0 0 0\nT: 1 0 0", r"calib_velo_to_cam\.txt, line 4 \(T\): this key is given twice"),
+        ("T: 0 0 0", "T: 0 0 0\nT: 1 0 0", r"calib_velo_to_cam\.txt, line 4 \(T\): this key appears twice"),
     ],
 )
 def test_rotations_that_are_none_and_keys_given_twice_are_refused(tmp_path, old, new, message):

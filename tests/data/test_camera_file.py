@@ -57,7 +57,7 @@ def test_an_unknown_camera_is_guessed_where_that_is_allowed(tmp_path):
     with pytest.raises(DataError, match=r"camera: unknown, which only data=video .*saunet calibrate video="):
         read_camera(path)
     for text in ("camera: unknown\nK: [500, 510, 321, 242]\n", "camera: mine\n"):
-        with pytest.raises(DataError, match=r"only 'unknown' is allowed, in place of K"):
+        with pytest.raises(DataError, match=r"only 'unknown' is allowed, instead of K"):
             read_camera(write(tmp_path, text), may_be_unknown=True)
 
 
@@ -166,7 +166,7 @@ def test_a_point_is_found_where_k_says_after_undistortion_crop_and_size(model, k
 
 def test_frames_of_another_size_are_named():
     lens = Lens(camera([]), 200, 320)
-    with pytest.raises(DataError, match=r"a.png is 100x50 .* where other frames of its clip are 320x200"):
+    with pytest.raises(DataError, match=r"a.png is 100x50 .* but other frames of its clip are 320x200"):
         lens(np.zeros((50, 100, 3), np.uint8), "a.png")
 
 

@@ -124,7 +124,7 @@ def test_the_radius_of_a_fold_is_that_of_the_formula_and_the_lens_is_refused():
         lens("pinhole", [-0.35, 0.0, 0.0, 0.0], 560.0, (720, 1280))
     middle = lens("pinhole", [-0.35, 0.0, 0.0, 0.0], 560.0, (720, 1280), fov=60.0)
     assert middle.K[0, 0] == pytest.approx(640 / np.tan(np.radians(30)))
-    with pytest.raises(DataError, match=r"fov is 100 and the straight picture of this lens is at most \d+ degrees"):
+    with pytest.raises(DataError, match=r"fov is 100, but the undistorted picture of this lens is at most \d+ degrees"):
         lens("pinhole", [-0.35, 0.0, 0.0, 0.0], 560.0, (720, 1280), fov=100.0)
 
 

@@ -172,7 +172,7 @@ def test_real_sequence(kitti_mini):
     [
         ("3 0 0 0 0 3 0 0 0 0 3 1", "not a rotation"),
         ("0 0 0 0 0 0 0 0 0 0 0 1", "not a rotation"),
-        ("-1 0 0 0 0 1 0 0 0 0 1 1", "mirrors"),
+        ("-1 0 0 0 0 1 0 0 0 0 1 1", "reflection"),
     ],
 )
 def test_poses_whose_rotation_is_none_are_refused(root, row, message):

@@ -296,7 +296,7 @@ def test_another_size_within_a_clip_and_a_camera_that_does_not_fit(tmp_path):
     make_clip(tmp_path / "r", "a", [*pictures[:5], pictures[5][:100], *pictures[6:]])
     data = module(tmp_path / "r", static="keep", val_share=0.0)
     data.setup("fit")
-    with pytest.raises(DataError, match=r"frame_5.png is 320x100 .* where other frames of its clip are 320x200"):
+    with pytest.raises(DataError, match=r"frame_5.png is 320x100 .* but other frames of its clip are 320x200"):
         list(data.train_dataloader())
     (tmp_path / "r" / "camera.yaml").write_text("image_size: [1920, 1080]\nK: [1500, 1512, 960, 540]\n")
     wrong = module(tmp_path / "r", static="keep", val_share=0.0)
@@ -375,7 +375,7 @@ def test_an_unknown_camera_is_estimated_once_from_all_its_clips(tmp_path, monkey
         np.testing.assert_allclose(drive.lens.K, [[0.7 * 288, 0, 159.5 - 32], [0, 0.7 * 288, 99.5], [0, 0, 1]])
         assert (drive.lens.model, drive.lens.coefficients) == ("division", (pytest.approx(-0.2 * 0.7**2),))
     assert asked == [(2, (128 / 288, 100 / 288))]  # a window a clip; the second time it is known
-    assert "known to 0.40% from 5 windows" in caplog.text
+    assert "known to within 0.40% from 5 windows" in caplog.text
     (kept,) = (tmp_path / "cache").glob("camera-*.yaml")  # for prediction, which takes no unknown camera
     assert f"{kept}, which saunet predict takes as undistort=" in caplog.text
     lens = Undistorter(read_camera(kept)).lens(200, 320)
@@ -413,7 +413,7 @@ def test_a_camera_called_unknown_keeps_what_its_file_says_beside_the_lens(tmp_pa
 def test_an_unknown_camera_that_nothing_tells_is_refused_or_guessed(tmp_path):
     make_clip(tmp_path, "a", frames(14), camera=None)
     data = module(tmp_path, camera="unknown")
-    with pytest.raises(DataError, match=r"cannot be known .*film a minute with turns.*model\.intrinsics=learned"):
+    with pytest.raises(DataError, match=r"cannot be estimated .*film a minute with turns.*model\.intrinsics=learned"):
         data.setup("fit")
     data = module(tmp_path, camera="unknown", guess_camera=True)
     data.setup("fit")

@@ -1,4 +1,4 @@
-"""Data module of the synthetic world: nothing to download, exact depth, pose and intrinsics."""
+"""Data module of the synthetic world: nothing to download; exact depth, poses and intrinsics."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class SyntheticDataModule(DepthDataModule):
         train_drives: Number of drives to train on.
         val_drives: Number of drives to validate on.
         test_drives: Number of drives to test on.
-        frames_per_drive: Length of each drive, at 10 frames a second.
-        moving_cars: Cars that move in each drive, by turns ahead and oncoming.
+        frames_per_drive: Length of each drive, at 10 frames per second.
+        moving_cars: Moving cars in each drive, alternately ahead and oncoming.
         camera_height: Meters above the road.
-        cache: Folder in which rendered drives are kept between runs; None renders them each time.
-        stereo: Batches carry the right camera's image, 0.54 m to the right, as one more source; with ``offsets: []`` it
-            is the only one.
-        **loading: Loader settings, as in `LoadOptions`; ``seed`` also decides the streets.
+        cache: Folder that keeps rendered drives between runs; None renders them each time.
+        stereo: Add the right camera's image, 0.54 m to the right, as one more source; with ``offsets: []`` it is the
+            only one.
+        **loading: Loader settings, as in `LoadOptions`; ``seed`` also chooses the streets.
 
     Raises:
         ConfigError: if a parameter is out of range.
@@ -53,7 +53,7 @@ class SyntheticDataModule(DepthDataModule):
 
     protocol = "synthetic"
     camera_height: float = 1.65
-    cacheable = False  # it renders, once, into a cache of its own
+    cacheable = False  # it renders once, into its own cache
     ground_truth = "exact"
 
     def __init__(
@@ -76,7 +76,9 @@ class SyntheticDataModule(DepthDataModule):
         for split, count in self.counts.items():
             positive(f"{split}_drives", count)
             if count > _SEEDS_A_SPLIT:
-                raise ConfigError(f"{split}_drives is {count}; at most {_SEEDS_A_SPLIT} drives a split are kept apart")
+                raise ConfigError(
+                    f"{split}_drives is {count}; at most {_SEEDS_A_SPLIT} different drives per split are possible"
+                )
         self.frames_per_drive = int(positive("frames_per_drive", frames_per_drive))
         self.moving_cars = int(positive("moving_cars", moving_cars, allow_zero=True))
         self.camera_height = positive("camera_height", camera_height)
@@ -108,7 +110,7 @@ class SyntheticDataModule(DepthDataModule):
     def driven(self) -> SyntheticDataModule:
         """Return a data module whose test drives are this one's training drives, at the size of its networks.
 
-        Whoever adapts to a clip wants its depth: the video was learned from, its true depth was not.
+        For adapting to a clip, whose depth is wanted: the video was learned from, its true depth was not.
         """
         other = copy.copy(self)
         other.crop_margin, other.datasets, other.usage = 0.0, {}, {}

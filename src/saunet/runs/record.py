@@ -189,8 +189,8 @@ class ModelRecord:
             before, now = getattr(self, name), getattr(new, name)
             if before != now:
                 raise CheckpointError(
-                    f"the checkpoint was trained with {name} {before} and this run has {now}; "
-                    "a resumed run continues the same training, so give the same settings, as `saunet resume RUN` does"
+                    f"the checkpoint was trained with {name} {before} but this run has {now}; a resumed run "
+                    "continues the same training, so give the same settings, as `saunet resume RUN` does"
                 )
 
     def check_registered(self) -> None:

@@ -103,7 +103,7 @@ def test_what_is_missing_or_broken_is_one_sentence(tmp_path):
     table = tmp_path / "a" / "poses.csv"
     lines = table.read_text().splitlines()
     table.write_text("\n".join([*lines[:-1], lines[-1].replace("90.0", "100")]))
-    with pytest.raises(DataError, match=r"poses\.csv has fov \[90\.0, 100\.0\]; a recording has one"):
+    with pytest.raises(DataError, match=r"poses\.csv has fov \[90\.0, 100\.0\]; a recording must have one"):
         module(tmp_path).setup("test")
     table.write_text("\n".join(lines[1:]))
     with pytest.raises(DataError, match=r"must start with the line frame,timestamp,x,"):

@@ -113,7 +113,7 @@ def test_a_broken_scene_is_named(tmp_path):
     root = set_trees.ddad(tmp_path, ("CAMERA_01",))
     scene = root / "000000" / "scene_beef.json"
     scene.write_text(scene.read_text().replace('"qw"', '"w"'))
-    with pytest.raises(DataError, match=r"scene_beef.json: lidar of sample 0 has rotation .*length 1"):
+    with pytest.raises(DataError, match=r"scene_beef.json: lidar of sample 0 has rotation .*unit quaternion"):
         module(root).setup("fit")
     scene.write_text(scene.read_text().replace('"pose"', '"position"'))
     with pytest.raises(DataError, match=r"scene_beef.json is not a scene of DDAD .*'pose'"):

@@ -125,7 +125,7 @@ def test_a_straight_fisheye_pixel_shows_what_the_lens_saw_there(root):
 def test_what_is_missing_is_said(root, tmp_path):
     with pytest.warns(UserWarning, match=r"6 of 7 train sequences are missing, the first .*drive_0000_sync"):
         module(root, train_sequences=kitti_360.TRAIN).setup("fit")
-    with pytest.raises(DataError, match=r"1 of 1 test sequences are missing.*name those that are there"):
+    with pytest.raises(DataError, match=r"1 of 1 test sequences are missing.*name existing ones"):
         module(root, test_sequences=["0018"]).setup("test")
     with pytest.raises(ConfigError, match=r"cameras is 'left'"):
         module(root, cameras=["left"])

@@ -63,7 +63,7 @@ def test_what_is_missing_is_counted_and_training_is_refused(root, tmp_path):
     assert COUNT == 134  # images of Test134
     with pytest.warns(UserWarning, match=r"132 of 134 test images are missing at .*Test134\.tar\.gz"):
         module(root / "Test134").setup("test")
-    with pytest.raises(ConfigError, match="make3d is single images to test on"):
+    with pytest.raises(ConfigError, match="make3d has only single test images"):
         module(root).setup("fit")
     with pytest.raises(DataError, match=r"no 'img-\*\.jpg' at .*unpack Test134\.tar\.gz"):
         module(tmp_path).setup("test")
@@ -75,5 +75,5 @@ def test_what_is_missing_is_counted_and_training_is_refused(root, tmp_path):
         data.setup("test")
     assert "1 without ground truth" in data.summary("test")
     maps[1].write_bytes(b"not MATLAB")
-    with pytest.raises(DataError, match=r"depth_sph_corr-b\.mat is no MATLAB file with a Position3DGrid"):
+    with pytest.raises(DataError, match=r"depth_sph_corr-b\.mat is not a readable MATLAB file with a Position3DGrid"):
         next(data.batches("test", "cpu"))

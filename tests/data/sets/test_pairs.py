@@ -115,7 +115,9 @@ def test_numbers_that_names_skip_are_no_neighbors(tmp_path):
 def test_what_is_missing_or_broken_is_one_sentence(tmp_path):
     write_image(tmp_path / "images" / "a.png")
     write_depth(tmp_path / "depth" / "b.npy", 1)
-    with pytest.raises(DataError, match=r"1 images and 1 depth maps below .* no two belong together; expected images/"):
+    with pytest.raises(
+        DataError, match=r"1 images and 1 depth maps below .* no image matches a depth map; expected images/"
+    ):
         module(tmp_path).setup("fit")
     with pytest.raises(DataError, match=r"no data root at .*gone"):
         module(tmp_path / "gone").setup("fit")
@@ -133,5 +135,5 @@ def test_what_is_missing_or_broken_is_one_sentence(tmp_path):
     (tmp_path / "rgb" / "a.jpg").unlink()
     write_image(tmp_path / "images" / "b.png")
     (tmp_path / "camera.yaml").write_text("image_size: [40, 24]\nK: [30, 30, 19.5, 11.5]\ndistortion: [0.1, 0, 0, 0]\n")
-    with pytest.raises(DataError, match=r"camera\.yaml describes bent images"):
+    with pytest.raises(DataError, match=r"camera\.yaml describes images with distortion"):
         module(tmp_path).setup("fit")

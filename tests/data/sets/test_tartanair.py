@@ -97,7 +97,7 @@ def test_what_is_missing_or_broken_is_one_sentence(tmp_path):
     folder = tmp_path / "P000"
     write_flight(folder)
     (folder / "pose_left.txt").write_text("0 0 0 0 0 0 1\n" * 4)
-    with pytest.raises(DataError, match=r"pose_left\.txt has 4 poses and there are images to number 5"):
+    with pytest.raises(DataError, match=r"pose_left\.txt has 4 poses but the images go up to number 5"):
         module(tmp_path).setup("fit")
     (folder / "pose_left.txt").unlink()
     with pytest.raises(DataError, match=r"without pose"):

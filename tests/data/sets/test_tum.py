@@ -101,7 +101,7 @@ def test_the_kinects_calibration_undistorts_images_and_depth_alike(tmp_path):
         np.testing.assert_allclose(bent, [150, 100], atol=0.4)
         assert np.abs([columns.mean() - 150, rows.mean() - 100]).max() > 2
     folder.rename(tmp_path / "desk")
-    with pytest.raises(ConfigError, match=r"'desk' does not say freiburg1, 2 or 3"):
+    with pytest.raises(ConfigError, match=r"'desk' has no freiburg1, 2 or 3"):
         module(tmp_path, calibration="kinect").setup("test")
 
 
@@ -118,7 +118,7 @@ def test_what_is_missing_or_broken_is_one_sentence(tmp_path):
     with pytest.raises(DataError, match="without pose"):
         module(tmp_path, with_pose=True).setup("fit")
     (folder / "rgb.txt").write_text("# nothing\n1305031102.0 rgb/gone.png\n")
-    with pytest.raises(DataError, match=r"rgb\.txt lists no file that is there"):
+    with pytest.raises(DataError, match=r"rgb\.txt lists no existing file"):
         module(tmp_path).setup("fit")
     (folder / "rgb.txt").write_text("soon rgb/gone.png\n")
     with pytest.raises(DataError, match=r"rgb\.txt, line 1: expected a time and a file name, got 'soon rgb/gone\.png'"):

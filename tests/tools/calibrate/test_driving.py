@@ -124,7 +124,7 @@ def test_a_focal_length_is_not_known_where_the_bend_is_not(curvatures: tuple[flo
 
 
 def test_what_time_did_not_allow_to_look_for_is_said() -> None:
-    assert "not looked for" in replace(lens(5, 5, 5), bend=None).assumed
+    assert "was not checked" in replace(lens(5, 5, 5), bend=None).assumed
 
 
 def test_a_straight_lens_stays_straight() -> None:
@@ -182,7 +182,7 @@ def test_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="set one of input and video"):
         CalibrateOptions(input="a.mp4", video="b.mp4")
     drive = write_video(tmp_path / "drive.mp4", 30)  # a picture that only shifts
-    with pytest.raises(DataError, match=r"cannot be known from .*film a minute with turns"):
+    with pytest.raises(DataError, match=r"cannot be estimated from .*film a minute with turns"):
         calibrate(CalibrateOptions(video=str(drive), output=str(tmp_path / "camera.yaml")))
     assert not (tmp_path / "camera.yaml").exists()
 

@@ -1,4 +1,4 @@
-"""What the public data sets share: recordings made of image files, and data modules made of whole recordings."""
+"""Shared by the public data sets: recordings made of image files, and data modules made of whole recordings."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ class FilesDrive(Drive):
     """A recording of image files with one K; a subclass adds the depth that its data set has.
 
     Args:
-        name: As in `Drive.name`.
+        name: See `Drive.name`.
         paths: Frame number -> image file.
-        K: 3 x 3, in pixels (whose centers are integers) of images of ``size``; images scaled as a whole may be used.
-        calibration: File that K comes from, for messages.
-        size: (height, width) that K belongs to; None where the files do not say.
+        K: 3 x 3, in pixels (with integer centers) of images of ``size``; the images may be scaled, but not cropped.
+        calibration: The file with K, for messages.
+        size: (height, width) that K belongs to; None if the files do not say.
         times: Frame number -> seconds.
         poses: Frame number -> T_world_cam, 4 x 4, meters.
         camera_height: Meters above the road.
-        condition: Weather or light.
+        condition: Weather or light, such as ``night``.
         folder: Folder of the recording.
     """
 
@@ -125,11 +125,11 @@ class FilesDrive(Drive):
 
 
 class ScannedDrive(FilesDrive):
-    """A recording with a laser scanner: depth from its points, moved from the moment of the scan to the image's.
+    """A recording with a laser scanner: depth from its points, moved from the time of the scan to that of the image.
 
     Args:
         *args: As for `FilesDrive`.
-        scans: Frame number -> file of points, and T_world_lidar when it was taken.
+        scans: Frame number -> file of points, and T_world_lidar at the time of the scan.
         **kwargs: As for `FilesDrive`; frames with a scan need a pose.
     """
 
@@ -138,8 +138,8 @@ class ScannedDrive(FilesDrive):
         self._scans = scans
 
     def points(self, scan: Path) -> NDArray[np.float32]:
-        """Return the points of a file in the scanner's frame, n x 3, meters; each data set stores them its own way."""
-        raise NotImplementedError(f"{type(self).__name__} does not say how its points are stored")
+        """Return a file's points in the scanner's frame, n x 3, meters; each data set stores them differently."""
+        raise NotImplementedError(f"{type(self).__name__} does not implement reading its points")
 
     def has_depth(self, index: int) -> bool:
         return index in self._scans and self._scans[index][0].is_file()
@@ -167,20 +167,20 @@ class ScannedDrive(FilesDrive):
 
 
 class FilesDataModule(DepthDataModule):
-    """A data set whose splits are lists of recordings; a subclass implements `drives` in place of `select`."""
+    """A data set whose splits are lists of recordings; a subclass implements `drives` instead of `select`."""
 
     root: str
 
     def drives(self, split: str) -> Sequence[Drive]:
         """Return the recordings of ``train``, ``val``, ``test`` or ``predict``."""
-        raise NotImplementedError(f"{type(self).__name__} does not say which recordings belong to '{split}'")
+        raise NotImplementedError(f"{type(self).__name__} does not define the recordings of '{split}'")
 
     def targets(self, split: str, drive: Drive) -> Sequence[int]:
-        """Return the frames of a recording that a split wants: all of them unless a subclass says otherwise."""
+        """Return a recording's frames for a split: all of them unless a subclass overrides it."""
         return drive.indices
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return the targets of a split's recordings, tests only with ground truth, poses where they are asked for."""
+        """Return a split's target frames: for tests only those with ground truth, with poses if these are needed."""
         selections = [Selection(drive, self.targets(split, drive)) for drive in self.drives(split)]
         if split == "test" and self.ground_truth != "none":
             selections = [with_truth(selection) for selection in selections]
@@ -196,10 +196,10 @@ class FilesDataModule(DepthDataModule):
 
 
 def find_root(root: str | Path, holds: str, what: str) -> Path:
-    """Return the folder with an entry ``holds`` (a name or pattern): root, one or two below, or the one above.
+    """Return the folder with an entry ``holds`` (a name or pattern): root, one or two levels below, or one above.
 
     Raises:
-        DataError: if there is none; ``what`` says in the message what such a folder is.
+        DataError: if there is none; ``what`` describes such a folder in the message.
     """
     folder = Path(root).expanduser().absolute()
     if not folder.is_dir():
@@ -220,14 +220,14 @@ def transform(
 ) -> Float[ndarray, "4 4"]:
     """Return the rigid motion of a quaternion (in the stated order of its numbers) and a translation, 4 x 4.
 
-    ``where`` names the record in messages. A norm more than 1 % from 1 is an error; smaller ones are normalized.
+    ``where`` names the record in messages. A norm off by more than 1 % is an error; smaller deviations are normalized.
     """
     numbers = np.array([*quaternion, *translation], np.float64)
     length = float(np.linalg.norm(numbers[:4]))
     if numbers.shape != (7,) or not np.isfinite(numbers).all() or abs(length - 1) > 0.01:
         raise DataError(
-            f"{where} has rotation {list(quaternion)} and translation {list(translation)}; expected a quaternion of "
-            f"length 1 (it has {length:.4g}) and three finite numbers: copy the file again"
+            f"{where} has rotation {list(quaternion)} and translation {list(translation)}; expected a unit "
+            f"quaternion (its length is {length:.4g}) and three finite numbers: copy the file again"
         )
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(np.roll(numbers[:4], -1) if order == "wxyz" else numbers[:4]).as_matrix()
@@ -237,7 +237,7 @@ def transform(
 
 @contextlib.contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Turn what a file that is missing or of another shape raises into one sentence; ``what`` it should be."""
+    """Turn the exceptions of a missing or malformed file into one sentence; ``what`` is what it should be."""
     try:
         yield
     except SaunetError:
@@ -250,7 +250,7 @@ def reading(path: Path, what: str) -> Iterator[None]:
 
 
 class Listing:
-    """Which files exist, each folder listed once."""
+    """Whether files exist, listing each folder once."""
 
     def __init__(self) -> None:
         self._names: dict[Path, set[str]] = {}
@@ -263,7 +263,7 @@ class Listing:
 
 
 def those_present(paths: Sequence[Path], there: Listing, what: str, fix: str) -> list[Path]:
-    """Return the paths that exist; warn with a count where some are missing.
+    """Return the paths that exist; warn with a count if some are missing.
 
     Raises:
         DataError: if none of them exists.
@@ -282,9 +282,9 @@ def report_missing(missing: Sequence[Any], wanted: int, what: str, fix: str) -> 
 
 
 def associate(first: Float[ndarray, " n"], second: Float[ndarray, " m"], most: float) -> list[tuple[int, int]]:
-    """Return pairs of places in two lists of ascending times, nearest first served, each place at most once.
+    """Return pairs of positions in two lists of ascending times, nearest pairs first, each position at most once.
 
-    ``most`` are the seconds that the two times of a pair may differ; pairs are sorted by the first place.
+    ``most`` is the largest difference within a pair, in seconds; pairs are sorted by the first position.
     """
     low, high = np.searchsorted(second, first - most, "left"), np.searchsorted(second, first + most, "right")
     close = [(abs(first[i] - second[j]), i, j) for i in range(len(first)) for j in range(low[i], high[i])]
@@ -298,14 +298,14 @@ def associate(first: Float[ndarray, " n"], second: Float[ndarray, " m"], most: f
 
 
 def chosen(key: str, names: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of a setting ``key``, each checked, at least one."""
+    """Return the names of a setting ``key``, after checking each; at least one is required."""
     if not names:
         raise ConfigError(f"{key} is empty; name at least one of {', '.join(known)}")
     return tuple(one_of(key, name, known) for name in names)
 
 
 def file_key(path: Path, *facts: Any) -> str:
-    """Return a hash of a file's place, size and age and of all else that ground truth is computed from."""
+    """Return a hash of a file's path, size and age and of everything else that ground truth is computed from."""
     state = path.stat()
     plain = [each.tolist() if isinstance(each, np.ndarray) else each for each in facts]
     return hashlib.sha256(repr((str(path.absolute()), state.st_size, state.st_mtime_ns, plain)).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Recordings of the CARLA simulator: images and depth as its cameras save them, and a table of where they were."""
+"""Recordings of the CARLA simulator: images and depth as its cameras save them, and a table of camera poses."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from saunet.io.images import read_unchanged
 from saunet.registry import datamodules
 
 COLUMNS = ("frame", "timestamp", "x", "y", "z", "pitch", "yaw", "roll", "fov")
-"""Of ``poses.csv``: what an image of CARLA knows of itself (``frame``, ``timestamp``, ``transform``, ``fov``), in
+"""Columns of ``poses.csv``, from a CARLA image's ``frame``, ``timestamp``, ``transform`` and ``fov``:
 seconds, meters and degrees, in Unreal's left-handed axes (x forward, y right, z up)."""
 FAR = 1000.0
-"""Meters that the largest stored depth stands for; the sky has it."""
+"""Meters of the largest stored depth, which the sky has."""
 WEATHER = re.compile(
     r"(?:Clear|Cloudy|Wet|WetCloudy|SoftRain|MidRain(?:y)?|HardRain)(?:Noon|Sunset|Night)|DustStorm|Default"
 )
-"""Names of CARLA's weather presets, which a folder of recordings may have."""
+"""Names of CARLA's weather presets, allowed as names of recording folders."""
 _FIX = "record it as docs/datasets.md shows"
 
 
@@ -36,12 +36,12 @@ class CarlaDrive(DepthFilesDrive):
 
     @staticmethod
     def read(path: Path) -> NDArray[np.float32]:
-        """Return a stored map in meters: 24 bits in red, green and blue, red the lowest; the sky unknown."""
+        """Return a stored map in meters: 24 bits in red (lowest), green and blue; the sky is unknown."""
         stored = read_unchanged(path)
         if stored.dtype != np.uint8 or stored.ndim != 3:
             raise DataError(
                 f"{path} contains {stored.dtype} of shape {stored.shape}; expected CARLA's depth in the three 8-bit "
-                "channels of a PNG: save it as it comes, without a color converter"
+                "channels of a PNG: save it unchanged, without a color converter"
             )
         blue, green, red = (stored[..., channel].astype(np.float64) for channel in range(3))
         depth = (red + 256 * green + 65_536 * blue) * (FAR / (2**24 - 1))
@@ -56,7 +56,7 @@ class CarlaDataModule(RecordingsDataModule):
         root: Folder of the recordings, each with ``rgb``, ``depth`` and ``poses.csv``, at most four levels below.
         val_drives: Recordings to validate on, by name below the root or by pattern.
         test_drives: Recordings to test and predict; by default the held-out frames.
-        val_share: Share to hold out where none are named: whole recordings where there are ten, else their tails.
+        val_share: Fraction to hold out if none are named: whole recordings if there are ten or more, else their ends.
         camera_height: Meters from the road to the camera.
         **loading: Loader settings, as in `LoadOptions`.
 
@@ -108,14 +108,16 @@ def read_recording(folder: Path, root: Path, camera_height: float | None) -> Car
     images = numbered(folder / "rgb", r"(\d+)\.(?:png|jpg)")
     report_missing(sorted(rows.keys() - images.keys()) if images else [], len(rows), f"images of {table}", _FIX)
     kept = sorted(rows.keys() & images.keys())
-    # CARLA counts ticks of the simulation, of which a camera may see every second or third
+    # CARLA counts simulation ticks, and a camera may record only every second or third
     index = {frame: place for place, frame in enumerate(kept)}
     K, size = np.eye(3), (2, 2)
     if kept:
         _, size = common_size([images[frame] for frame in kept])
         fovs = {float(rows[frame][8]) for frame in kept}
         if len(fovs) > 1 or not 0 < min(fovs) < 180:
-            raise DataError(f"{table} has fov {sorted(fovs)}; a recording has one, in degrees: record each by itself")
+            raise DataError(
+                f"{table} has fov {sorted(fovs)}; a recording must have one, in degrees: record each separately"
+            )
         f = size[1] / 2 / np.tan(np.radians(fovs.pop()) / 2)
         K = np.array([[f, 0, (size[1] - 1) / 2], [0, f, (size[0] - 1) / 2], [0, 0, 1]])
     parts = folder.relative_to(root).parts
@@ -139,8 +141,8 @@ def read_recording(folder: Path, root: Path, camera_height: float | None) -> Car
 def pose(x: float, y: float, z: float, pitch: float, yaw: float, roll: float) -> NDArray[np.float64]:
     """Return T_world_cam (right, down, forward) of a transform of CARLA (forward, right, up; degrees).
 
-    Its positive yaw turns right, its positive pitch looks up, its positive roll sinks the right side: turns about our
-    down, right and forward axes, applied in this order.
+    Its positive yaw turns right, its positive pitch looks up, its positive roll sinks the right side: rotations about
+    our down, right and forward axes, applied in this order.
     """
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("YXZ", [yaw, pitch, roll], degrees=True).as_matrix()

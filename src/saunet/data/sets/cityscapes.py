@@ -25,7 +25,7 @@ SIZE = (1024, 2048)
 BEFORE, AFTER = 19, 10
 """Frames of a snippet before and after the annotated one, which has the camera file."""
 KEPT = 0.75
-"""Upper part of the images that is used: below are the bonnet and the star on it (Watson et al. 2021)."""
+"""Fraction of the images that is used, from the top: below are the hood and the star on it (Watson et al. 2021)."""
 _NAME = re.compile(r"(.+_\d{6}_)(\d{6})_[A-Za-z0-9]+\.(?:png|jpg|json)")
 
 Files = Mapping[tuple[str, int], Path]  # ("aachen_000000_", 19) -> file
@@ -64,14 +64,14 @@ class CityscapesDrive(FilesDrive):
         return index in self._disparities
 
     def depth(self, index: int) -> NDArray[np.float32] | None:
-        """Return depth from the stored disparity: (p - 1) / 256 pixels, where p = 0 is unknown and 1 infinitely far."""
+        """Return depth from the stored disparity: (p - 1) / 256 pixels; p = 0 is unknown and 1 infinitely far."""
         if index not in self._disparities:
             return None
         disparity = read_depth(self._disparities[index]) - np.float32(1 / 256)
         if disparity.shape != SIZE:
             raise DataError(
                 f"{self._disparities[index]} is {disparity.shape[1]}x{disparity.shape[0]} (width x height); its "
-                f"numbers are pixels of images of {SIZE[1]}x{SIZE[0]}: use the original map"
+                f"values are pixels of images of {SIZE[1]}x{SIZE[0]}: use the original map"
             )
         far = np.float32(self.baseline * self.calibrated_K[0, 0])
         return self._upper(np.divide(far, disparity, out=np.zeros_like(disparity), where=disparity > 0))
@@ -99,7 +99,8 @@ class CityscapesDataModule(FilesDataModule):
 
     Args:
         root: Folder with ``leftImg8bit_sequence``, ``camera`` and ``disparity``, each holding train, val and test.
-        crop: ``bonnet`` keeps the upper three quarters of images and depth, which the protocol needs; ``none`` all.
+        crop: ``bonnet`` keeps the upper three quarters of images and depth, as the protocol requires; ``none`` keeps
+            all.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
@@ -150,7 +151,7 @@ def _parts(path: Path) -> tuple[str, int]:
 
 
 def _files(root: Path, folder: str, split: str) -> Files:
-    """Return the files of single frames and of snippets; where a frame has both, that of the snippet."""
+    """Return the files of single frames and of snippets; if a frame has both, that of the snippet."""
     single, snippets = (root.glob(f"{name}/{split}/*/*.png") for name in (folder, f"{folder}_sequence"))
     return {_parts(path): path for paths in (single, snippets) for path in paths}
 

@@ -23,14 +23,14 @@ from saunet.registry import datamodules
 
 SIZE, FPS = (874, 1164), 20.0  # (height, width); frames per second
 K = np.array([[910.0, 0, (1164 - 1) / 2], [0, 910, (874 - 1) / 2], [0, 0, 1]])
-"""Its 582, 437 for the center counts from the corner of the first pixel."""
+"""Its center 582, 437 is counted from the corner of the first pixel."""
 _AXES = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """Our camera axes (right, down, forward) to the phone's (forward, right, down)."""
 _FIX = "unpack the chunk again"
 
 
 class CommaDrive(FilesDrive):
-    """One minute of a route; frames are those of the video that are used, in order."""
+    """One minute of a route; its frames are the used frames of the video, in order."""
 
     numbers: tuple[int, ...] = ()  # of the frames in the video
     speeds: NDArray[np.float64] | None = None
@@ -62,7 +62,7 @@ class CommaDataModule(RecordingsDataModule):
         fps: Frames per second to use; the video has 20.
         val_drives: Segments to validate on, by name below the root or by pattern.
         test_drives: Segments to test and predict; by default the held-out frames.
-        val_share: Share to hold out where none are named: whole segments where there are ten, else their tails.
+        val_share: Fraction to hold out if none are named: whole segments if there are ten or more, else their ends.
         frames_cache: Folder for decoded videos; by default in the user's cache folder.
         max_width: Frames are kept at most this wide.
         **loading: Loader settings, as in `LoadOptions`.
@@ -96,7 +96,7 @@ class CommaDataModule(RecordingsDataModule):
         self.hold_out(val_drives, test_drives, val_share)
 
     def prepare_data(self) -> None:
-        """Decode videos on one process, before the others look."""
+        """Decode videos in one process, before the others read them."""
         len(self.recordings)
 
     def find(self) -> Sequence[Drive]:
@@ -107,7 +107,7 @@ class CommaDataModule(RecordingsDataModule):
         lacking = [path.parent for path in videos if not (path.parent / "global_pose" / "frame_positions").is_file()]
         report_missing(lacking if self.with_pose or self.odometer else [], len(videos), "global_pose folders", _FIX)
         found = list[CommaDrive]()
-        said = VideoReader(videos[0], FPS).fps or FPS  # bare streams may say another rate than the true one
+        said = VideoReader(videos[0], FPS).fps or FPS  # bare streams may state a wrong rate
         with bar(self._place()[0] == 0) as shown:
             task = shown.add_task("decoding segments", total=len(videos))
             for path in videos:
@@ -117,7 +117,7 @@ class CommaDataModule(RecordingsDataModule):
 
 
 def read_segment(video: Path, root: Path, fps: float, said: float, cache: Path, max_width: int) -> CommaDrive:
-    """Return a minute of a route, whose video says that it has ``said`` frames per second."""
+    """Return a minute of a route, whose video states ``said`` frames per second."""
     folder, name = video.parent, video.parent.relative_to(root).as_posix()
     camera = CameraFile(Path("comma2k19's camera"), K, SIZE, fps=FPS)
     recording = read_clip(Clip(name, video, camera), fps * said / FPS, cache, max_width)

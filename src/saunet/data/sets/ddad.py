@@ -30,16 +30,16 @@ from saunet.io.plain import read_arrays, read_json
 from saunet.registry import datamodules
 
 CAMERAS = ("camera_01", "camera_05", "camera_06", "camera_07", "camera_08", "camera_09")
-"""The front camera first; in the files the names are upper case."""
+"""Cameras, the front one first; in the files their names are upper case."""
 SPLITS = {"train": "0", "val": "1", "test": "1", "predict": "1"}
 """Split -> its key in ddad.json; the official test images come without depth, so papers report val."""
-MAX_RANGE = 250.0  # meters that the scanners reach
+MAX_RANGE = 250.0  # range of the scanners in meters
 
 Array = NDArray[np.float64]
 
 
 class DdadDrive(ScannedDrive):
-    """One camera of one scene; depth from the scanner's points, moved from their moment to the image's."""
+    """One camera of one scene; depth from the scanner's points, moved from their time to that of the image."""
 
     def __init__(self, scene: Path, plain: Any, camera: str, masks: Path | None, there: Listing) -> None:
         folder, sizes = scene.parent, set[tuple[int, int]]()
@@ -117,8 +117,8 @@ class DdadDataModule(FilesDataModule):
         cameras: Cameras to train on, of ``camera_01`` (front), ``camera_05`` to ``camera_09``.
         test_cameras: Cameras to validate and test on.
         masks: Folder of masks, black where a camera sees its own car, as ``CAMERA_05/<scene>/mask.png``,
-            ``<scene>/CAMERA_05_mask.png`` or ``CAMERA_05_mask.png`` for all scenes. What is black has no depth and no
-            photometric loss. None uses everything.
+            ``<scene>/CAMERA_05_mask.png`` or ``CAMERA_05_mask.png`` for all scenes. Black pixels have no depth and no
+            photometric loss. None uses all pixels.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
@@ -173,7 +173,7 @@ def _find_mask(masks: Path, scene: str, camera: str) -> Path | None:
 
 
 def _transform(plain: Any, where: str) -> Array:
-    rotation = [plain["rotation"].get(key, 0.0) for key in ("qw", "qx", "qy", "qz")]  # protobuf may leave zeros out
+    rotation = [plain["rotation"].get(key, 0.0) for key in ("qw", "qx", "qy", "qz")]  # protobuf may omit zeros
     return transform(rotation, [plain["translation"].get(key, 0.0) for key in "xyz"], "wxyz", where)
 
 

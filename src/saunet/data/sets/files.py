@@ -62,7 +62,7 @@ def pair_up(left: DepthFilesDrive, right: DepthFilesDrive, T_right_left: Array) 
 
 
 class RecordingsDataModule(FilesDataModule):
-    """A data set without a published split: recordings are held out by name, or a share of all frames.
+    """A data set without a published split: recordings are held out by name, or a fraction of all frames.
 
     A subclass implements `find` and sets the three attributes by `hold_out`.
     """
@@ -77,7 +77,7 @@ class RecordingsDataModule(FilesDataModule):
 
     def find(self) -> Sequence[Drive]:
         """Return all recordings below the root."""
-        raise NotImplementedError(f"{type(self).__name__} does not say which recordings there are")
+        raise NotImplementedError(f"{type(self).__name__} does not implement finding its recordings")
 
     @functools.cached_property
     def recordings(self) -> Mapping[str, Drive]:
@@ -100,7 +100,7 @@ class RecordingsDataModule(FilesDataModule):
         return self._division.of(split)[drive.name]
 
     def select(self, split: str) -> Sequence[Selection]:
-        """Return the frames of a split, and with training how many are in none."""
+        """Return the frames of a split, and for training also the number in no split."""
         unused = self._division.unused if split == "train" else {}
         return [
             Selection(drive, frames, {**left_out, BETWEEN: unused.get(drive.name, 0)})
@@ -119,16 +119,16 @@ def numbered(folder: Path, pattern: str) -> dict[int, Path]:
 
 
 def read_rows(path: Path, columns: Sequence[str], *, skip: int = 0, fix: str = "copy it again") -> Array:
-    """Read a table of numbers between spaces or commas, a row a line.
+    """Read a table of numbers separated by spaces or commas, one row per line.
 
     Args:
         path: The file.
-        columns: What its columns are called.
-        skip: Lines at the top that name the columns; lines that start with ``#`` are comments.
+        columns: The names of its columns.
+        skip: Number of header lines; lines that start with ``#`` are comments.
         fix: What to do if it is missing or damaged.
 
     Raises:
-        DataError: if it is missing, or a line does not have so many finite numbers.
+        DataError: if it is missing, or a line does not have one finite number per column.
     """
     table = []
     for number, words in read_words(path, fix)[skip:]:
@@ -144,7 +144,7 @@ def read_rows(path: Path, columns: Sequence[str], *, skip: int = 0, fix: str = "
 
 
 def read_words(path: Path, fix: str = "copy it again") -> list[tuple[int, list[str]]]:
-    """Return (line number, words between spaces or commas) of the lines of a file that are no comments."""
+    """Return (line number, words between spaces or commas) of a file's lines, without comments."""
     try:
         lines = read_text(path, error=DataError).splitlines()
     except OSError as reason:

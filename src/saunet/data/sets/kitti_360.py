@@ -30,13 +30,13 @@ CAMERAS = {"perspective_left": 0, "perspective_right": 1, "fisheye_left": 2, "fi
 TRAIN, VAL, TEST = ("0000", "0002", "0003", "0004", "0005", "0007", "0010"), ("0006",), ("0009",)
 """The sequences with poses as SSCBench divides them."""
 _MOTION = tuple(f"T[{row},{column}]" for row in range(3) for column in range(4))
-"""What the numbers of a line are: the upper rows of a rigid motion."""
+"""The numbers of a line: the upper rows of a rigid motion."""
 
 Array = NDArray[np.float64]
 
 
 class Kitti360Drive(ScannedDrive):
-    """One camera of one sequence; fisheye images are straightened, and their depth is z, not the distance of points."""
+    """One camera of one sequence; fisheye images are undistorted, and depth is z, not the distance of points."""
 
     def __init__(self, root: Path, sequence: str, camera: str) -> None:
         self._given, number, home = (root, sequence, camera), CAMERAS[camera], root / "calibration"
@@ -54,7 +54,7 @@ class Kitti360Drive(ScannedDrive):
             self.T_car_cam[:3, :3] = self.T_car_cam[:3, :3] @ read[R].T
         T_velo_cam0 = _rigid(read_rows(home / "calib_cam_to_velo.txt", _MOTION).reshape(3, 4))
         T_car_velo = _rigid(cam_to_car["image_00"]) @ np.linalg.inv(T_velo_cam0)
-        # Scans and images of one number belong to one moment, so that depth needs no pose.
+        # A scan and an image with the same number belong together, so depth needs no pose.
         self._T: Array = np.asarray(np.linalg.inv(self.T_car_cam) @ T_car_velo, np.float64)
         poses, times = root / "data_poses" / sequence / "poses.txt", read_timestamps(images / "timestamps.txt")
         rows = read_rows(poses, ("frame", *_MOTION)) if poses.is_file() else np.empty((0, 13))
@@ -125,7 +125,7 @@ class Kitti360Drive(ScannedDrive):
 
 @datamodules.register("kitti_360")
 class Kitti360DataModule(FilesDataModule):
-    """KITTI-360: perspective or straightened fisheye video with poses for most frames, LiDAR depth as the camera's z.
+    """KITTI-360: perspective or undistorted fisheye video with poses for most frames, LiDAR depth as the camera's z.
 
     Args:
         root: Folder with ``calibration``, ``data_2d_raw``, ``data_poses`` and ``data_3d_raw``.
@@ -163,13 +163,13 @@ class Kitti360DataModule(FilesDataModule):
         root = find_root(self.root, "data_2d_raw", "the folder with calibration and data_2d_raw")
         names = self.sequences["test" if split == "predict" else split]
         folders = [root / "data_2d_raw" / f"2013_05_28_drive_{name}_sync" for name in names]
-        fix = "unpack them there, or name those that are there"
+        fix = "unpack them there, or name existing ones"
         present = those_present(folders, Listing(), f"{split} sequences", fix)
         return [Kitti360Drive(root, folder.name, camera) for folder in present for camera in self.cameras]
 
 
 class _Matrices:
-    """Matrices of a calibration file by key; one that is missing is said when it is asked for."""
+    """Matrices of a calibration file by key; a missing one is reported when it is needed."""
 
     def __init__(self, path: Path, shapes: dict[str, tuple[int, ...]]) -> None:
         self._path, self._found = path, read_matrices(path, shapes)

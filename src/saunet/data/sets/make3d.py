@@ -41,11 +41,11 @@ class Make3dDrive(DepthFilesDrive):
 
     @staticmethod
     def read(path: Path) -> NDArray[np.float32]:
-        """Return the laser's distances, 55 x 305, meters: the fourth number of each point, which the field compares."""
+        """Return the laser's distances, 55 x 305, meters: the fourth number of each point, which papers compare."""
         try:
             grid = scipy.io.loadmat(str(path), variable_names=["Position3DGrid"])["Position3DGrid"]
         except (OSError, ValueError, KeyError, TypeError, NotImplementedError, MatReadError) as reason:
-            raise DataError(f"{path} is no MATLAB file with a Position3DGrid that can be read; {_FIX}") from reason
+            raise DataError(f"{path} is not a readable MATLAB file with a Position3DGrid; {_FIX}") from reason
         if grid.ndim != 3 or grid.shape[2] != 4:
             raise DataError(f"{path}: Position3DGrid has shape {grid.shape}; expected 55 x 305 x 4: {_FIX}")
         depth = np.asarray(grid[..., 3], np.float32)
@@ -82,12 +82,12 @@ class Make3dDataModule(DepthDataModule):
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
-        ConfigError: if a parameter is out of range, or it is to train or validate on.
+        ConfigError: if a parameter is out of range, or if it is used for training or validation.
     """
 
     protocol = "make3d"
     ground_truth = "camera_z"
-    cacheable = False  # copies are read in training only
+    cacheable = False  # copies are only read in training
 
     root: str
 
@@ -97,7 +97,7 @@ class Make3dDataModule(DepthDataModule):
 
     def select(self, split: str) -> Sequence[Selection]:
         if split in ("train", "val"):
-            raise ConfigError("make3d is single images to test on; train on other data and evaluate with data=make3d")
+            raise ConfigError("make3d has only single test images; train on other data and evaluate with data=make3d")
         home = find_root(self.root, "img-*.jpg", f"the folder of Test134; {_FIX}").parent
         images = sorted(home.glob("*/img-*.jpg"), key=natural_order)
         maps = {path.stem.removeprefix("depth_sph_corr-"): path for path in home.rglob("depth_sph_corr-*.mat")}

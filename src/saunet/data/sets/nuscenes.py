@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 
 class Record(NamedTuple):
-    """A row of ``sample_data``: what one sensor took at one moment."""
+    """A row of ``sample_data``: one measurement of one sensor."""
 
     time: float  # seconds
     file: str
@@ -46,7 +46,7 @@ class Record(NamedTuple):
 
 
 class NuScenesDrive(ScannedDrive):
-    """One camera in one scene; depth at key frames, from the scan of the same sample moved to the image's moment."""
+    """One camera in one scene; depth at key frames, from the scan of the same sample moved to the time of the image."""
 
     def __init__(self, tables: Tables, scene: str, camera: str, key_frames: bool, there: Listing) -> None:
         records = [each for each in tables.records[scene, camera] if each.sample or not key_frames]
@@ -83,7 +83,7 @@ class NuScenesDrive(ScannedDrive):
 
 
 class Tables:
-    """What the tables of one version say of some cameras and of the scanner at key frames."""
+    """The tables of one version, for some cameras and for the scanner at key frames."""
 
     def __init__(self, root: Path, version: str, cameras: Iterable[str]) -> None:
         self.root, self.folder = root, root / version
@@ -133,7 +133,7 @@ class Tables:
         return rows
 
     def pose(self, record: Record) -> Array:
-        """Return T_world_sensor at the moment of a record."""
+        """Return T_world_sensor at the time of a record."""
         rotation, translation = self._egos[record.ego]
         T_world_ego = transform(rotation, translation, "wxyz", f"ego_pose {record.ego}")
         T: Array = T_world_ego @ self.sensors[record.sensor][0]
@@ -152,12 +152,12 @@ class NuScenesDataModule(FilesDataModule):
     Args:
         root: Folder with the tables (``v1.0-trainval``), ``samples`` and ``sweeps``.
         version: ``v1.0-trainval`` (700 scenes to train, 150 to validate and test) or ``v1.0-mini`` (8 and 2); by
-            default the first that is there.
+            default the first one present.
         cameras: Cameras to train on, such as ``CAM_FRONT`` and ``CAM_BACK``.
         test_cameras: Cameras to validate and test on.
         frames: ``sweeps`` takes all frames, at about 12 Hz; ``key_frames`` those of ``samples`` alone, at 2 Hz.
-        conditions: Only scenes with one of these conditions, ``clear``, ``rain``, ``night`` or ``night rain``, which
-            are read from their descriptions; all if empty.
+        conditions: Only scenes with one of these conditions, ``clear``, ``rain``, ``night`` or ``night rain``, found in
+            the scenes' descriptions; all if empty.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:

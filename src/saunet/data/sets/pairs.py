@@ -23,9 +23,9 @@ from saunet.io.plain import read_array
 from saunet.registry import datamodules
 
 IMAGES, DEPTHS = frozenset({"images", "image", "rgb", "color"}), frozenset({"depth", "depths"})
-"""Names of folders that stand beside each other and hold the images and their depth maps."""
+"""Names of sibling folders with the images and their depth maps."""
 VIEW = 60.0
-"""Horizontal field of view in degrees of `unknown_camera`; only losses and metrics of 3D shape use it."""
+"""Horizontal field of view of `unknown_camera` in degrees; only losses and metrics of 3D shape use it."""
 _SPLITS = {"train": "train", "training": "train", "val": "val", "valid": "val", "validation": "val", "test": "test"}
 _WORD = r"(?:(?:sync_)?depth|rgb|colou?r|image|img)s?"
 _WORDS = re.compile(rf"^{_WORD}[_-]?|[_-]?{_WORD}$", re.IGNORECASE)
@@ -95,33 +95,34 @@ class PairsDrive(Drive):
 
 
 def read_pair_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
-    """Return depth in meters, h x w, 0 where unknown: where a file says 0, less, or no finite number."""
+    """Return depth in meters, h x w, 0 where unknown: where the file has 0, a negative or a non-finite number."""
     if path.suffix.lower() != ".npy":
         return read_depth(path, depth_scale)
     depth = read_array(path)
     depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
     if depth.ndim != 2 or depth.dtype.kind != "f":
         raise DataError(
-            f"{path} contains {depth.dtype} of shape {depth.shape}; a depth map is h x w decimal numbers in meters"
+            f"{path} contains {depth.dtype} of shape {depth.shape}; a depth map must have h x w floating-point "
+            "numbers in meters"
         )
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
 
 
 @datamodules.register("pairs")
 class PairsDataModule(RecordingsDataModule):
-    """Any folder of images with depth maps in meters, as Ultralytics and NYU-like sets have it or predict writes it.
+    """Any folder of images with depth maps in meters, laid out like Ultralytics, NYU-like sets or ``pairs`` of predict.
 
-    Depth is a float ``.npy`` in meters or a 16-bit PNG; 0 and less is unknown. The images of a folder, in order, are
-    one recording: neighbors in it are neighbors in time when it comes to training. Folders called train, val and test
-    are the splits unless recordings are named.
+    Depth is a float ``.npy`` in meters or a 16-bit PNG; values of 0 or below are unknown. The images of a folder, in
+    order, are one recording, and training takes neighbors in it as neighbors in time. Folders called train, val and
+    test are the splits unless recordings are named.
 
     Args:
         root: Folder of the images and depth maps, at any depth.
-        depth_scale: What 16-bit PNGs store for a meter: 1000 for millimeters, 256 for KITTI's maps.
+        depth_scale: Value of one meter in 16-bit PNGs: 1000 for millimeters, 256 for KITTI's maps.
         camera: Calibration of the camera; by default the nearest ``camera.yaml`` of each folder.
         val_drives: Folders to validate on, by name below the root or by pattern.
         test_drives: Folders to test and predict; by default the held-out frames.
-        val_share: Share to hold out where nothing says what validates.
+        val_share: Fraction to hold out if neither folders nor names define validation.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
@@ -131,7 +132,7 @@ class PairsDataModule(RecordingsDataModule):
     recognizable = False
     protocol = "synthetic"
     ground_truth = "exact"
-    cacheable = False  # copies are of recordings whose images share one size
+    cacheable = False  # copies need recordings with images of one size
 
     def __init__(
         self,
@@ -156,7 +157,7 @@ class PairsDataModule(RecordingsDataModule):
             raise DataError(f"no data root at {root.absolute()}; set data.root to a folder of images and depth maps")
         images, depths = _find_files(root)
         if not images.keys() & depths.keys():
-            what = f"{len(images)} images and {len(depths)} depth maps below {root} and no two belong together"
+            what = f"{len(images)} images and {len(depths)} depth maps below {root} but no image matches a depth map"
             raise DataError(f"{what}; {_LAYOUT}")
         folders: dict[Path, list[tuple[str, str]]] = {}
         for key in images:
@@ -172,7 +173,8 @@ class PairsDataModule(RecordingsDataModule):
                 camera = unknown_camera(folder / FILE_NAME)
             if not camera.is_straight:
                 raise DataError(
-                    f"{camera.path} describes bent images, whose depth maps are not undistorted; do so first"
+                    f"{camera.path} describes images with distortion, and depth maps cannot be undistorted here; "
+                    "undistort both first"
                 )
             names = [images[key].name for key in keys]
             order = [keys[place] for place in frame_order(names)]
@@ -192,13 +194,13 @@ class PairsDataModule(RecordingsDataModule):
         if assumed:
             rank_zero_warn(
                 f"{len(assumed)} of {len(found)} folders have no {FILE_NAME}, the first {assumed[0]}; a horizontal "
-                f"field of view of {VIEW:g} degrees is assumed, so before training on video set data.camera"
+                f"field of view of {VIEW:g} degrees is assumed; set data.camera before training on video"
             )
         return found
 
     @functools.cached_property
     def recordings(self) -> Mapping[str, Drive]:
-        """All recordings by name; names of folders decide what is held out unless recordings are named."""
+        """All recordings by name; folder names decide what is held out unless recordings are named."""
         found = {drive.name: drive for drive in self.find()}
         if not self.val_drives and not self.test_drives:
             splits = {name: _SPLITS.get(_split_folder(name), "train") for name in found}
@@ -208,7 +210,7 @@ class PairsDataModule(RecordingsDataModule):
 
 
 def _find_files(root: Path) -> tuple[dict[tuple[str, str], Path], dict[tuple[str, str], Path]]:
-    """Return images and depth maps by what both have in common: the folder, and the name without words for either."""
+    """Return images and depth maps by their common key: the folder, and the name without words for either."""
     images: dict[tuple[str, str], Path] = {}
     depths: dict[tuple[str, str], Path] = {}
     for place, folders, names in os.walk(root, followlinks=True):
@@ -224,7 +226,7 @@ def _find_files(root: Path) -> tuple[dict[tuple[str, str], Path], dict[tuple[str
             known, key = depths if is_depth else images, (common, _WORDS.sub("", stem))
             if key in known and not is_depth:
                 raise DataError(f"{known[key]} and {Path(place) / name} would share one depth map; remove one of them")
-            if key not in known or suffix.lower() == ".png":  # as in Ultralytics, PNG before NPY
+            if key not in known or suffix.lower() == ".png":  # PNG before NPY, as in Ultralytics
                 known[key] = Path(place) / name
     return images, depths
 

@@ -18,10 +18,10 @@ from saunet.io.plain import read_array
 from saunet.registry import datamodules
 
 FOCAL = 320.0
-"""Pixels: half of 640 columns at 90 degrees. Its 320, 240 for the center counts from the corner of the first pixel."""
+"""Pixels: half of 640 columns at 90 degrees. Its center 320, 240 is counted from the corner of the first pixel."""
 BASELINE = 0.25  # meters between the cameras
 SKY = 1000.0
-"""Meters from which on depth is the sphere that the sky is painted on (10 000, or infinity in half precision)."""
+"""From this depth on, in meters, a pixel is sky: it is painted on a sphere (10 000, or infinity in half precision)."""
 _AXES = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """Our camera axes (right, down, forward) to theirs, which are those of the world too (north, east, down)."""
 _POSE = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -35,7 +35,7 @@ class TartanAirDrive(DepthFilesDrive):
 
     @staticmethod
     def read(path: Path) -> NDArray[np.float32]:
-        """Return a stored map in meters: an array, or V2's numbers in the four bytes of a PNG's pixels; no sky."""
+        """Return a stored map in meters, from an array, or from V2's four bytes per PNG pixel; the sky is unknown."""
         if path.suffix == ".npy":
             depth = read_array(path)
         else:
@@ -43,7 +43,9 @@ class TartanAirDrive(DepthFilesDrive):
             if depth.dtype == np.uint8 and depth.ndim == 3 and depth.shape[2] == 4:
                 depth = np.ascontiguousarray(depth).view("<f4")[..., 0]
         if depth.ndim != 2 or depth.dtype.kind != "f":
-            raise DataError(f"{path} contains {depth.dtype} of shape {depth.shape}; expected h x w decimal numbers")
+            raise DataError(
+                f"{path} contains {depth.dtype} of shape {depth.shape}; expected h x w floating-point numbers"
+            )
         return np.where((depth > 0) & (depth < SKY), depth, 0).astype(np.float32)
 
 
@@ -56,7 +58,8 @@ class TartanAirDataModule(RecordingsDataModule):
         right: Use the right camera's images too.
         val_drives: Flights to validate on, by name below the root (``abandonedfactory/Easy/P011 l``) or by pattern.
         test_drives: Flights to test and predict; by default the held-out frames.
-        val_share: Share to hold out where no flights are named: whole flights where there are ten, else their tails.
+        val_share: Fraction to hold out if no flights are named: whole flights if there are ten or more, else their
+            ends.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
@@ -112,7 +115,7 @@ def read_flight(folder: Path, name: str, version: str, camera: str, side: str) -
     if file.is_file():
         rows = read_rows(file, _POSE)
         if paths and len(rows) <= max(paths):
-            raise DataError(f"{file} has {len(rows)} poses and there are images to number {max(paths)}; copy it again")
+            raise DataError(f"{file} has {len(rows)} poses but the images go up to number {max(paths)}; copy it again")
         for frame in paths:
             T_ned = transform(rows[frame, 3:].tolist(), rows[frame, :3].tolist(), "xyzw", f"{file}, pose {frame}")
             poses[frame] = _AXES.T @ T_ned @ _AXES

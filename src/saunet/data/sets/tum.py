@@ -24,7 +24,7 @@ SIZE = (480, 640)  # (height, width)
 STEPS = 5000
 """Stored depth of one meter."""
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
-"""fx, fy, cx, cy of ROS' driver, by which depth was registered to the images: what the data set recommends."""
+"""fx, fy, cx, cy of ROS' driver, which registered depth to the images; the data set recommends these."""
 CALIBRATED: dict[str, tuple[tuple[float, float, float, float], tuple[float, ...]]] = {
     "freiburg1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "freiburg2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
@@ -36,7 +36,7 @@ _POSE = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
 class TumDrive(DepthFilesDrive):
-    """One sequence; with a calibration, images and depth are undistorted alike."""
+    """One sequence; with a calibration, images and depth are both undistorted."""
 
     bend: tuple[float, ...] = ()  # distortion of the images
 
@@ -65,17 +65,17 @@ class TumDrive(DepthFilesDrive):
 class TumDataModule(RecordingsDataModule):
     """TUM RGB-D: hand-held and robot sequences of rooms, with the depth of a Kinect and true poses.
 
-    Images, depth and poses are taken at different times; each image gets the depth and the pose nearest in time, each
-    of these once.
+    Images, depth and poses are taken at different times; each image gets the depth and the pose nearest in time, and
+    each of these is used once.
 
     Args:
         root: Folder of the sequences (``rgbd_dataset_freiburg1_xyz``, ...), or one of them.
-        calibration: ``default`` K for images as they are, as the data set recommends, since depth is registered by it;
-            or the ``kinect`` calibration of each camera, by which images and depth are undistorted.
-        max_difference: Seconds that depth and pose may differ from their image.
+        calibration: ``default`` uses K for images as they are, as the data set recommends, because depth is registered
+            with it; ``kinect`` undistorts images and depth with the calibration of each camera.
+        max_difference: Largest difference in time between an image and its depth or pose, in seconds.
         val_drives: Sequences to validate on, by name or by pattern.
         test_drives: Sequences to test and predict; by default the held-out frames.
-        val_share: Share to hold out where none are named: whole sequences where there are ten, else their tails.
+        val_share: Fraction to hold out if none are named: whole sequences if there are ten or more, else their ends.
         **loading: Loader settings, as in `LoadOptions`.
 
     Raises:
@@ -115,14 +115,14 @@ class TumDataModule(RecordingsDataModule):
 
 
 def read_sequence(folder: Path, calibration: str, most: float) -> TumDrive:
-    """Return a sequence; frames are numbered in the order of rgb.txt."""
+    """Return a sequence, with frames numbered in the order of rgb.txt."""
     times, paths = _listed(folder / "rgb.txt")
     (fx, fy, cx, cy), bend = DEFAULT, tuple[float, ...]()
     if calibration == "kinect":
         camera = re.search("freiburg[123]", folder.name)
         if not camera:
             raise ConfigError(
-                f"'{folder.name}' does not say freiburg1, 2 or 3; rename it, or set data.calibration=default"
+                f"the name '{folder.name}' has no freiburg1, 2 or 3; rename it, or set data.calibration=default"
             )
         (fx, fy, cx, cy), bend = CALIBRATED[camera[0]]
     poses, truth = dict[int, NDArray[np.float64]](), folder / "groundtruth.txt"
@@ -150,7 +150,7 @@ def read_sequence(folder: Path, calibration: str, most: float) -> TumDrive:
 
 
 def _listed(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
-    """Return the times, ascending, and files that a list names."""
+    """Return the times, ascending, and files of a list."""
     rows = []
     for line, words in read_words(path, _FIX):
         try:
@@ -160,5 +160,5 @@ def _listed(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
             raise DataError(f"{path}, line {line}: expected a time and a file name, got '{got}'; {_FIX}") from None
     rows = sorted(row for row in rows if row[1].is_file())
     if not rows:
-        raise DataError(f"{path} lists no file that is there; {_FIX}")
+        raise DataError(f"{path} lists no existing file; {_FIX}")
     return np.array([time for time, _ in rows]), [file for _, file in rows]

@@ -25,7 +25,7 @@ VARIANTS: tuple[str, ...] = ("clone", "fog", "morning", "overcast", "rain", "sun
 CAMERAS = {"left": (0, "l"), "right": (1, "r")}  # camera name -> its number on disk and its letter in names
 SIZE = (375, 1242)  # (height, width) of the images
 SKY = 65_535
-"""Stored depth of the sky and of all beyond 655.34 m."""
+"""Stored depth of the sky and of everything beyond 655.34 m."""
 FPS = 10.0  # of KITTI, whose drives are cloned frame by frame
 
 _FIX = "unpack vkitti_2.0.3_rgb.tar, vkitti_2.0.3_depth.tar and vkitti_2.0.3_textgt.tar.gz into one folder"
@@ -50,7 +50,7 @@ class VirtualKittiDataModule(FilesDataModule):
 
     Args:
         root: Folder of the scenes (``Scene01/clone/frames/...`` beside ``Scene01/clone/intrinsic.txt``).
-        variants: Variants to use, which results are grouped by.
+        variants: Variants to use; results are grouped by them.
         cameras: ``left``, ``right`` or both.
         val_scenes: Scenes to validate on.
         test_scenes: Scenes to test and predict; all others train.
@@ -95,7 +95,7 @@ class VirtualKittiDataModule(FilesDataModule):
         there = [pair for pair in wanted if (home.joinpath(*pair) / "frames" / "rgb").is_dir()]
         lacking = [home.joinpath(*pair) for pair in wanted if pair not in there]
         what = f"scenes times variants of the {split} split"
-        report_missing(lacking, len(wanted), what, f"{_FIX}, or choose data.variants and scenes that are there")
+        report_missing(lacking, len(wanted), what, f"{_FIX}, or choose existing data.variants and scenes")
         found = [read_variant(home, *pair) for pair in there]
         return [drives[camera] for drives in found for camera in self.cameras if drives[camera].indices]
 
@@ -110,7 +110,9 @@ def read_variant(home: Path, scene: str, variant: str) -> dict[str, VirtualKitti
     E = {number: {int(row[0]): row[2:].reshape(4, 4) for row in extrinsics if row[1] == number} for number in (0, 1)}
     both = E[0].keys() & E[1].keys()  # extrinsics map points of the world to the camera's
     if not both or len(np.unique(intrinsics[:, 2:], axis=0)) != 1:
-        raise DataError(f"{given} must have one K for all frames, and {moved} rows of cameras 0 and 1; {_FIX}")
+        raise DataError(
+            f"{given} must have one K for all frames, and {moved} must have rows of cameras 0 and 1; {_FIX}"
+        )
     fx, fy, cx, cy = intrinsics[0, 2:]  # 620.5 is the middle of 1242 pixels if the center of the first one is 0
     for name, (number, side) in CAMERAS.items():
         paths = numbered(folder / "frames" / "rgb" / f"Camera_{number}", r"rgb_(\d+)\.(?:jpg|png)")

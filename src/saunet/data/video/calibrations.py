@@ -1,7 +1,7 @@
-"""Calibration files of other tools, read into the words of ``camera.yaml`` and written from them (docs/cameras.md).
+"""Calibration files of other tools, converted to and from the keys of ``camera.yaml`` (docs/cameras.md).
 
-A file's format is found from its content. The center of the first pixel is 0 here as in OpenCV, ROS and Kalibr, 0.5 in
-COLMAP and Nerfstudio, 1 in MATLAB.
+A file's format is recognized by its content. The center of the first pixel is 0 here as in OpenCV, ROS and Kalibr, 0.5
+in COLMAP and Nerfstudio, 1 in MATLAB.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ Plain = dict[str, Any]
 Cameras = Iterator[tuple[str, Plain]]
 SUFFIXES = (".yaml", ".yml", ".json", ".txt", ".bin", ".xml")
 EXPORTS = {"ros": "_ros.yaml", "kalibr": "_kalibr.yaml", "colmap": "_colmap.txt", "opencv": "_opencv.yaml"}
-"""Formats that can be written, and the ends of their files' names."""
+"""Formats that can be written, with the endings of their file names."""
 
 
 def split_name(given: str | Path) -> tuple[Path, str | None]:
-    """Return the file and the camera's name in it of ``FILE[:camera name]``."""
+    """Split ``FILE[:camera name]`` into the file and the camera's name."""
     path = Path(given).expanduser()
     before, colon, name = str(path).rpartition(":")
     return (Path(before), name) if colon and not path.exists() and Path(before).is_file() else (path, None)
 
 
 def find_camera(path: Path, name: str | None) -> Any:
-    """Return one camera of a calibration file in the words of ``camera.yaml``; such a file itself as it is.
+    """Return one camera of a calibration file with the keys of ``camera.yaml``; such a file is returned unchanged.
 
     Raises:
-        DataError: if the file is damaged, of no known or of two formats, or has several cameras and none is named.
+        DataError: if the file is damaged, in no known format or in two, or has several cameras and none is named.
     """
     data = read_bytes(path)
     kind, cameras = _cameras(path, data)
     if not cameras:
-        raise DataError(f"{path} is read as {kind} and has no camera in it")
+        raise DataError(f"{path} is read as {kind} but has no camera in it")
     names = ", ".join(list(cameras)[:20]) + (" ..." if len(cameras) > 20 else "")
     if name is not None:
         if name not in cameras:
@@ -83,14 +83,16 @@ def _cameras(path: Path, data: bytes) -> tuple[str, dict[str, Any]]:
     elif text.lstrip().startswith("<"):
         plain = _xml(path, text)
     else:
-        if text.startswith("%YAML"):  # OpenCV's dialect: a directive of its own, and no space needed after a key
+        if text.startswith("%YAML"):  # OpenCV's dialect: its own directive, and no space required after a key
             text = re.sub(r"(?m)^(\s*[\w.]+):(?=[^\s:])", r"\1: ", text.partition("\n")[2])
         documents = re.split(r"(?m)^(?:---|\.\.\.)[ \t]*$", text)
         filled = [each for each in documents if each.strip()]
         plain = parse_yaml(filled[0] if len(filled) == 1 else text, str(path), DataError)
     found = [(kind, reader) for kind, fits, reader in _KINDS if isinstance(plain, dict) and fits(plain)]
     if len(found) > 1:
-        raise DataError(f"{path} can be read as {' and as '.join(kind for kind, _ in found)}; leave one of them in it")
+        raise DataError(
+            f"{path} can be read as {' and as '.join(kind for kind, _ in found)}; keep only one of them in it"
+        )
     if found:
         kind, reader = found[0]
         return kind, _read(path, kind, lambda: reader(plain))
@@ -98,21 +100,21 @@ def _cameras(path: Path, data: bytes) -> tuple[str, dict[str, Any]]:
 
 
 def _read(path: Path, kind: str, cameras: Callable[[], Cameras]) -> dict[str, Any]:
-    """Return what a reader finds; what it does not find is a sentence."""
+    """Return a reader's result, and turn missing keys into one sentence."""
     try:
         return dict(cameras())
     except KeyError as reason:
-        raise DataError(f"{path} is read as {kind} and lacks {reason}; add it, or write a camera.yaml") from reason
+        raise DataError(f"{path} is read as {kind} but lacks {reason}; add it, or write a camera.yaml") from reason
     except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError) as reason:
         if isinstance(reason, DataError):
             raise DataError(f"{path} is read as {kind}: {reason}") from reason
-        raise DataError(f"{path} is read as {kind} and has a value that cannot be ({str(reason)[:80]})") from reason
+        raise DataError(f"{path} is read as {kind} and has an invalid value ({str(reason)[:80]})") from reason
 
 
 def _camera(
     size: Sequence[Any], K: Sequence[Any], model: str, distortion: Sequence[Any], corner: float = 0.0, **more: Any
 ) -> Plain:
-    """Return a camera in the words of ``camera.yaml``; ``corner`` is what its first pixel's center is called."""
+    """Return a camera with the keys of ``camera.yaml``; ``corner`` is the first pixel's center in the file."""
     numbers = [float(each) for each in K]
     x, y = (2, 3) if len(numbers) == 4 else (2, 5)
     numbers[x], numbers[y] = numbers[x] - corner, numbers[y] - corner
@@ -128,7 +130,7 @@ def _flat(value: Any) -> list[Any]:
     return [number for row in value for number in (row if isinstance(row, list) else [row])]
 
 
-# ROS camera_info files and messages, OpenCV FileStorage: the same words in several spellings.
+# ROS camera_info files and messages, OpenCV FileStorage: the same keys in several spellings.
 _SPELLINGS = {
     "K": ("cameramatrix", "k", "intrinsicmatrix", "intrinsics"),
     "D": ("distortioncoefficients", "distcoeffs", "d", "distcoeff"),
@@ -157,7 +159,7 @@ def _opencv(plain: Plain) -> Cameras:
     if size is None:
         raise DataError("it does not say the size of its images; add the lines image_width: and image_height:")
     if "D" not in words:
-        raise DataError("it has no distortion_coefficients; add them (zeros for straight images)")
+        raise DataError("it has no distortion_coefficients; add them (zeros for undistorted images)")
     roi = plain.get("roi") or {}
     if roi.get("x_offset") or roi.get("y_offset"):
         raise DataError("its images are a region of the sensor (roi); crop K and size yourself in a camera.yaml")
@@ -173,7 +175,7 @@ def _opencv(plain: Plain) -> Cameras:
 def _xml(path: Path, text: str) -> Any:
     try:
         if "<!" in re.sub("<!--.*?-->", "", text, flags=re.DOTALL):
-            raise DataError(f"{path} is XML with declarations, which no calibration needs; remove them")
+            raise DataError(f"{path} is XML with DTD declarations, which no calibration needs; remove them")
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as reason:
         raise DataError(f"{path} cannot be read as XML ({reason})") from reason
@@ -285,7 +287,7 @@ _COLMAP: dict[int, tuple[str, int, int, str]] = {
 
 
 def _colmap_binary(data: bytes) -> list[list[Any]] | None:
-    """Return the rows of a cameras.bin as of a cameras.txt; None if the bytes are none."""
+    """Return the rows of a cameras.bin as in a cameras.txt; None if the bytes are not a cameras.bin."""
     rows: list[list[Any]] = []
     try:
         (count,), at = struct.unpack_from("<Q", data), 8
@@ -306,7 +308,7 @@ def _colmap(rows: Any) -> Cameras:
             raise DataError(f"camera {number} is {name}; known are {', '.join(known)}")
         _, focals, count, model = known[name]
         if len(parameters) != count:
-            raise DataError(f"camera {number} has {len(parameters)} parameters and {name} has {count}")
+            raise DataError(f"camera {number} has {len(parameters)} parameters but {name} has {count}")
         K = [parameters[0], parameters[focals - 1], *parameters[focals : focals + 2]]
         bent = list(parameters[focals + 2 :])
         bent += [0.0] * (next(each for each in COEFFICIENTS[model] if each >= len(bent)) - len(bent))
@@ -338,7 +340,7 @@ def _nerfstudio(plain: Plain) -> Cameras:
             raise DataError(f"its camera_model is {kind}; known are the pinhole models, OPENCV and OPENCV_FISHEYE")
         k1, k2, k3, k4, p1, p2 = (float(words.get(key) or 0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
         if not fisheye and k4:
-            raise DataError("k4 of a perspective camera means different things in different tools; give COLMAP's file")
+            raise DataError("k4 of a perspective camera has different meanings in different tools; give COLMAP's file")
         bent = [k1, k2, k3, k4] if fisheye else [k1, k2, p1, p2, k3]
         camera = _camera(size, K, "fisheye" if fisheye else "pinhole", bent, corner=0.5)
         yield str(frame.get("file_path", number)), camera

@@ -1,21 +1,22 @@
-"""One camera: its intrinsics, distortion, height and frame rate as a user writes them down, and straight images.
+"""One camera: its intrinsics, distortion, height and frame rate from a file, and undistorted images.
 
 ```yaml
 image_size: [1920, 1080]               # width, height of the images that K belongs to
 K: [1408.2, 1407.9, 958.7, 541.3]      # fx, fy, cx, cy in pixels; or three rows of three numbers
 distortion: [-0.31, 0.12, 0, 0, -0.02] # OpenCV's k1 k2 p1 p2 k3 ...; leave it out for undistorted images
 model: pinhole                         # or fisheye, omni ... (docs/cameras.md)
-fov: 100                               # degrees: width of the straight picture; by default as wide as it can be
-fps: 30                                # of the frames; a video file's own rate goes before it
+fov: 100                               # degrees: width of the undistorted picture; by default as wide as possible
+fps: 30                                # of the frames; a video file's own rate takes precedence
 camera_height: 1.42                    # meters above the road, for metric depth
-condition: cloudy                      # a label; clips can be filtered and compared by it
-crop: [0, 0.12, 0, 0]                  # share to cut off at the top, bottom, left, right: sky, bonnet
+condition: cloudy                      # a label to filter and compare clips by
+crop: [0, 0.12, 0, 0]                  # fractions to cut off at the top, bottom, left, right: sky, hood
 ```
 
-``camera: unknown`` in place of K and image_size: data=video then estimates the focal length from turns in the clips.
+Write ``camera: unknown`` instead of K and image_size, and data=video estimates the focal length from turns in the
+clips.
 
-With ``normalized: true`` K is in shares of the width and height, (0.5, 0.5) the middle of the image, and no size is
-needed.
+With ``normalized: true``, K is in fractions of the width and height, (0.5, 0.5) is the middle of the image, and no size
+is needed.
 """
 
 from __future__ import annotations
@@ -43,11 +44,11 @@ from saunet.io.atomic import write_bytes
 
 FILE_NAME = "camera.yaml"
 FIX = "is K in pixels of images of this size, or normalized (then set normalized: true)?"
-"""What to look at where K cannot belong to the images."""
+"""What to check if K does not fit the images."""
 _SAME_SHAPE = 0.02
-"""Relative difference of the two aspect ratios up to which a frame is the calibrated image at another size."""
+"""Largest relative difference of aspect ratios for a frame to count as the calibrated image at another size."""
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
-_LARGEST = 1e300  # beyond it a whole number is no float; NaN and infinity are not within it either
+_LARGEST = 1e300  # larger integers do not fit a float; NaN and infinity are outside too
 
 
 @dataclass(frozen=True)
@@ -56,19 +57,19 @@ class CameraFile:
 
     path: Path
     K: NDArray[np.float64]
-    """3 x 3; in pixels of `image_size` (integer coordinates are pixel centers), or normalized where that is None."""
-    image_size: tuple[int, int] | None  # (height, width); None where K is normalized
+    """3 x 3; in pixels of `image_size` (integer coordinates are pixel centers), or normalized if that is None."""
+    image_size: tuple[int, int] | None  # (height, width); None if K is normalized
     distortion: tuple[float, ...] = ()
     model: str = "pinhole"
     fps: float | None = None
     camera_height: float | None = None  # meters above the road
     condition: str | None = None
     crop: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Shares of the image to cut off at the top, bottom, left and right."""
-    reprojection_error: float | None = None  # root mean square in pixels, where the file comes from a calibration
-    fov: float | None = None  # horizontal degrees of the straight picture; None for as many as it can have
+    """Fractions of the image to cut off at the top, bottom, left and right."""
+    reprojection_error: float | None = None  # root mean square in pixels, if the file comes from a calibration
+    fov: float | None = None  # horizontal degrees of the undistorted picture; None for the widest possible
     is_known: bool = True
-    """False where the file says ``camera: unknown``: K is a guess then."""
+    """False if the file says ``camera: unknown``; K is then a guess."""
 
     @property
     def is_straight(self) -> bool:
@@ -76,7 +77,7 @@ class CameraFile:
         return self.model == "pinhole" and not any(self.distortion)
 
     def intrinsics(self, height: int, width: int, what: str = "the frames") -> NDArray[np.float64]:
-        """Return K, 3 x 3, in pixels of frames of a size, which must have the shape of the calibrated ones."""
+        """Return K, 3 x 3, in pixels of frames of a size, which must have the calibrated aspect ratio."""
         if not self.is_known:
             focal = GUESS * width
             return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
@@ -86,11 +87,11 @@ class CameraFile:
         else:
             rows, columns = self.image_size
             if abs(height / rows * columns / width - 1) > _SAME_SHAPE:
-                fix = "give frames of the calibrated shape (scaled as a whole, not cropped), or calibrate anew"
+                fix = "give frames of the calibrated shape (scaled, not cropped), or calibrate again"
                 if abs(height / columns * rows / width - 1) < _SAME_SHAPE:
                     fix = (
-                        "the sides are swapped: image_size is [width, height], and for a video that its tag rotates, "
-                        "it and K are those of the picture as players show it"
+                        "the sides are swapped: image_size is [width, height]; for a video with a rotation tag, it "
+                        "and K are those of the picture that players show"
                     )
                 raise CameraError(
                     f"{what} are {width}x{height} (width x height) but {self.path} is for {columns}x{rows}; {fix}"
@@ -102,12 +103,12 @@ class CameraFile:
 
 
 def unknown_camera(path: Path) -> CameraFile:
-    """Return a camera of which nothing is known."""
+    """Return a camera about which nothing is known."""
     return CameraFile(path, np.array([[GUESS, 0, 0.5], [0, GUESS, 0.5], [0, 0, 1]]), None, is_known=False)
 
 
 def forgotten(camera: CameraFile) -> CameraFile:
-    """Return a camera without what is known of its lens: K, distortion and model."""
+    """Return a camera without its K, distortion and model."""
     blank = unknown_camera(camera.path)
     kept = (camera.fps, camera.camera_height, camera.condition, camera.crop)
     return CameraFile(blank.path, blank.K, None, (), blank.model, *kept, is_known=False)
@@ -122,7 +123,7 @@ def read_camera(path: str | Path, *, may_be_unknown: bool = False) -> CameraFile
         fix = "make one with saunet calibrate, or write one (see docs/your_camera.md)"
         raise DataError(f"no camera file at {path}; {fix}") from reason
     except OSError as reason:
-        raise DataError(f"cannot read {path}: {reason.strerror or reason}; check its rights") from reason
+        raise DataError(f"cannot read {path}: {reason.strerror or reason}; check its permissions") from reason
     if not isinstance(plain, dict):
         raise DataError(f"{path} holds {type(plain).__name__}; expected keys such as 'K: [fx, fy, cx, cy]'")
     keys = [
@@ -132,7 +133,7 @@ def read_camera(path: str | Path, *, may_be_unknown: bool = False) -> CameraFile
     ]
     if plain and not set(plain) & set(keys):
         raise DataError(
-            f"{path} is no calibration that can be read: camera.yaml, ROS, OpenCV, Kalibr, COLMAP, Nerfstudio, KITTI, "
+            f"{path} is not a readable calibration: camera.yaml, ROS, OpenCV, Kalibr, COLMAP, Nerfstudio, KITTI, "
             "VINS, ORB-SLAM or MATLAB (see docs/cameras.md)"
         )
     for key in plain:
@@ -142,12 +143,12 @@ def read_camera(path: str | Path, *, may_be_unknown: bool = False) -> CameraFile
     if "camera" in plain:
         if plain["camera"] != "unknown" or {"K", "image_size", "model", "distortion", "normalized"} & set(plain):
             raise DataError(
-                f"{path}: camera is {plain['camera']!r}; only 'unknown' is allowed, in place of K and the lens"
+                f"{path}: camera is {plain['camera']!r}; only 'unknown' is allowed, instead of K and the lens"
             )
         if not may_be_unknown:
             raise DataError(
-                f"{path} says camera: unknown, which only data=video can estimate; give K, the file that its training "
-                "kept, or one made with saunet calibrate video=drive.mp4"
+                f"{path} says camera: unknown, which only data=video can estimate; give K, the camera file kept by "
+                "its training, or one made with saunet calibrate video=drive.mp4"
             )
     return _camera(path, plain)
 
@@ -196,13 +197,13 @@ def _camera(path: Path, plain: Mapping[str, Any]) -> CameraFile:
         is_known=known,
     )
     if camera.fov is not None and camera.fov > WIDEST:
-        raise DataError(f"{path}: fov is {camera.fov:g} degrees; a straight picture has at most {WIDEST:g}")
+        raise DataError(f"{path}: fov is {camera.fov:g} degrees; an undistorted picture has at most {WIDEST:g}")
     if size is not None:
         check_intrinsics(camera.K, *size, f"{path}: K", FIX)
     elif known and not (0.1 < camera.K[0, 0] < 20 and 0 < camera.K[0, 2] < 1 and 0 < camera.K[1, 2] < 1):
         raise DataError(
             f"{path}: normalized K has fx {camera.K[0, 0]:g} and center {camera.K[0, 2]:g}, {camera.K[1, 2]:g}; "
-            "expected shares of the image, such as 0.58, 1.92, 0.5, 0.5"
+            "expected fractions of the image, such as 0.58, 1.92, 0.5, 0.5"
         )
     return camera
 
@@ -211,8 +212,8 @@ def check_crop(crop: Sequence[float | int], what: str, error: type[SaunetError] 
     fits = len(crop) == 4 and all(0 <= share < 1 for share in crop)
     if not fits or crop[0] + crop[1] > 0.9 or crop[2] + crop[3] > 0.9:
         raise error(
-            f"{what} is {list(crop)}; expected shares to cut off at the [top, bottom, left, right], each at least 0, "
-            "that leave a tenth of the height and width"
+            f"{what} is {list(crop)}; expected fractions to cut off at the [top, bottom, left, right], each at least "
+            "0, that leave a tenth of the height and width"
         )
 
 
@@ -293,7 +294,7 @@ class Lens:
         corner = self._columns.start, self._rows.start
         self.K = crop_intrinsics(torch.from_numpy(K), *corner).numpy()
         self.model: LensModel | None = None
-        """What is undistorted; None if nothing is."""
+        """The lens that is undistorted; None if there is none."""
         if self._maps is not None:
             recorded = crop_intrinsics(torch.from_numpy(recorded), *corner).numpy()
             self.model = LensModel(camera.model, camera.distortion, recorded)
@@ -304,8 +305,8 @@ class Lens:
         if image.shape[:2] != self.recorded:
             height, width = self.recorded
             raise DataError(
-                f"{name} is {image.shape[1]}x{image.shape[0]} (width x height) where other frames of its clip are "
-                f"{width}x{height}; frames of a clip share one size"
+                f"{name} is {image.shape[1]}x{image.shape[0]} (width x height) but other frames of its clip are "
+                f"{width}x{height}; all frames of a clip must have one size"
             )
         if undistort and self._maps is not None:
             image = np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
@@ -313,7 +314,7 @@ class Lens:
 
 
 class Undistorter:
-    """Undistorts and crops images of any size that the camera takes, as training on its clips does."""
+    """Undistorts and crops the camera's images of any size, as training on its clips does."""
 
     def __init__(self, camera: CameraFile, crop: Sequence[float | int] | None = None) -> None:
         self.camera, self._crop = camera, crop

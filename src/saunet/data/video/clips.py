@@ -1,7 +1,7 @@
-"""Clips of any camera on disk: which there are, and their frames in order.
+"""Clips of any camera on disk: finding them, and their frames in order.
 
-Reading a video out of order is slow (every frame needs those before it), so its frames are kept as JPEGs in a cache
-folder. The originals are only ever read.
+Reading a video out of order is slow (every frame needs the ones before it), so its frames are kept as JPEGs in a cache
+folder. The originals are never written to.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from saunet.io.times import frame_times, times_file
 from saunet.io.video import BARE_SUFFIXES, VIDEO_SUFFIXES, VideoReader, nearest_steps
 
 _NO_CLIPS = frozenset({"@eaDir", "__MACOSX"})
-"""Folders in which other systems keep thumbnails and attributes; names with a dot in front are skipped as well."""
+"""Folders of thumbnails and attributes from other systems; names that start with a dot are skipped as well."""
 UNKNOWN = "unknown"
-"""What a user calls a camera of which nothing is known, in place of its file."""
+"""What a user writes instead of a file for a camera about which nothing is known."""
 QUALITY = 95  # JPEG quality of cached frames
 
 
 class FramesCacheError(DataError):
-    """The folder for decoded frames and measurements cannot be written, which is no fault of a clip."""
+    """The folder for decoded frames and measurements cannot be written; no clip is to blame."""
 
 
 @dataclass(frozen=True)
@@ -49,19 +49,19 @@ class Clip:
 
 @dataclass(frozen=True)
 class Recording:
-    """The frames of a clip that are taken in the first place, in order of time."""
+    """The chosen frames of a clip, in order of time."""
 
     paths: FramePaths
     numbers: tuple[int, ...]  # number of each in the clip as recorded, from 0
     fps: float | None  # frames per second as recorded; None if unknown
-    missing: int = 0  # frames at the end that a video claims to hold and that cannot be decoded
-    passed_over: int = 0  # frames between those taken, which the frame rate asked for does not need
-    plain: int = 0  # frames of a video that have one single color, as where nothing could be decoded
+    missing: int = 0  # frames at the end that a video claims to have but that cannot be decoded
+    passed_over: int = 0  # frames skipped to reach the requested frame rate
+    plain: int = 0  # frames of a video in one single color, as when nothing could be decoded
     times: tuple[float, ...] | None = None
-    """Seconds of each from any fixed origin, by the video, a table, stamps in the names or EXIF; None if unknown."""
+    """Seconds of each from any fixed origin, from the video, a table, stamps in the names or EXIF; None if unknown."""
 
     def time(self, place: int) -> float | None:
-        """Return the time of one, by the rate if it has no other; None if unknown."""
+        """Return the time of one frame, from the rate if there is no other; None if unknown."""
         if self.times is not None:
             return self.times[place]
         return self.numbers[place] / self.fps if self.fps else None
@@ -79,8 +79,8 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
     if 0 < len(depth) < len(paths):
         paths = [path for path in paths if path not in depth]
         warnings.warn(
-            f"{len(depth)} folders below {root} contain 16-bit images of one channel, such as {depth[0]}; beside color "
-            "images these are taken for depth, not for clips",
+            f"{len(depth)} folders below {root} contain 16-bit images of one channel, such as {depth[0]}; beside "
+            "color images these count as depth maps, not as clips",
             stacklevel=2,
         )
     if not paths:
@@ -92,7 +92,7 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
 
     def camera_of(path: Path) -> CameraFile:
         found = given or _camera_of(path, base, known)
-        if unknown:  # what a file says beside K and the lens holds all the same
+        if unknown:  # the rest of the file still applies
             return forgotten(found) if found else unknown_camera(Path(UNKNOWN))
         if found is None:
             place = _highest(path, base) / FILE_NAME
@@ -108,7 +108,7 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
 
 
 class FramePaths(Sequence[Path]):
-    """Paths of files in one folder, each made when it is asked for: a million of them take a second and 300 MB."""
+    """Paths of files in one folder, each created on demand: a million paths take a second and 300 MB."""
 
     def __init__(self, folder: Path, names: Sequence[str]) -> None:
         self.folder, self.names = folder, tuple(names)
@@ -136,7 +136,7 @@ def frame_paths(folder: Path) -> FramePaths:
 
 
 def timed_paths(folder: Path) -> tuple[FramePaths, list[float] | None]:
-    """Return what `frame_paths` does, and the seconds of each image from any fixed origin; None if unknown."""
+    """Return the result of `frame_paths`, and each image's seconds from any fixed origin; None if unknown."""
     with os.scandir(folder) as entries:
         names = [entry.name for entry in entries if _is_image(entry.name) and entry.is_file()]
     names = [names[place] for place in frame_order(names)]
@@ -156,7 +156,7 @@ def _suffix(name: str) -> str:
 
 
 def every(recorded: float | None, wanted: float | None) -> Iterator[int]:
-    """Return the numbers of the frames to take for a frame rate: those nearest to equal steps of time."""
+    """Return the numbers of the frames to use for a frame rate: those nearest to equal time steps."""
     ratio = max(1.0, recorded / wanted) if recorded and wanted else 1.0
     return (int(step * ratio + 0.5) for step in itertools.count())
 
@@ -182,12 +182,12 @@ def read_clip(
         times = None if facts["times"] is None else tuple(map(float, facts["times"]))
         count = int(facts["count"])
         if not numbers or (times is not None and len(times) != len(numbers)):
-            raise ValueError(f"it lists {len(numbers)} frames and {len(times or ())} times")
+            raise ValueError(f"it lists {len(numbers)} frames but {len(times or ())} times")
     except (OSError, ValueError, LookupError, TypeError) as reason:
         raise DataError(f"{folder / 'clip.json'} is damaged ({reason}); delete the folder {folder}") from reason
     paths = frame_paths(folder)
     if len(paths) != len(numbers):
-        raise DataError(f"{folder} holds {len(paths)} of {len(numbers)} frames; delete it, so that it is made again")
+        raise DataError(f"{folder} holds {len(paths)} of {len(numbers)} frames; delete it to make it again")
     return Recording(paths, numbers, rate, missing, count - len(numbers), plain, times)
 
 
@@ -207,7 +207,7 @@ def _read_folder(clip: Clip, fps: float | None) -> Recording:
 
 
 def default_cache() -> Path:
-    """Return where decoded frames and measurements go unless told otherwise: the user's cache folder."""
+    """Return the default folder of decoded frames and measurements: the user's cache folder."""
     base = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
     return Path(base) / "saunet" / "clips"
 
@@ -220,7 +220,7 @@ def _decode(
     max_width: int,
     advance: Callable[[int, int | None], None],
 ) -> None:
-    """Write the frames of a video that are wanted, into a folder that gets its name only when it is complete."""
+    """Write the requested frames of a video to a folder that gets its name only when complete."""
     partial = folder.with_name(partial_name(folder.name))
     numbers: list[int] = []
     times: list[float | None] = []
@@ -246,12 +246,12 @@ def _decode(
         try:
             os.replace(partial, folder)
         except OSError:
-            if not (folder / "clip.json").is_file():  # or else another process was faster
+            if not (folder / "clip.json").is_file():  # otherwise another process was faster
                 raise
     except OSError as reason:
         raise FramesCacheError(
-            f"cannot keep the frames of {video} in {folder.parent}: {reason.strerror or reason}; "
-            "set data.frames_cache to a folder with room that can be written"
+            f"cannot keep the frames of {video} in {folder.parent}: {reason.strerror or reason}; set "
+            "data.frames_cache to a writable folder with enough space"
         ) from reason
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -281,7 +281,7 @@ def _is_depth(folder: Path) -> bool:
 def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
     """Yield the folders that hold images and the video files, at any depth; a folder once, however linked.
 
-    Links are followed last, so that what lies below the folder itself keeps its own name.
+    Links are followed last, so that everything below the folder itself keeps its own name.
     """
     seen = set() if seen is None else seen
     links: list[Path] = []
@@ -302,12 +302,12 @@ def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
 
 
 def _highest(path: Path, base: Path) -> Path:
-    """Return the highest folder whose camera file a clip may have: the root, or the one around a clip that is it."""
+    """Return the topmost folder with a clip's camera file: the root, or the one around a clip that is the root."""
     return base.parent if path == base else base
 
 
 def nearest_camera(path: Path, base: Path) -> Path | None:
-    """Return the nearest camera file of a clip that was found below ``base``, or is it; None without one."""
+    """Return the nearest camera file of a clip that was found below ``base``, or is it; None if there is none."""
     folders = [path, *path.parents] if path.is_dir() else list(path.parents)
     files = (folder / FILE_NAME for folder in folders[: folders.index(_highest(path, base)) + 1])
     return next((file for file in files if file.is_file()), None)

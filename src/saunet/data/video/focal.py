@@ -1,11 +1,11 @@
-"""The focal length from a driving video itself: tracked points, bundle adjustment over short windows, and how sure.
+"""The focal length from driving video itself: tracked points, bundle adjustment of short windows, and uncertainty.
 
-Two views never tell it for a car on a steady curve, and straight motion tells it hardly: windows of several frames are
-solved with the focal length free, each says how well it knows it, and only what the windows agree on counts.
+Two views of a car on a steady curve never determine it, and straight motion hardly does. So windows of several frames
+are solved with a free focal length, each with its uncertainty, and only what the windows agree on counts.
 
-A lens that bends the picture changes the focal length much more than the residuals: k1 = -0.1 makes it 22 % too long.
-So the windows are solved for several bends of the division model too, whose correction needs no focal length, and for
-several centers.
+Lens distortion changes the focal length much more than the residuals: k1 = -0.1 makes it 22 % too long. So the windows
+are also solved for several strengths of the division model, which needs no focal length to correct, and for several
+centers.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from saunet.geometry.tracks import follow
 
 F64 = NDArray[np.float64]
 Tracked = tuple[F64, NDArray[np.bool_], tuple[int, int]]
-"""What `track` returns of a window, and the size of its pictures, (height, width)."""
+"""The result of `track` for a window, and the size of its pictures, (height, width)."""
 WINDOW = 12
-"""Frames that are solved together, about a second of them."""
+"""Frames solved together, about one second."""
 STEP = 0.1
 """Seconds between its frames."""
 WIDTH = 620
-"""Pictures are made this narrow."""
+"""Pictures are resized to this width."""
 KNOWN = 0.015
-"""Relative standard deviation up to which a focal length counts as known."""
+"""Largest relative standard deviation for a focal length to count as known."""
 _TELLING = 0.04
-"""Up to which it is enough to tell a wrong one by."""
+"""Largest relative standard deviation that is good enough to detect a wrong focal length."""
 _VAGUE = 2 * KNOWN
-"""A straight road: no lens makes up for turns."""
+"""Below this, the road is straight: no lens can replace turns."""
 _AXES = ("bend", "right", "down")
 """How a lens may differ from a straight one with its center in the middle."""
 _COARSE = (0.2, 0.03, 0.03)
@@ -59,18 +59,18 @@ _MODEL = 0.2
 """Doubt about the form of the lens, as a share of what its bend changes the focal length by, where half a picture is as
 wide as a focal length; it falls with the fourth power."""
 _START = 0.8
-"""Focal length to start from, in picture widths."""
+"""Initial focal length, in picture widths."""
 _SYSTEMATIC = 0.003
-"""What one window is not better than, whatever its residuals say: the center and the lens are assumed."""
+"""Smallest uncertainty of one window, whatever its residuals: the center and the lens are assumed."""
 _SCALES, _ITERATIONS = (0.05, 0.01, 0.002, 0.0006), 15
 """Residuals, in widths, from which Cauchy's weights fall: large ones first, so that a far start finds its way."""
 _FEWEST = 60
-"""Points that a window needs."""
+"""Fewest points of a window."""
 
 
 @dataclass(frozen=True, slots=True)
 class WindowFocal:
-    """What one window says."""
+    """The estimate from one window."""
 
     focal: float
     """In picture widths."""
@@ -81,7 +81,7 @@ class WindowFocal:
 
 
 def track(frames: Sequence[NDArray[np.uint8]]) -> tuple[F64, NDArray[np.bool_]]:
-    """Track points of the last frame backwards, in which direction a driving camera keeps seeing them.
+    """Track points of the last frame backwards: in that direction a driving camera keeps seeing them.
 
     Returns pixels (n, frames, 2) and where they are known (n, frames), the last frame first.
     """
@@ -124,10 +124,10 @@ def solve_points(
     Args:
         x: Points (n, frames, 2) from where the center is expected, in picture widths.
         known: Where they are known (n, frames).
-        width: Of the pictures in pixels, for the error.
-        bend: That of `FocalEstimate`.
-        right: That of `FocalEstimate`.
-        down: That of `FocalEstimate`.
+        width: Width of the pictures in pixels, for the error.
+        bend: See `FocalEstimate`.
+        right: See `FocalEstimate`.
+        down: See `FocalEstimate`.
 
     Returns:
         None if too few points are tracked, or no focal length fits.
@@ -142,18 +142,18 @@ def solve_points(
 
 @dataclass(frozen=True, slots=True)
 class FocalEstimate:
-    """What all windows say together."""
+    """The estimate from all windows together."""
 
     focal: float
     """In picture widths."""
     uncertainty: float
-    """Relative standard deviation, larger where windows disagree."""
+    """Relative standard deviation, larger if windows disagree."""
     windows: int
     bend: float | None = 0.0
     """Of the lens: a straight picture's points are ``x / (1 + bend * |x|^2)``, in widths; 0 where none was found, None
     where time did not allow to look for it."""
     right: float = 0.0
-    """How far the principal point is from where it was expected, in widths."""
+    """Offset of the principal point from the expected one, in widths."""
     down: float = 0.0
 
     @property
@@ -168,11 +168,11 @@ class FocalEstimate:
 
     @property
     def assumed(self) -> str:
-        """What is to be said with the estimate."""
+        """The assumptions to report with the estimate."""
         bent = f"lens: division model, {self.distortion:.3f}" if self.bend else "no distortion found"
         if self.bend is None:
-            bent = "distortion not looked for, which would make it too long"
-        elsewhere = f"center {self.right:+.1%} of the width to the right and {self.down:+.1%} down of the middle"
+            bent = "distortion was not checked, and would make it too long"
+        elsewhere = f"center {self.right:+.1%} of the width to the right of and {self.down:+.1%} below the middle"
         return f"{bent}; {elsewhere if self.right or self.down else 'center in the middle'}"
 
     @property
@@ -181,16 +181,16 @@ class FocalEstimate:
 
     @property
     def tells(self) -> bool:
-        """Whether a focal length 20 % off can be told from the right one: four deviations are less than that."""
+        """Whether an error of 20 % would be noticed: four standard deviations are less than that."""
         return self.windows >= 3 and self.uncertainty <= _TELLING and self.bend is not None
 
     def contradicts(self, focal: float) -> bool:
-        """Return whether a given focal length, in picture widths, cannot be the one of the pictures."""
+        """Return whether a given focal length, in picture widths, contradicts the pictures."""
         return self.tells and abs(math.log(focal / self.focal)) > max(4 * self.uncertainty, 0.08)
 
 
 def combined(found: Sequence[WindowFocal]) -> FocalEstimate | None:
-    """Return the weighted mean of windows, without those that contradict the others; None if there is none."""
+    """Return the weighted mean of windows, without outliers; None if there is none."""
     logs = np.log([each.focal for each in found])
     spread = np.maximum([each.uncertainty for each in found], _SYSTEMATIC)
     keep = np.isfinite(spread)
@@ -208,12 +208,12 @@ def combined(found: Sequence[WindowFocal]) -> FocalEstimate | None:
 
 
 def refusal(found: FocalEstimate | None, source: str) -> str:
-    """Say why a focal length cannot be known, and what to film."""
-    known = "nothing says it"
+    """Describe why a focal length cannot be estimated, and what to film."""
+    known = "no turn shows it"
     if found is not None and math.isfinite(found.uncertainty):
-        known = f"it looks like {found.focal:.2f} image widths, known to {found.uncertainty:.1%} only"
+        known = f"it looks like {found.focal:.2f} image widths, but only to within {found.uncertainty:.1%}"
     film = "film a minute with turns at 15 to 30 km/h: corners, a roundabout, a winding road"
-    return f"the focal length cannot be known from {source}: {known}, {KNOWN:.1%} is required; {film}"
+    return f"the focal length cannot be estimated from {source}: {known} ({KNOWN:.1%} is required); {film}"
 
 
 def drive_windows(drives: Sequence[Drive], most: int) -> Iterator[list[NDArray[np.uint8]]]:
@@ -224,7 +224,7 @@ def drive_windows(drives: Sequence[Drive], most: int) -> Iterator[list[NDArray[n
         span = every * (WINDOW - 1)
         for start in range(0, len(drive.indices) - span, max(1, span // 2)):
             chosen = drive.indices[start : start + span + 1 : every]
-            if chosen[-1] - chosen[0] == span:  # nothing is missing
+            if chosen[-1] - chosen[0] == span:  # so nothing is missing
                 starts.append((drive, chosen))
     for place in evenly(len(starts), most):
         drive, chosen = starts[place]
@@ -233,7 +233,7 @@ def drive_windows(drives: Sequence[Drive], most: int) -> Iterator[list[NDArray[n
 
 
 def _median_step(drive: Drive) -> float:
-    """Return how many recorded frames there are to a step of the indices."""
+    """Return the number of recorded frames per step of the indices."""
     numbers = [drive.recorded(index) for index in drive.indices[:100]]
     return max(1.0, float(np.median(np.diff(numbers)))) if len(numbers) > 1 else 1.0
 

@@ -1,4 +1,4 @@
-"""Whether a given camera is that of a drive: its focal length against the one that turns tell.
+"""Whether a given camera fits a drive: its focal length against the one estimated from turns.
 
 Distortion is in units of focal lengths, so a wrong focal length straightens wrongly, and the bend that this leaves
 makes another one look right. So points are followed in the pictures as recorded and straightened for one supposed focal
@@ -37,14 +37,14 @@ def check_focal(
 
     Args:
         windows: Frames (height, width) of one size, which may be smaller than that of K.
-        lens: Its center and the shape of its pixels are taken as they are.
-        width: Of the pictures of its K, pixels.
-        most: How many windows to solve: those that turn most.
+        lens: Its center and pixel aspect ratio are trusted.
+        width: Width of the pictures of its K, pixels.
+        most: Number of windows to solve: those with the strongest turns.
         seconds: Processor time after which only the windows that are needed are solved; a contradiction is checked
             again even then.
 
     Returns:
-        To be compared with ``lens.K[0, 0] / width``; None if no window has enough points to follow.
+        The estimate, to compare with ``lens.K[0, 0] / width``; None if no window has enough points to track.
     """
     until = time.process_time() + seconds
     return settled(turning_most(windows, most, until - seconds / 2), lens, width, until)

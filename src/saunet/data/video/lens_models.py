@@ -1,4 +1,4 @@
-"""Lens models: where each shows a ray, how far it can be trusted, and which straight picture fits into its picture.
+"""Lens models: the projection of rays, the radius up to which it is valid, and the undistorted picture that fits.
 
 x, y are on the image plane at distance 1, before K. Sources: OpenCV's `calib3d` and `fisheye`, COLMAP's `models.h`, Mei
 2007 (omni), Devernay 2001 (fov), Fitzgibbon 2001 (division), Khomutenko 2016 (eucm), Usenko 2018 (double_sphere).
@@ -25,9 +25,9 @@ COEFFICIENTS = {
     "eucm": (2,),
     "double_sphere": (2,),
 }
-"""How many numbers of distortion each model has; see docs/cameras.md for their order."""
+"""Number of distortion coefficients of each model; see docs/cameras.md for their order."""
 WIDEST = 120.0
-"""Horizontal degrees up to which a picture is straightened: beyond, its corners are mostly interpolated."""
+"""Widest undistorted picture in horizontal degrees: beyond, its corners are mostly interpolated."""
 Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]
 
 
@@ -126,20 +126,20 @@ def straight_intrinsics(
     fov: float | None,
     where: str,
 ) -> NDArray[np.float64]:
-    """Return K of a straight picture of the same size without blank pixels: as wide as it can be, or ``fov`` degrees.
+    """Return K of an undistorted picture of the same size without blank pixels: the widest, or ``fov`` degrees wide.
 
     Args:
-        model: Of the lens.
-        coefficients: Its distortion.
-        K: Of the recorded picture.
-        height: Of both pictures.
-        width: Of both pictures.
+        model: The lens model.
+        coefficients: Its distortion coefficients.
+        K: K of the recorded picture.
+        height: Height of both pictures.
+        width: Width of both pictures.
         fov: Horizontal field of view; None for the widest, at most `WIDEST`. OpenCV chooses for pinhole lenses; for
             others the optical axis stays where it is and pixels keep their shape.
-        where: File, for messages.
+        where: The file, for messages.
 
     Raises:
-        CameraError: if the model folds back inside the part of the picture that is used, or ``fov`` is too wide.
+        CameraError: if the model folds back inside the used part of the picture, or ``fov`` is too wide.
     """
     limit, radius = fold(model, coefficients, K, height, width)
 
@@ -164,14 +164,14 @@ def straight_intrinsics(
     if fov is not None:
         if fov > widest + 0.05:
             raise CameraError(
-                f"{where}: fov is {fov:g} and the straight picture of this lens is at most {widest:.0f} degrees wide; "
-                "choose less"
+                f"{where}: fov is {fov:g}, but the undistorted picture of this lens is at most {widest:.0f} degrees "
+                "wide; choose a smaller fov"
             )
         return straight(fov)
     if limit < np.inf and (model == "pinhole" or (widest < WIDEST and fits(straight(widest + 1), np.inf))):
         raise CameraError(
-            f"{where}: this lens model folds back {radius:.0f} pixels from the center, inside the picture, and means "
-            f"nothing beyond; calibrate with the board held into the corners too, or set fov to at most {widest:.0f} "
+            f"{where}: this lens model folds back {radius:.0f} pixels from the center, inside the picture, and is "
+            f"invalid beyond; calibrate with the board in the corners too, or set fov to at most {widest:.0f} "
             "degrees in camera.yaml to use only the middle (saunet calibrate converts other files)"
         )
     if model == "pinhole" and not K[0, 1]:  # OpenCV overlooks skew

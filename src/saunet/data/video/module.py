@@ -48,18 +48,18 @@ from saunet.io.speeds import SpeedTable, read_speeds
 from saunet.registry import datamodules
 
 SPEEDS = "speeds.csv"
-"""A clip's speeds: in its folder, or beside a video as ``NAME.speeds.csv``."""
+"""File of a clip's speeds: in its folder, or beside a video as ``NAME.speeds.csv``."""
 _WINDOWS = 100
-"""Windows in which turns are looked for where the camera is unknown."""
+"""Number of windows in which to look for turns if the camera is unknown."""
 LONGEST_STEP = 5.0
-"""Seconds between two frames beyond which they are no neighbors: too much has moved meanwhile."""
+"""Two frames farther apart than this, in seconds, are not neighbors: too much has moved meanwhile."""
 
 
 class ClipDrive(Drive):
     """A clip of any camera.
 
-    Frames are numbered anew from 0 in the order of time, without those that are `left_out`; a number is skipped where
-    frames on both sides are no neighbors (a broken image, a long stop or a cut between them).
+    Frames are numbered from 0 in the order of time, without those `left_out`; a number is skipped if the frames on both
+    sides are not neighbors (a broken image, a long stop or a cut between them).
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class ClipDrive(Drive):
 
     @functools.cached_property
     def gaps(self) -> frozenset[int]:
-        """Indices of frames after which the recording lacks frames; the steps between chosen frames are no measure."""
+        """Indices of frames after which the recording lacks frames; the steps between chosen frames do not tell."""
         times, numbers = self.recording.times, self.recording.numbers
         if times is None or len(times) < 3:
             return frozenset()
@@ -132,9 +132,9 @@ class ClipDrive(Drive):
         return read_speeds(file) if file.is_file() else None
 
     def align_speeds(self, flow: NDArray[np.float64]) -> str:
-        """Put the clip's speeds on the clock of its frames, given each one's flow, and return what was found."""
+        """Align the clip's speeds with the clock of its frames, given each frame's flow, and return the alignment."""
         if self._speeds is None:
-            raise DataError(f"'{self.name}' has no {SPEEDS} to align; leave data.align_speeds out")
+            raise DataError(f"'{self.name}' has no {SPEEDS} to align; leave out data.align_speeds")
         times = np.array([self.recording.time(place) for place in range(len(flow))], dtype=np.float64)
         if np.isnan(times).any():
             raise DataError(f"the frames of '{self.name}' have no times; give fps in its {FILE_NAME}")
@@ -144,7 +144,7 @@ class ClipDrive(Drive):
         return f"{moved.path}: {found}"
 
     def check_speeds(self) -> None:
-        """Check that the clip's speeds have something in common with the time of its frames."""
+        """Check that the clip's speeds overlap with the time of its frames."""
         known = self._speeds.drives.get("") if self._speeds and self._speeds.unit == "time" else None
         if not self._indices or known is None:
             return
@@ -156,7 +156,7 @@ class ClipDrive(Drive):
             )
 
     def _tick(self, index: int) -> float:
-        """Return where a frame is in the table of speeds; NaN if unknown."""
+        """Return a frame's time in the table of speeds; NaN if unknown."""
         at = self.recorded(index) if self._speeds and self._speeds.unit == "frame" else self.time(index)
         return math.nan if at is None else float(at)
 
@@ -235,7 +235,7 @@ class ClipDrive(Drive):
 
 
 def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tuple[dict[int, int], dict[str, int]]:
-    """Return frame number -> place in the recording, and how many places got none, by reason."""
+    """Return frame number -> position in the recording, and how many positions got none, by reason."""
     count = len(recording.paths)
     left_out = {"not decodable": recording.missing, "passed over by fps": recording.passed_over}
     if motion is None:
@@ -267,8 +267,8 @@ def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tup
 class VideoDataModule(DepthDataModule):
     """Your own camera: each folder of frames and each video below the root is a clip; ``camera.yaml`` describes it.
 
-    Frames are undistorted and cropped as they are read. Videos are decoded once into a cache. How far the picture moves
-    is measured once, so that doubled frames and stops are left out. The originals are never written to.
+    Frames are undistorted and cropped as they are read. Videos are decoded once into a cache. The motion of the picture
+    is measured once, to leave out doubled frames and stops. The originals are never written to.
 
     Args:
         root: Folder of clips at any depth, a folder of frames, or a video.
@@ -277,16 +277,18 @@ class VideoDataModule(DepthDataModule):
         conditions: Only clips whose camera file has one of these conditions, such as ``[cloudy, sunny]``; all if empty.
         val_clips: Clips to hold out, by name below the root or by pattern, such as ``night_*``.
         test_clips: Clips to test and predict; by default the held-out frames.
-        val_share: Share to hold out where no clips are named: whole clips where there are ten, else the clips' tails.
-        fps: Frames a second to use; None uses all. Folders of frames need ``fps`` in their camera file for that.
-        parallax: Use a frame when the picture has moved this far since the last one used (median flow in pixels at 320
-            width; 3 is moderate): even steps whatever the speed. 0 goes by time alone.
-        static: Frames in which nothing moves: ``drop`` them from training and validation, and doubled frames
-            altogether; or ``keep`` all and measure nothing.
-        crop: Shares to cut off at the [top, bottom, left, right], such as ``[0,0.12,0,0]`` for a bonnet; by default
+        val_share: Fraction to hold out if no clips are named: whole clips if there are ten or more, else the clips'
+            ends.
+        fps: Frames per second to use; None uses all. Folders of frames need ``fps`` in their camera file for that.
+        parallax: Use a frame once the picture has moved this far since the last used one (median flow in pixels at 320
+            width; 3 is moderate), for even steps at any speed. 0 goes by time alone.
+        static: Frames in which nothing moves: ``drop`` leaves them out of training and validation, and doubled frames
+            out of everything; ``keep`` keeps all and measures nothing.
+        crop: Fractions to cut off at the [top, bottom, left, right], such as ``[0,0.12,0,0]`` for a hood; by default
             those of the camera file.
-        camera_height: Meters from the road to the camera, for clips whose camera file does not say.
-        align_speeds: Find the clock of each ``speeds.csv`` by the optical flow, if it is not that of the frames.
+        camera_height: Meters from the road to the camera, for clips whose camera file has no height.
+        align_speeds: Find the clock offset of each ``speeds.csv`` from optical flow, if its clock differs from the
+            frames'.
         frames_cache: Folder for decoded videos and measurements; by default in the user's cache folder.
         max_width: Frames of videos are kept at most this wide.
         **loading: Loader settings, as in `LoadOptions`.
@@ -341,7 +343,7 @@ class VideoDataModule(DepthDataModule):
         self._broken: list[str] = []
 
     def prepare_data(self) -> None:
-        """Decode videos and measure motion on one process, before the others look."""
+        """Decode videos and measure motion in one process, before the others read them."""
         self.drives()
 
     def drives(self) -> list[ClipDrive]:
@@ -359,12 +361,12 @@ class VideoDataModule(DepthDataModule):
 
     @property
     def camera_height(self) -> float | None:
-        """Meters of the camera above the road, where all clips agree; else None."""
+        """Meters of the camera above the road if all clips agree, else None."""
         heights = {drive.camera_height for drive in self.drives()}
         return heights.pop() if len(heights) == 1 else None
 
     def summary(self, split: str) -> str:
-        """Return what a split uses and leaves out; training names the clips that cannot be read."""
+        """Return what a split uses and leaves out; for training also the clips that cannot be read."""
         broken = self._broken if split == "train" else []
         return "\n  ".join([super().summary(split), *(f"clip left out: {error}" for error in broken)])
 
@@ -401,7 +403,7 @@ class VideoDataModule(DepthDataModule):
         return selections
 
     def _with_focal_lengths(self, drives: list[ClipDrive]) -> list[ClipDrive]:
-        """Estimate the focal length of each unknown camera from the turns in all its clips."""
+        """Estimate the focal length of each unknown camera from turns in all its clips."""
         groups: dict[tuple[Path, tuple[int, int]], list[ClipDrive]] = {}
         for drive in drives:
             if not drive.clip.camera.is_known and drive.indices:
@@ -421,19 +423,22 @@ class VideoDataModule(DepthDataModule):
             lens: dict[str, Any] = {"model": "division", "distortion": (found.distortion,)} if found.bend else {}
             for drive in several:
                 known[drive.name] = replace(drive.clip.camera, K=K, image_size=(height, width), is_known=True, **lens)
-            said = f"known to {found.uncertainty:.2%} from {found.windows} windows of {WINDOW} frames; {found.assumed}"
+            said = (
+                f"known to within {found.uncertainty:.2%} from {found.windows} windows of {WINDOW} frames; "
+                f"{found.assumed}"
+            )
             camera = known[several[0].name]
             file = self.frames_cache / f"camera-{short_hash(repr((K.tolist(), camera)))}.yaml"
             if not file.is_file():
                 write_camera(file, camera, f"estimated from {what}: {said}")
             rank_zero_info(
-                f"focal length of {what}: {focal:.1f} px of {width} ({view:.0f} degrees), {said}; this camera is kept "
-                f"in {file}, which saunet predict takes as undistort="
+                f"focal length of {what}: {focal:.1f} px of {width} ({view:.0f} degrees), {said}; this camera is "
+                f"kept in {file}; give it to saunet predict as undistort="
             )
         return [drive.seen_by(known[drive.name]) if drive.name in known else drive for drive in drives]
 
     def _focal(self, drives: Sequence[ClipDrive]) -> FocalEstimate | None:
-        """Return what turns say about the focal length of one camera, in widths of its drives' frames; kept on disk."""
+        """Return the focal length of one camera from turns, in widths of its drives' frames; it is kept on disk."""
         keys = [motion_key(drive.recording.paths, self.crop or drive.clip.camera.crop) for drive in drives]
         key = short_hash(repr((keys, self.fps, self.parallax, self.static, "with center")))
         file = self.frames_cache / f"focal-{key}.json"
@@ -447,7 +452,7 @@ class VideoDataModule(DepthDataModule):
         return found
 
     def _usable_drive(self, clip: Clip, shown: Progress) -> ClipDrive | None:
-        """Return a clip as a drive; None where it cannot be read and that is to be skipped."""
+        """Return a clip as a drive; None if it cannot be read and unreadable files are skipped."""
         try:
             return self._drive(clip, shown)
         except DataError as error:
@@ -469,14 +474,14 @@ class VideoDataModule(DepthDataModule):
         shown.update(task, visible=False)
         if recording.plain:
             warnings.warn(
-                f"{recording.plain} frames of {clip.path} have one single color; they may not have been decoded, look "
-                "at the video",
+                f"{recording.plain} frames of {clip.path} have one single color; they may not have been decoded: "
+                "check the video",
                 stacklevel=2,
             )
         if self.fps is not None and recording.fps is None:
             warnings.warn(
-                f"the frame rate of {clip.path} is unknown, so data.fps has no effect and all are taken; give fps "
-                f"in {FILE_NAME}",
+                f"the frame rate of {clip.path} is unknown, so data.fps has no effect and all frames are used; give "
+                f"fps in {FILE_NAME}",
                 stacklevel=2,
             )
         motion = None

@@ -1,7 +1,7 @@
-"""How much the picture moves between the frames of a clip: which are doubled, static, or begin another scene.
+"""Motion of the picture between the frames of a clip: which are doubled, static, or begin another scene.
 
-Most frames of a clip are far from every limit, and a fourth or half of a JPEG's resolution is enough to see that; those
-that are not are measured at the full resolution, so that the frames chosen do not depend on the shortcut.
+Most frames of a clip are far from every limit, and a fourth or half of a JPEG's resolution is enough to see that. The
+others are measured at the full resolution, so the choice of frames does not depend on the shortcut.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from saunet.io.plain import read_array
 from saunet.threads import available_cores
 
 SAME_PICTURE = 0.01
-"""Mean difference over the picture's standard deviation under which two frames are the same picture twice."""
+"""Mean difference over the picture's standard deviation below which two frames show the same picture."""
 CUT = 0.75
 """The same measure from which two frames may be of different scenes (1.13 if nothing matches): KITTI's neighbors differ
 by up to 0.5, frames of different recordings by 0.88 to 1.0."""
@@ -51,11 +51,11 @@ class Motion:
     unreadable: tuple[int, ...] = ()  # frames that cannot be decoded
 
     def doubled(self) -> NDArray[np.bool_]:
-        """Say which frames are the same picture as the one before, one value a frame: the frame rate was raised."""
+        """Return which frames repeat the previous picture, one value per frame: the frame rate was raised."""
         return np.nan_to_num(self.change, nan=1.0) < SAME_PICTURE
 
     def static(self, min_flow: float = MIN_FLOW) -> NDArray[np.bool_]:
-        """Say which frames show no motion against the one before, one value a frame; the second judges the first."""
+        """Return which frames show no motion since the previous, one value per frame; the second judges the first."""
         flow = self.flow.copy()
         known = np.flatnonzero(np.isfinite(flow))
         if known.size and known[0] > 0:
@@ -64,7 +64,7 @@ class Motion:
 
 
 def cuts(change: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Say which frames begin another scene (a cut, a loop, the next recording), given the change to the one before."""
+    """Return which frames begin another scene (a cut, a loop, the next recording), given each frame's change."""
     known = np.nan_to_num(change)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(known, 2), 5)[:, [0, 1, 3, 4]]
     # The second largest: next to a cut there may be another one, as around a single black frame.
@@ -89,7 +89,7 @@ def shrink(
 
 
 class _Picture:
-    """A frame, decoded only as far as it is needed."""
+    """A frame, decoded only as far as needed."""
 
     def __init__(self, path: Path, crop: Sequence[float | int], exact: bool) -> None:
         self._path, self._crop = path, crop
@@ -101,12 +101,12 @@ class _Picture:
 
     @functools.cached_property
     def small(self) -> NDArray[np.uint8] | None:
-        """A gray picture of the narrower width of `QUICK`; None if it has to be decoded in full."""
+        """A gray picture of the narrower width in `QUICK`; None if it has to be decoded in full."""
         return self._look(min(QUICK))
 
     @functools.cached_property
     def medium(self) -> NDArray[np.uint8] | None:
-        """Likewise, of the wider."""
+        """Likewise, of the wider one."""
         return self._look(max(QUICK))
 
     def _look(self, width: int) -> NDArray[np.uint8] | None:
@@ -135,7 +135,7 @@ def _compare(before: _Picture, after: _Picture) -> tuple[float, float]:
 
 
 def _compare_quickly(before: _Picture, after: _Picture) -> tuple[float, float] | None:
-    """Return flow and change by pictures of reduced decodings; None where these may not decide as the full ones."""
+    """Return flow and change from reduced decodings; None if these might decide differently from full ones."""
     if before.small is None or after.small is None:
         return None
     small, wide = QUICK
@@ -183,7 +183,7 @@ def _measure_block(
 
 
 def _settle_cuts(paths: FramePaths, crop: Sequence[float | int], found: NDArray[np.float64]) -> None:
-    """Measure exactly what lies around a possible cut: it is judged by the changes beside it."""
+    """Measure exactly around a possible cut, which is judged by the changes beside it."""
     readable = np.flatnonzero(found[2])
     near = np.convolve(found[1, readable] >= CUT, np.ones(5), "full")[2:-2] > 0
     pictures: dict[int, _Picture] = {}
@@ -203,8 +203,8 @@ def measure(
 ) -> Motion:
     """Measure the motion between consecutive images, with as many threads as there are cores.
 
-    Not ``exact``, numbers far from `SAME_PICTURE`, `MIN_FLOW` and `CUT` may come from smaller pictures: what they
-    decide is the same, and they are no measure of distance.
+    Unless ``exact``, numbers far from `SAME_PICTURE`, `MIN_FLOW` and `CUT` may come from smaller pictures: the
+    decisions are the same, but the numbers do not measure distance.
     """
     key = motion_key(paths, crop) if cache else ""
     names = [cache / f"motion-{key}{kind}.npy" for kind in ("", "-quick")] if cache else []
@@ -241,7 +241,7 @@ def _motion(found: NDArray[np.float64]) -> Motion:
 
 
 def even_steps(flow: NDArray[np.float64], parallax: float) -> NDArray[np.bool_]:
-    """Choose frames so that the picture moves by about ``parallax`` from each to the next; the first is one."""
+    """Choose frames, starting with the first, so that the picture moves by about ``parallax`` between them."""
     chosen, gathered = np.zeros(len(flow), dtype=bool), 0.0
     for place, step in enumerate(np.nan_to_num(flow)):
         gathered += step
@@ -262,7 +262,7 @@ def motion_key(paths: FramePaths, crop: Sequence[float | int]) -> str:
 
 
 def _read_motion(file: Path, count: int) -> Motion | None:
-    """Return a kept measurement; None where there is none that fits, and then it is made anew."""
+    """Return a kept measurement; None if none fits, so that it is made again."""
     try:
         found = read_array(file)
     except (OSError, UnreadableError):
