@@ -267,16 +267,16 @@ def test_points_are_tracked_in_the_place_of_a_pose_network_where_that_is_asked_f
         common = (checkpoint(smoke_run), f"motion={motion}")
         outcome = tool("odometry", *common, "data=synthetic_tiny", f"output_dir=path_{motion}", "figure=false")
         assert outcome.code == 0, outcome.err
-        assert ("asked for with motion=tracked" in outcome.out) == (motion == "tracked")
+        assert ("requested by motion=tracked" in outcome.out) == (motion == "tracked")
         settings = json.loads((tmp_path / f"path_{motion}" / "odometry.json").read_text())["settings"]
         assert settings.get("motion") == (None if motion == "auto" else motion)
         predicted = tool("predict", "clip", *common, camera, f"output=out_{motion}", "outputs=[trajectory]")
         assert predicted.code == 0, predicted.err
-        assert ("asked for with motion=tracked" in predicted.out) == (motion == "tracked")
+        assert ("requested by motion=tracked" in predicted.out) == (motion == "tracked")
         paths[motion] = read_kitti(tmp_path / f"out_{motion}" / "clip_trajectory.txt")
     assert not np.allclose(paths["auto"], paths["tracked"], atol=1e-3)
     tool("predict", "clip", *common, "output=o", "outputs=[trajectory]").says("motion is 'tracked'", "set camera=")
-    tool("predict", "clip", *common, "output=o").says("no path is asked for", "outputs=[trajectory]")
+    tool("predict", "clip", *common, "output=o").says("outputs has no trajectory", "outputs=[trajectory]")
     tool("odometry", checkpoint(smoke_run), "motion=points").says("motion is 'points'", "auto, tracked")
 
 

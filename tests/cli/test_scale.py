@@ -166,7 +166,7 @@ def test_camera_height_needs_the_camera(recording: Path, street: SyntheticDrive)
 
 
 def test_a_live_camera_is_not_measured(recording: Path, street: SyntheticDrive) -> None:
-    with pytest.raises(ConfigError, match="a live camera cannot be looked at beforehand"):
+    with pytest.raises(ConfigError, match="needs a whole recording, which a live camera does not have"):
         measure(recording, street, TrueDepth(street), source="0", method="camera_height", camera_height=1.65)
 
 

@@ -87,7 +87,9 @@ def test_a_manifest_of_other_recordings_is_refused_and_of_some_warned_of(tmp_pat
 
     with pytest.raises(DataError, match=r"m.json names 2 recordings, none of them in the training data \(such as 'a'"):
         setup(["b", "a"])
-    with pytest.warns(UserWarning, match=r"names 2 recordings, and 1 of them are not in the training data \(such as 'b'; here"):
+    with pytest.warns(
+        UserWarning, match=r"names 2 recordings, and 1 of them are not in the training data \(such as 'b'; here"
+    ):
         setup(["b", f"{name(1)} l"])
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -124,7 +124,7 @@ def test_folder_whose_results_lie_inside(predictor: Predictor, tmp_path: Path) -
         summary = run(predictor, tmp_path / "in", tmp_path / "in" / "depth", ["html"], camera=[90], overwrite=True)
         assert summary.frames == 3
         write_image(tmp_path / "in" / "depth" / "x.png", next(clip(1)))
-    with pytest.raises(ConfigError, match="holds the originals"):
+    with pytest.raises(ConfigError, match="contains the input images"):
         run(predictor, tmp_path / "in", tmp_path / "in", ["mp4"])
 
 

@@ -56,7 +56,7 @@ def test_pairs_are_read_back_as_training_data(predictor: Predictor, folder: Path
     from saunet.runs.record import Scale
 
     out = tmp_path / "out"
-    with pytest.raises(ConfigError, match=r"'pairs', whose depth is in meters.*relative; set scale\.method"):
+    with pytest.raises(ConfigError, match=r"'pairs', which need depth in meters.*relative; set scale\.method"):
         run(predictor, folder, out, ("pairs",))
     assert not out.exists()
     predictor.scale = Scale(20.0, "camera height 1.65 m")
@@ -216,7 +216,7 @@ class TestRefused:
         link = tmp_path / "link"
         link.symlink_to(folder)
         for output in (folder, link):
-            with pytest.raises(ConfigError, match="holds the originals"):
+            with pytest.raises(ConfigError, match="contains the input images"):
                 run(predictor, str(folder / "*.png"), output)
         assert names(folder) == ["a.png", "b.jpg", "deep/c.png"]
 
@@ -225,7 +225,9 @@ class TestRefused:
         for original in ("a.png", "b.jpg"):
             (folder / original).unlink()
         for given in (folder, str(folder / "*" / "*.png"), [folder / "deep", folder]):
-            with pytest.raises(ConfigError, match=r"holds the originals \(.*c\.png\); choose another, such as .*depth"):
+            with pytest.raises(
+                ConfigError, match=r"contains the input images \(.*c\.png\); choose another, such as .*depth"
+            ):
                 run(predictor, given, folder)
         assert names(folder) == ["deep/c.png"]
 
@@ -234,7 +236,7 @@ class TestRefused:
     ) -> None:
         for name in ("a/x.png", "a/a/y.png"):
             write_image(tmp_path / name, picture)
-        with pytest.raises(ConfigError, match="holds the originals"):
+        with pytest.raises(ConfigError, match="contains the input images"):
             run(predictor, tmp_path / "a", tmp_path)
 
     def test_output_that_is_a_file(self, predictor: Predictor, folder: Path) -> None:
@@ -243,7 +245,7 @@ class TestRefused:
 
     @pytest.mark.parametrize(("name", "kind"), [("depth.mp4", "mp4"), ("depth.PNG", "color"), ("depth.npy", "npy")])
     def test_output_that_is_named_like_a_file(self, tmp_path: Path, name: str, kind: str) -> None:
-        with pytest.raises(ConfigError, match=rf"names the folder .* output=\S+depth outputs=\[{kind}\]"):
+        with pytest.raises(ConfigError, match=rf"is the folder .* output=\S+depth outputs=\[{kind}\]"):
             PredictOptions(input="in.mp4", output=tmp_path / name)
         (tmp_path / name).mkdir()
         PredictOptions(input="in.mp4", output=tmp_path / name)

@@ -228,7 +228,7 @@ class TestHub:
 
 
 def test_onnx_has_one_size(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="takes one size of images; leave keep_aspect out"):
+    with pytest.raises(ConfigError, match="takes images of one size; leave keep_aspect out"):
         saunet.load(tmp_path / "x.onnx", keep_aspect=True)
 
 

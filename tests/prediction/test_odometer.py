@@ -145,7 +145,7 @@ def test_a_step_without_points_goes_on_as_the_one_before():
     blind = Odometer(TrackedPose(known), 160, 512)
     for _ in range(3):
         blind.add(fog, drive.intrinsics(0))
-    with pytest.raises(DataError, match="known between none of 3 frames"):
+    with pytest.raises(DataError, match="unknown between all 3 frames"):
         blind.trajectory()
 
 
@@ -168,7 +168,7 @@ def test_what_makes_no_path(tmp_path: Path):
 
 def test_every_clip_is_told_why_points_are_tracked():
     """The odometer of another clip says what that of the first one said."""
-    for asked_for, why in ((True, "asked for with motion=tracked"), (False, "the model has no pose network")):
+    for asked_for, why in ((True, "requested by motion=tracked"), (False, "the model has no pose network")):
         odometer = Odometer(TrackedPose(nn.Identity(), asked_for), 64, 96)
         assert why in odometer.told
         assert odometer.restart().told == odometer.told

@@ -172,7 +172,7 @@ def test_bfloat16_is_used_where_it_is_asked_for(
     with pytest.raises(ConfigError, match=r"changes depth by 0.09.*allowed is 0.05"):
         runtimes.choose_runtime(original, checkpoint, "openvino-bf16")
     monkeypatch.setattr(runtimes, "_open", lambda *_: ("f32", eager))
-    with pytest.raises(ConfigError, match="needs a processor that computes in bfloat16"):
+    with pytest.raises(ConfigError, match="needs a processor with bfloat16"):
         runtimes.choose_runtime(original, checkpoint, "openvino-bf16")
 
 

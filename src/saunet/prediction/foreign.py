@@ -1,4 +1,4 @@
-"""Depth models of other systems, as ONNX or TorchScript files: what goes in, and what comes out, by name."""
+"""Depth models of other systems, as ONNX or TorchScript files, with their inputs and outputs described by name."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ MEANINGS: tuple[str, ...] = get_args(Meaning)
 """Meters; their natural logarithm; 1/depth up to a factor; the same up to a factor and a shift."""
 SCRIPT_SUFFIXES = (".ts", ".torchscript", ".jit", ".pt", ".pth")
 _SMALLEST = 1e-3
-"""Of the largest disparity of an image: what smaller values of affine disparity count as, for want of its shift."""
+"""Smallest affine disparity, as a fraction of an image's largest, because its shift is unknown."""
 
 
 @checked
 @dataclass(frozen=True, kw_only=True)
 class ForeignOptions:
-    """What a depth model of another system takes and gives: an ONNX or a TorchScript file.
+    """Input and output of another system's depth model, an ONNX or TorchScript file.
 
     Args:
-        preset: What is known of a family of models: one of `PRESETS`; the other options change it.
-        output: What the model's numbers are: ``depth`` in meters, ``log_depth`` (natural logarithm), ``disparity`` up
+        preset: Settings of a known family of models, one of `PRESETS`; the other options override them.
+        output: Meaning of the model's numbers: ``depth`` in meters, ``log_depth`` (natural logarithm), ``disparity`` up
             to a factor, or ``affine_disparity``, up to a factor and a shift.
-        mean: What is subtracted from RGB in [0, 1], by channel.
-        std: What that is divided by, by channel.
+        mean: Subtracted from RGB in [0, 1], per channel.
+        std: Divisor after that, per channel.
         height: Height of the model's input; by default the file's.
         width: Width of the model's input; by default the file's.
-        multiple: What the sides of its input must be multiples of.
-        factor: The numbers are multiplied by it first; with it, ``affine_disparity`` counts as disparity in 1/m.
-        shift: Added to ``affine_disparity`` then, 1/m.
-        run_code: Run a TorchScript file, which is a program: only if you trust whoever made it.
+        multiple: The sides of the input must be multiples of this.
+        factor: First multiplies the numbers; ``affine_disparity`` then counts as disparity in 1/m.
+        shift: Then added to ``affine_disparity``, 1/m.
+        run_code: Allow running a TorchScript file, which is a program; only if you trust its source.
 
     Raises:
         ConfigError: if a value is out of range or a choice is unknown.
@@ -83,7 +83,7 @@ class ForeignOptions:
 
     @property
     def given(self) -> bool:
-        """Whether anything is said about a model of another system."""
+        """Whether any option about a model of another system is set."""
         return self != NOTHING
 
     def _settled(self, path: Path) -> ForeignOptions:
@@ -93,8 +93,8 @@ class ForeignOptions:
         found = replace(known, **own)
         if found.output is None:
             raise ConfigError(
-                f"{path} is of another system; say what it is with foreign.preset={'|'.join(PRESETS)}, or what it "
-                f"gives with foreign.output={'|'.join(MEANINGS)} (and foreign.mean, foreign.std)"
+                f"{path} is a model of another system; say what it is with foreign.preset={'|'.join(PRESETS)}, or "
+                f"what it returns with foreign.output={'|'.join(MEANINGS)} (and foreign.mean, foreign.std)"
             )
         return found
 
@@ -117,7 +117,7 @@ Ultralytics' ``*-depth``, as their owners' scripts export them."""
 
 
 def is_foreign(path: Path) -> bool:
-    """Return whether a file is a TorchScript program; an ONNX file says inside whether it is ours."""
+    """Return whether a file is a TorchScript program; an ONNX file itself records whether it is ours."""
     suffix = path.suffix.lower()
     if suffix not in SCRIPT_SUFFIXES or not path.is_file():
         return False
@@ -132,15 +132,15 @@ class ForeignPredictor(ImagePredictor):
     """Predicts depth with a model of another system.
 
     Args:
-        path: An ONNX or a TorchScript file that takes images, b x 3 x h x w, and gives b x h x w or b x 1 x h x w.
-        options: What goes in and comes out.
+        path: An ONNX or TorchScript file that takes images, b x 3 x h x w, and returns b x h x w or b x 1 x h x w.
+        options: Its input and output.
         device: ``"cpu"`` or ``"cuda"``.
         flip: Average with the prediction of the mirrored image.
-        keep_aspect: Feed each image at its own aspect ratio, if the file allows any size.
+        keep_aspect: Keep each image's aspect ratio, if the file allows any size.
 
     Raises:
         CheckpointError: if the file is missing or broken.
-        ConfigError: if too little is said about it, it is a program that may not run, or sizes do not fit.
+        ConfigError: if options are missing, it is a program that is not allowed to run, or sizes do not fit.
     """
 
     def __init__(
@@ -152,15 +152,15 @@ class ForeignPredictor(ImagePredictor):
         else:
             if not options.run_code:
                 raise ConfigError(
-                    f"{path} is TorchScript, a program that could do anything on this machine; if you trust whoever "
-                    "made it, set foreign.run_code=true, or use ONNX"
+                    f"{path} is TorchScript, a program that could do anything on this machine; set "
+                    "foreign.run_code=true if you trust its source, or use ONNX"
                 )
             self._run, fixed = _script(path, device), None
         asked = (options.height, options.width)
         if fixed is not None and None not in asked and asked != fixed:
             raise ConfigError(
-                f"{path} takes images of {fixed[0]}x{fixed[1]} (height x width) only, and foreign.height and "
-                f"foreign.width say {asked[0]}x{asked[1]}; leave them out"
+                f"{path} takes images of {fixed[0]}x{fixed[1]} (height x width) only, but foreign.height and "
+                f"foreign.width are {asked[0]}x{asked[1]}; leave them out"
             )
         if fixed is not None and keep_aspect:
             raise ConfigError(f"{path} takes one size of images; leave keep_aspect out")
@@ -181,8 +181,8 @@ class ForeignPredictor(ImagePredictor):
     def unit(self) -> str:
         if self.shifted:
             return (
-                "relative, and its disparity has an unknown shift too, so shapes are distorted "
-                "(set foreign.factor and foreign.shift)"
+                "relative, and disparity also has an unknown shift, so shapes are distorted (set foreign.factor and "
+                "foreign.shift)"
             )
         return super().unit
 
@@ -194,7 +194,7 @@ class ForeignPredictor(ImagePredictor):
         return np.asarray(np.maximum(found, np.float32(1e-9)), np.float32)
 
     def raw_disparity(self, images: Float32[np.ndarray, "b 3 h w"]) -> Float32[np.ndarray, "b _ _"]:
-        """Run the model: RGB in [0, 1] to disparity, which may be 0 and below where its zero means nothing."""
+        """Run the model: RGB in [0, 1] to disparity, which may be 0 or negative if its zero is arbitrary."""
         if not self.flip:
             return self._disparity(images)
         from saunet.exporting.onnx import flip_blend
@@ -211,7 +211,7 @@ class ForeignPredictor(ImagePredictor):
             values = values[:, 0]
         if values.ndim != 3 or len(values) != len(images):
             raise CheckpointError(
-                f"{self.path} gives shape {values.shape} for {len(images)} images; a depth model gives "
+                f"{self.path} returns shape {values.shape} for {len(images)} images; a depth model returns "
                 f"({len(images)}, height, width) or ({len(images)}, 1, height, width)"
             )
         factor, meaning = np.float32(self.options.factor or 1.0), self.options.output
@@ -224,13 +224,13 @@ class ForeignPredictor(ImagePredictor):
 
     @functools.cached_property
     def fingerprint(self) -> str:
-        """A short hash of the file and of the settings that change results."""
+        """A short hash of the file and of all settings that change results."""
         settings = repr((sorted(asdict(self.options).items()), self.flip, self.keep_aspect)).encode()
         return hashlib.sha256(self.path.read_bytes() + settings).hexdigest()[:16]
 
 
 def _onnx(path: Path, device: str) -> tuple[Any, tuple[int, int] | None]:
-    """Return what runs an ONNX file, and its input's (height, width) where that is fixed."""
+    """Return a function that runs an ONNX file, and its input's (height, width) if fixed."""
     from saunet.exporting.onnx import open_session
 
     session = open_session(path, device)
@@ -255,18 +255,18 @@ def _onnx(path: Path, device: str) -> tuple[Any, tuple[int, int] | None]:
 
 
 def _script(path: Path, device: str) -> Any:
-    """Return what runs a TorchScript program."""
+    """Return a function that runs a TorchScript program."""
     import torch
 
     if not path.is_file():
         raise CheckpointError(f"no model at {path}; check the path")
     try:
-        with warnings.catch_warnings():  # torch would rather have torch.export, which the file's maker did not use
+        with warnings.catch_warnings():  # torch recommends torch.export, but the file exists already
             warnings.simplefilter("ignore", DeprecationWarning)
             read: Any = torch.jit.load
             program = read(str(path), map_location=device).eval()
     except RuntimeError as reason:
-        raise CheckpointError(f"{path} is not a TorchScript file that torch can read, or is damaged") from reason
+        raise CheckpointError(f"{path} is damaged, or not a TorchScript file that torch can read") from reason
 
     def run(images: np.ndarray) -> np.ndarray:
         with torch.inference_mode():

@@ -30,14 +30,14 @@ _PAPER, _GRID, _INK, _TRACK, _START, _END = (
 
 
 class TrackedPose(nn.Module):
-    """Motion from tracked points to the next frame, in the place of a pose network: its length is that of depth."""
+    """Motion to the next frame from tracked points, instead of a pose network; its length comes from depth."""
 
     offsets = (1,)
 
     def __init__(self, depth: nn.Module, asked_for: bool = False) -> None:
         super().__init__()
         self.depth = depth
-        self.asked_for = asked_for  # though the model has a pose network
+        self.asked_for = asked_for  # although the model has a pose network
 
     def forward(
         self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b 1 3 h w"], K: Float[Tensor, "b 3 3"]
@@ -46,9 +46,9 @@ class TrackedPose(nn.Module):
 
 
 class Odometer:
-    """Follows the camera through a clip, frame by frame; memory does not grow but by one pose a frame.
+    """Follows the camera through a clip, frame by frame; memory grows only by one pose per frame.
 
-    A network that sees both neighbors gives two motions at once, so it is asked at every second frame only.
+    A network that sees both neighbors predicts two motions at once, so it runs only at every second frame.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Odometer:
         self._batch_size = batch_size
         self._reach = max(abs(offset) for offset in self._offsets)
         self._stride = 2 if {-1, 1} <= set(self._offsets) else 1
-        self._next = 1 if -1 in self._offsets else 0  # the first frame that has a neighbor on the side we look at
+        self._next = 1 if -1 in self._offsets else 0  # the first frame with a neighbor on the side of this offset
         self._count = 0
         self._images: dict[int, Tensor] = {}
         self._cameras: dict[int, Tensor] = {}
@@ -90,10 +90,10 @@ class Odometer:
     ) -> Odometer:
         """Load the pose network of a checkpoint or exported folder, or its depth network to track points with.
 
-        With ``motion="tracked"`` points are tracked though there is a pose network. Nothing in the file is run.
+        With ``motion="tracked"`` points are tracked even if there is a pose network. No code in the file is run.
         """
         if Path(path).suffix.lower() == ".onnx":
-            raise ConfigError(f"{path} has no pose network, which a path needs; give the checkpoint")
+            raise ConfigError(f"{path} has no pose network, which a trajectory needs; give the checkpoint")
         model = read_model(path)
         depth, pose = model.networks()
         size = model.record.height, model.record.width
@@ -101,26 +101,26 @@ class Odometer:
         return cls(followed, *size, scale or model.record.scale, device, batch_size)
 
     def restart(self) -> Odometer:
-        """Return an odometer with the same network that stands before the first frame of another clip."""
+        """Return an odometer with the same network, ready for the first frame of another clip."""
         return Odometer(self._pose, *self._size, self.scale, self._device, self._batch_size)
 
     @property
     def tracks(self) -> bool:
-        """Whether there is no pose network, so that points are tracked, which takes the camera's intrinsics."""
+        """Whether points are tracked because there is no pose network; this requires the camera's intrinsics."""
         return isinstance(self._pose, TrackedPose)
 
     @property
     def told(self) -> str:
-        """Where the motion comes from if `tracks`, in words."""
+        """Description of the source of the motion if `tracks`."""
         asked_for = isinstance(self._pose, TrackedPose) and self._pose.asked_for
-        why = "asked for with motion=tracked" if asked_for else "the model has no pose network"
-        return f"from tracked points ({why}), with the length that the predicted depth gives it"
+        why = "requested by motion=tracked" if asked_for else "the model has no pose network"
+        return f"from tracked points ({why}), with its length from the predicted depth"
 
     def add(self, image: UInt8[np.ndarray, "h w 3"], K: Float[np.ndarray, "3 3"] | None = None) -> None:
-        """Take the next frame, with its intrinsics in pixels if `tracks`."""
+        """Add the next frame, with its intrinsics in pixels if `tracks`."""
         self._images[self._count] = torch.from_numpy(network_input(image, *self._size)).to(self._device)
         if self.tracks:
-            assert K is not None, "tracking points takes the camera"
+            assert K is not None, "tracking points requires the camera"
             self._cameras[self._count] = torch.from_numpy(Camera(K, *image.shape[:2]).resized(*self._size).K)
         self._count += 1
         while self._next + self._reach < self._count:
@@ -135,7 +135,7 @@ class Odometer:
         for center in range(self._next, last + (1 not in self._offsets), self._stride):
             self._ask_at(center)
         self._answer()
-        if last - 1 not in self._motions:  # both neighbors are asked for in pairs; this motion has no pair
+        if last - 1 not in self._motions:  # motions come in pairs; this one has none
             self._ask_at(last - 1)
             self._answer()
         motions = np.stack([self._motions[index] for index in range(last)])
@@ -152,7 +152,7 @@ class Odometer:
 
     @torch.inference_mode()
     def _answer(self) -> None:
-        """Ask the network at the waiting frames; sources beyond the ends of the clip stop at its ends."""
+        """Run the network on the waiting frames; sources beyond the ends of the clip are replaced by its end frames."""
         if not self._waiting:
             return
         last = self._count - 1
@@ -176,18 +176,18 @@ class Odometer:
 
 
 def _filled(motions: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "n 4 4"]:
-    """Put the motion before, or the first known one, in the place of those that are unknown."""
+    """Replace unknown motions with the previous one, or the first known one."""
     known = np.isfinite(motions).all((1, 2))
     if not known.any():
         raise DataError(
-            f"the camera's motion is known between none of {len(motions) + 1} frames: too few points can be followed; "
+            f"the camera's motion is unknown between all {len(motions) + 1} frames: too few points can be tracked; "
             "give brighter or sharper frames, closer in time"
         )
     lost = int((~known).sum())
     if lost:
         warnings.warn(
-            f"too few points could be followed in {lost} of {len(motions)} steps of the path; there the camera moves "
-            "on as in the step before",
+            f"too few points could be tracked in {lost} of {len(motions)} steps of the path; there the motion of the "
+            "previous step is used",
             stacklevel=2,
         )
     before = np.maximum.accumulate(np.where(known, np.arange(len(motions)), -1))
@@ -199,7 +199,7 @@ def follow(odometer: Odometer, drive: Any, progress: bool = True) -> Float64[np.
     numbers = list(drive.indices)
     gaps = [a for a, b in itertools.pairwise(numbers) if b != a + 1]
     if gaps:
-        raise DataError(f"'{drive.name}' has no frame {gaps[0] + 1}; a path needs all frames from first to last")
+        raise DataError(f"'{drive.name}' has no frame {gaps[0] + 1}; a path needs every frame from first to last")
     odometer = odometer.restart()
     with bar(progress, "images", taken=True) as shown:
         task = shown.add_task(drive.name, total=len(numbers))
@@ -210,7 +210,7 @@ def follow(odometer: Odometer, drive: Any, progress: bool = True) -> Float64[np.
 
 
 def write_trajectory(picture: Path, T_world_cam: Float64[np.ndarray, "n 4 4"], metric: bool) -> None:
-    """Write a trajectory twice: drawn from above, and beside it as KITTI poses, whose name ends in ``.txt``."""
+    """Write a trajectory twice: drawn from above, and beside it as KITTI poses (``.txt``)."""
     write_kitti(picture.with_suffix(".txt"), T_world_cam)
     write_image(picture, draw_from_above(T_world_cam, metric))
 
@@ -218,7 +218,7 @@ def write_trajectory(picture: Path, T_world_cam: Float64[np.ndarray, "n 4 4"], m
 def draw_from_above(
     T_world_cam: Float64[np.ndarray, "n 4 4"], metric: bool, size: int = 800
 ) -> UInt8[np.ndarray, "{size} {size} 3"]:
-    """Draw where the camera went, seen from above: x to the right, z (ahead at the start) up, both at one scale."""
+    """Draw the path of the camera from above: x to the right, z (ahead at the start) up, at the same scale."""
     way = T_world_cam[:, [0, 2], 3]
     extent = max(float(np.ptp(way, axis=0).max()), 1e-9) * 1.15
     margin, top = size // 16, size // 10
@@ -240,13 +240,13 @@ def draw_from_above(
     length = float(np.linalg.norm(np.diff(T_world_cam[:, :3, 3], axis=0), axis=1).sum())
     unit = "m" if metric else "relative units"
     canvas[: top - 8] = _PAPER
-    words = f"{len(way)} frames, {length:.4g} {unit} along the path; a square is {step:g} {unit}"
+    words = f"{len(way)} frames, {length:.4g} {unit} along the path; one square is {step:g} {unit}"
     for row, text in enumerate((words, "from above; green: start, looking up; red: end")):
         cv2.putText(canvas, text, (14, 26 + 24 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.55, _INK, 1, cv2.LINE_AA)
     return canvas
 
 
 def _round_step(value: float) -> float:
-    """Return 1, 2 or 5 times a power of ten, the largest that is not above ``value``."""
+    """Return the largest of 1, 2 or 5 times a power of ten that is not above ``value``."""
     power = 10.0 ** math.floor(math.log10(value))
     return max(factor * power for factor in (1, 2, 5) if factor * power <= value * (1 + 1e-9))

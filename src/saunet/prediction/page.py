@@ -1,4 +1,4 @@
-"""A prediction to look at: a figure for notebooks, and a page that says the depth under the cursor."""
+"""Views of a prediction: a figure for notebooks, and a page that shows the depth under the cursor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from saunet.prediction.prediction import Prediction
 
 _PAGE = Path(__file__).with_name("depth.html")
 _WIDTH = 1280
-"""Pixels across at most; larger predictions are shown smaller."""
+"""Largest width in pixels; larger predictions are shown smaller."""
 
 
 def depth_figure(prediction: Prediction) -> str:
@@ -34,7 +34,7 @@ def depth_figure(prediction: Prediction) -> str:
 
 
 def depth_page(prediction: Prediction, colormap: str = "magma") -> str:
-    """Return a page that fetches nothing: image, disparity, the depth under the cursor, and what colors mean."""
+    """Return a page that loads nothing else: image, disparity, the depth under the cursor, and a color scale."""
     height, width = prediction.depth.shape
     rows, columns = max(1, round(height * min(1, _WIDTH / width))), min(width, _WIDTH)
     disparity = np.asarray(resize(prediction.disparity, rows, columns), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Pictures side by side with their names: what the demo, the training log and reports show."""
+"""Pictures side by side with their names, as in the demo, the training log and reports."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def depth_panel(
     note: str = "",
     others: Mapping[str, Float[np.ndarray, "_ _"]] = MappingProxyType({}),
 ) -> UInt8[np.ndarray, "hp wp 3"]:
-    """Show an image, its disparity, and, where the true depth is known, the truth and the relative error.
+    """Show an image, its disparity and, if the true depth is known, the truth and the relative error.
 
     The prediction is scaled to the truth by the ratio of medians before the comparison, as in evaluation, and both are
     painted with the truth's colors. ``others`` are further predictions by name, shown before it in the same way.
@@ -82,7 +82,7 @@ def label_height(width: int) -> int:
 
 
 def label(text: str, width: int) -> UInt8[np.ndarray, "_ {width} 3"]:
-    """Return a strip with a name in it, made smaller where it would not fit."""
+    """Return a strip with a name, in smaller letters if it does not fit."""
     height = label_height(width)
     size = height / 34
     (length, _), _ = cv2.getTextSize(text, _FONT, size, 1)
@@ -93,12 +93,12 @@ def label(text: str, width: int) -> UInt8[np.ndarray, "_ {width} 3"]:
 
 
 def fit(picture: UInt8[np.ndarray, "_ _ 3"], height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """Return a picture at exactly this size: smooth when it shrinks, sharp pixels when it grows much."""
+    """Return a picture at exactly this size: smooth when shrinking, sharp pixels when growing much."""
     if height >= 3 * picture.shape[0] and width >= 3 * picture.shape[1]:
         return cv2.resize(picture, (width, height), interpolation=cv2.INTER_NEAREST)
     return np.asarray(resize(picture, height, width))
 
 
 def _dots(picture: UInt8[np.ndarray, "h w 3"], size: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Spread single bright pixels over ``size`` x ``size``, so that they survive being made smaller."""
+    """Spread single bright pixels over ``size`` x ``size``, so that they survive shrinking."""
     return cv2.dilate(picture, np.ones((size, size), np.uint8)) if size > 1 else picture

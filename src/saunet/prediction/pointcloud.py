@@ -1,4 +1,4 @@
-"""Depth as colored points in space, from the camera's true intrinsics: as PLY, and as a page to walk around in."""
+"""Depth as colored points in space, from the camera's true intrinsics: as PLY, and as an interactive page."""
 
 from __future__ import annotations
 
@@ -68,14 +68,15 @@ class Camera:
         if not plausible or not (-self.width < K[0, 2] < 2 * self.width and -self.height < K[1, 2] < 2 * self.height):
             raise ConfigError(
                 f"intrinsics {np.array2string(K, precision=1, separator=',').replace(chr(10), '')} cannot belong to "
-                f"{self.width}x{self.height} pixels; needed: [[fx,0,cx],[0,fy,cy],[0,0,1]] in pixels of that size"
+                f"{self.width}x{self.height} pixels; they must be [[fx,0,cx],[0,fy,cy],[0,0,1]] in pixels of that "
+                "size"
             )
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float | int], height: int, width: int) -> Camera:
         """Read ``fx, fy, cx, cy``, the nine numbers of K by rows, or one: the horizontal field of view in degrees."""
         values = [float(number) for number in numbers]
-        if len(values) == 1:  # square pixels and a centered axis: a guess, for want of calibration
+        if len(values) == 1:  # square pixels and a centered axis: a guess without calibration
             focal = width / (2 * np.tan(np.radians(in_range("field of view", values[0], 1.0, 179.0)) / 2))
             values = [focal, focal, (width - 1) / 2, (height - 1) / 2]
         if len(values) == 4:
@@ -83,8 +84,8 @@ class Camera:
             values = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
         if len(values) != 9:
             raise ConfigError(
-                f"intrinsics have {len(values)} numbers; needed: fx, fy, cx, cy, "
-                "or the nine of K, or one: a horizontal field of view in degrees"
+                f"intrinsics have {len(values)} numbers; give fx, fy, cx, cy, or the nine of K, or one, the "
+                "horizontal field of view in degrees"
             )
         return cls(np.array(values).reshape(3, 3), height, width)
 
@@ -107,7 +108,7 @@ def point_cloud(
 ) -> PointCloud:
     """Return a prediction's pixels as points in space, colored by the image.
 
-    Left out are those farther than ``max_depth``, in the unit of depth, and those at depth edges that would float
+    Points farther than ``max_depth``, in the unit of depth, are left out. So are points at depth edges that would float
     between a near and a far surface: their depth differs from both by more than the fraction ``edge``. On street scenes
     that is a twentieth of the pixels; 0 keeps all.
     """
@@ -129,7 +130,7 @@ def point_cloud(
 
 
 def camera_of(camera: Camera | Sequence[float | int] | float | int | str | Path, height: int, width: int) -> Camera:
-    """Return the camera of a picture of this size from what a user gives: see `Camera.from_numbers`, or a file."""
+    """Return the camera of a picture of this size from a user's numbers (see `Camera.from_numbers`) or file."""
     if isinstance(camera, Camera):
         return camera
     if isinstance(camera, str | Path):
@@ -138,8 +139,8 @@ def camera_of(camera: Camera | Sequence[float | int] | float | int | str | Path,
         file = read_camera(str(camera))
         if not file.is_straight:
             raise ConfigError(
-                f"camera={camera} describes a lens with distortion, and points need straight images; "
-                "undistort them first, as `saunet predict undistort=FILE` does"
+                f"camera={camera} describes a lens with distortion, but points need undistorted images; undistort "
+                "them first, as `saunet predict undistort=FILE` does"
             )
         return Camera(file.intrinsics(height, width, "the images"), height, width)
     return Camera.from_numbers([camera] if isinstance(camera, float | int) else camera, height, width)
@@ -167,10 +168,10 @@ def _extremes(
 
 
 class ViewerWriter(Session):
-    """Writes predictions as one self-contained HTML page, to orbit the points and scrub through the clip.
+    """Writes predictions as one self-contained HTML page, for orbiting the points and scrubbing through the clip.
 
-    Use it as a context manager: frames are written as they come, each adds about 0.1 MB at the default width, and the
-    page gets its name only when it is complete; leaving it by an error discards it.
+    Use it as a context manager: frames are written as they come, and each adds about 0.1 MB at the default width. The
+    page gets its name only when it is complete; an error discards it.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""From any image to depth at its own size: what a prediction is, and all of predicting but the network; no torch."""
+"""From any image to depth at its own size: predictions, and all of predicting except the network; no torch."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ ImageLike = Any
 @checked
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Depth of one image, at that image's size; a notebook shows it as a picture beside its depth.
+    """Depth of one image, at that image's size; a notebook shows the picture beside its depth.
 
     Args:
         depth: Depth along the camera's z axis; see ``unit``.
         disparity: Its inverse.
         image: The image it belongs to, RGB.
-        scale: The factor that has been applied to reach meters; None where only relative depth is known.
+        scale: The factor that has been applied to get meters; None if depth is only relative.
         name: Where the image came from, such as a file name.
 
     Examples:
@@ -63,7 +63,7 @@ class Prediction:
 
     @property
     def unit(self) -> str:
-        """What one unit of ``depth`` is, for people."""
+        """The unit of ``depth``, in words."""
         return unit_of(self.scale)
 
     def color(self, limits: tuple[float, float] | None = None, colormap: str = "magma") -> UInt8[np.ndarray, "h w 3"]:
@@ -88,8 +88,8 @@ class Prediction:
         street scene.
 
         Args:
-            camera: Where rays go: a camera.yaml; fx, fy, cx, cy in pixels of this image; the nine numbers of K; or one
-                number, the horizontal field of view in degrees.
+            camera: The camera's intrinsics: a camera.yaml; fx, fy, cx, cy in pixels of this image; the nine numbers of
+                K; or one number, the horizontal field of view in degrees.
             max_depth: Leave out points that are farther, in the unit of ``depth``.
             edge: Leave out points whose depth differs by more than this fraction from the surfaces on both sides of an
                 edge; 0 keeps all.
@@ -106,12 +106,12 @@ class Prediction:
         return point_cloud(self, camera_of(camera, *self.depth.shape), max_depth=max_depth, edge=edge)
 
     def save(self, path: str | Path) -> None:
-        """Write depth as float32 (``.npy``), disparity in colors (``.png``, ``.jpg`` ...), or a page (``.html``).
+        """Write depth as float32 (``.npy``), disparity in colors (``.png``, ``.jpg``, ...), or a page (``.html``).
 
         The page shows image and disparity, and the depth under the cursor; it needs nothing but a browser.
 
         Raises:
-            ConfigError: for another suffix.
+            ConfigError: for any other suffix.
         """
         suffix = Path(path).suffix.lower()
         if suffix == ".npy":
@@ -159,16 +159,16 @@ class ImagePredictor(abc.ABC):
         height: Height of the network's input in pixels.
         width: Width of the network's input in pixels.
         scale: Factor to meters; None leaves depth relative.
-        keep_aspect: Feed each image at its own aspect ratio, with about height x width pixels, not exactly that size.
-        size_divisor: What the network's input sides must be multiples of.
+        keep_aspect: Keep each image's aspect ratio, at about height x width pixels instead of exactly that size.
+        size_divisor: The sides of the network's input must be multiples of this.
     """
 
     undistort: Callable[[UInt8[np.ndarray, "_ _ 3"]], UInt8[np.ndarray, "_ _ 3"]] | None = None
     """Applied to every image first; predictions are of the image that it returns."""
     undistorted_by: str | None = None
-    """Which camera that is for; None without."""
+    """The camera to undistort; None without one."""
     source: str = ""
-    """What it was loaded from."""
+    """The file it was loaded from."""
 
     def __init__(
         self, height: int, width: int, scale: Scale | None = None, keep_aspect: bool = False, size_divisor: int = 1
@@ -195,7 +195,7 @@ class ImagePredictor(abc.ABC):
 
     @property
     def unit(self) -> str:
-        """What one unit of predicted depth is, for people."""
+        """The unit of predicted depth, in words."""
         return unit_of(self.scale)
 
     def predict(self, image: ImageLike, name: str | None = None) -> Prediction:
@@ -204,16 +204,16 @@ class ImagePredictor(abc.ABC):
         Args:
             image: A path, an h x w x 3 RGB array of bytes, a PIL image, or a 3 x h x w tensor (bytes, or floats in
                 [0, 1]).
-            name: What to call it; the path by default.
+            name: Name of the image; the path by default.
 
         Raises:
-            DataError: if the image cannot be read or has a shape or type that is not an image's.
+            DataError: if the image cannot be read, or its shape or type is not that of an image.
             CheckpointError: if the network's output is not finite.
         """
         return self.predict_batch([image], [name] if name is not None else None)[0]
 
     def predict_batch(self, images: Sequence[ImageLike], names: Sequence[str] | None = None) -> list[Prediction]:
-        """Predict images, each at its own size, in as few runs of the network as these allow; see `predict`."""
+        """Predict images, each at its own size, in as few runs of the network as possible; see `predict`."""
         arrays = [as_image(image) for image in images]
         if self.undistort is not None:
             arrays = [self.undistort(array) for array in arrays]
@@ -229,7 +229,7 @@ class ImagePredictor(abc.ABC):
         return [results[index] for index in range(len(arrays))]
 
     def input_size(self, height: int, width: int) -> tuple[int, int]:
-        """Return the (height, width) at which an image of this size is fed to the network."""
+        """Return the (height, width) at which the network gets an image of this size."""
         if not self.keep_aspect:
             return self.height, self.width
         zoom, step = math.sqrt(self.height * self.width / (height * width)), self.size_divisor
@@ -242,7 +242,7 @@ class ImagePredictor(abc.ABC):
     ) -> Prediction:
         if not np.isfinite(disparity).all():
             raise CheckpointError(
-                f"the network's output for {name} is not finite; the weights are damaged or training diverged"
+                f"the network's output for {name} is not finite; the weights are damaged, or the training diverged"
             )
         # Linear interpolation in disparity: the network's own quantity, and the one in which planes are linear.
         full = cv2.resize(disparity, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
@@ -261,20 +261,21 @@ def as_image(image: ImageLike) -> UInt8[np.ndarray, "h w 3"]:
                 f"the image array has shape {image.shape}; arrays are h x w x 3, use image.transpose(1, 2, 0)"
             )
         return as_rgb_bytes(image, "the image array")
-    if hasattr(image, "getbands"):  # a PIL image, of which Pillow made the class
+    if hasattr(image, "getbands"):  # a PIL image; Pillow defines its class
         from PIL import ImageOps
 
-        image = ImageOps.exif_transpose(image)  # as files are read
+        image = ImageOps.exif_transpose(image)  # as for files
         return as_rgb_bytes(np.asarray(image if image.mode.startswith("I;16") else image.convert("RGB")), "the image")
     if not hasattr(image, "detach"):
         raise DataError(f"an image is a path, an array, a PIL image or a tensor, got {type(image).__name__}")
     values = image.detach().cpu().numpy()
     if values.ndim != 3 or values.shape[0] != 3:
-        raise DataError(f"the image tensor has shape {tuple(values.shape)}; tensors are 3 x h x w, one image a tensor")
+        raise DataError(f"the image tensor has shape {tuple(values.shape)}; a tensor must be one image, 3 x h x w")
     if values.dtype.kind == "f":
         if values.size and not (values.min() >= 0 and values.max() <= 1):
             raise DataError(
-                f"the image tensor has values from {values.min():g} to {values.max():g}; floats must lie in [0, 1]"
+                f"the image tensor has values from {values.min():g} to {values.max():g}; floating-point values must "
+                "lie in [0, 1]"
             )
         values = np.round(values * 255).astype(np.uint8)
     return as_rgb_bytes(values.transpose(1, 2, 0), "the image tensor")
@@ -288,7 +289,7 @@ def load(
     keep_aspect: bool = False,
     foreign: ForeignOptions | None = None,
 ) -> ImagePredictor:
-    """Load a trained model, however it is stored; see `saunet.load`. ONNX is run without even importing torch."""
+    """Load a trained model in any format; see `saunet.load`. ONNX runs without even importing torch."""
     predictor = _load(locate(source), device, flip, keep_aspect, foreign)
     predictor.source = str(source)
     return predictor
@@ -299,7 +300,7 @@ def _load(path: Path, device: str, flip: bool, keep_aspect: bool, foreign: Forei
 
     if (foreign is not None and foreign.given) or is_foreign(path):
         if path.suffix.lower() not in (".onnx", *SCRIPT_SUFFIXES):
-            raise ConfigError(f"foreign.* is for ONNX and TorchScript files of other systems, and {path} is neither")
+            raise ConfigError(f"foreign.* is for ONNX and TorchScript files of other systems, but {path} is neither")
         return ForeignPredictor(path, foreign or NOTHING, device, flip, keep_aspect)
     if path.is_dir() and (path / "model.onnx").is_file() and not (path / "model.safetensors").is_file():
         path = path / "model.onnx"
@@ -308,7 +309,7 @@ def _load(path: Path, device: str, flip: bool, keep_aspect: bool, foreign: Forei
 
         if keep_aspect:
             raise ConfigError(
-                f"{path} is ONNX and takes one size of images; leave keep_aspect out or load a checkpoint"
+                f"{path} is ONNX and takes images of one size; leave keep_aspect out, or load a checkpoint"
             )
         return OnnxPredictor(path, device=device, flip=flip)
     if path.suffix.lower() == ".pt2":

@@ -28,8 +28,8 @@ class Predictor(ImagePredictor):
         width: Width of the network's input in pixels.
         device: Where to run, such as ``"cpu"`` or ``"cuda"``.
         scale: Factor to meters; None leaves depth relative.
-        flip: Average with the prediction of the mirrored image (twice the time, a little less error).
-        keep_aspect: Feed each image at its own aspect ratio, with about height x width pixels, not exactly that size.
+        flip: Average with the prediction of the mirrored image (twice the time, slightly less error).
+        keep_aspect: Keep each image's aspect ratio, at about height x width pixels instead of exactly that size.
 
     Examples:
         >>> saunet.Predictor.from_checkpoint("last.ckpt").predict("road.png").disparity.dtype
@@ -55,12 +55,12 @@ class Predictor(ImagePredictor):
     def from_checkpoint(
         cls, path: str | Path, device: str | torch.device = "cpu", flip: bool = False, keep_aspect: bool = False
     ) -> Predictor:
-        """Load a trained model, a checkpoint or an exported folder; nothing in the file is run.
+        """Load a trained model, a checkpoint or an exported folder; no code in the file is run.
 
         Args:
             path: A checkpoint file, or a folder that ``saunet export`` wrote.
             device: Where the network runs.
-            flip: Also predict the mirrored image and blend: slower and a little better.
+            flip: Also predict the mirrored image and blend: slower and slightly better.
             keep_aspect: Keep the shape of images instead of stretching them to the size of the training.
 
         Raises:
@@ -92,7 +92,7 @@ class Predictor(ImagePredictor):
 
     @property
     def fingerprint(self) -> str:
-        """A short hash of the weights and of the settings that change results, the scale among them."""
+        """A short hash of the weights and of all settings that change results, including the scale."""
         factor = self.scale.factor if self.scale else None
         settings = (self.weights_hash, self.height, self.width, self.flip, self.keep_aspect, factor)
         return hashlib.sha256(repr(settings).encode()).hexdigest()[:16]

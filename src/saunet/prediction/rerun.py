@@ -1,4 +1,4 @@
-"""Predictions as a recording that Rerun's viewer plays: image, depth, camera, points, and the camera's path."""
+"""Predictions as a recording for Rerun's viewer: image, depth, camera, points, and the camera's path."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from saunet.prediction.odometer import Odometer
 
 POINTS = 50_000
-"""Points of a frame at most; the viewer makes a full cloud of depth and camera itself."""
+"""Most points per frame; the viewer makes a full cloud from depth and camera itself."""
 _PATIENCE = 120.0
 """Seconds for the last data to reach the disk."""
 
@@ -52,13 +52,13 @@ class RerunSink(Sink):
             self._recording = recording = self._rr.RecordingStream("saunet")
             recording.save(temporary)
             recording.send_recording_name(self.paths[0].stem)
-            recording.set_log_time_enabled(False)  # else the viewer plays at the pace of the computing
+            recording.set_log_time_enabled(False)  # otherwise the viewer plays at the speed of the prediction
             recording.set_log_tick_enabled(False)
             recording.log("world", self._rr.ViewCoordinates.RDF, static=True, strict=True)
             yield
             if self._odometer is not None:
                 self._log_path(self._odometer.trajectory())
-            # A full disk is no exception in Rerun: its writer thread logs a line and leaves half a file.
+            # A full disk raises no exception in Rerun: its writer thread logs a line and leaves half a file.
             with contextlib.suppress(RuntimeError):
                 recording.flush(timeout_sec=_PATIENCE)
                 recording.disconnect()

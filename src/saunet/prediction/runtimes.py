@@ -1,4 +1,4 @@
-"""Which program runs the network: torch, or on a CPU another that is installed, faster, and gives the same depth."""
+"""The runtime of the network: torch, or on a CPU another installed one that is faster and gives the same depth."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from saunet.weights.files import read_model
 
 
 class Change(NamedTuple):
-    """How depth changes relative to torch's."""
+    """Change of depth relative to torch's."""
 
     mean: float
-    """Over an image: Abs Rel."""
+    """Mean over an image: Abs Rel."""
     largest: float
-    """At any pixel."""
+    """Largest at any pixel."""
 
     def within(self, limit: Change) -> bool:
-        """Return whether neither is larger; NaN is."""
+        """Return whether neither exceeds the other's; NaN does."""
         return self.mean <= limit.mean and self.largest <= limit.largest
 
     def __str__(self) -> str:
@@ -45,24 +45,24 @@ class Change(NamedTuple):
 
 
 LIMITS = {"f32": Change(1e-4, 1e-2), "bf16": Change(2e-3, 0.1)}
-"""Largest change, by precision, with which a runtime is used."""
+"""Largest allowed change for a runtime, by precision."""
 ASKED = Change(5e-2, math.inf)
-"""The same where bfloat16 is asked for: it moves edges by a pixel, so that one pixel's depth says nothing."""
+"""The same if bfloat16 is requested: it moves edges by a pixel, so single pixels say nothing."""
 _BF16 = "-bf16"
-"""How the name of a runtime ends that is to compute in bfloat16."""
+"""Ending of the names of runtimes that compute in bfloat16."""
 WORTH_FRAMES = 200
-"""Frames that are worth a conversion, which takes as long as about so many frames."""
+"""Fewest frames worth a conversion, which takes about as long as this many frames."""
 _PACKAGES = {"openvino": ("openvino",), "onnx": ("onnxruntime", "onnx", "onnxscript")}
 _EXTRAS = {"openvino": "openvino", "onnx": "export"}
 
 
 class ConvertedPredictor(Predictor):
-    """A predictor whose network another runtime runs; on the first images it is compared with torch once more.
+    """A predictor that runs its network in another runtime, and compares it with torch once more on the first images.
 
     Args:
         predictor: The original.
         run: The converted network: one image to its disparity.
-        limit: Largest change of depth.
+        limit: Largest allowed change of depth.
     """
 
     def __init__(self, predictor: Predictor, run: Run, limit: Change) -> None:
@@ -76,8 +76,8 @@ class ConvertedPredictor(Predictor):
             self._compared, change = True, depth_change(exporters.run_eager(self.network), self._converted, images[:1])
             if not change.within(self._limit):
                 raise CheckpointError(
-                    f"in this runtime, depth of the first image changes by {change}, and allowed is {self._limit}; "
-                    "set runtime=torch"
+                    f"in this runtime, depth of the first image changes by {change}, but only {self._limit} is "
+                    "allowed; set runtime=torch"
                 )
         found = self._each(images)
         if self.flip:
@@ -100,18 +100,18 @@ def choose_runtime(
 ) -> ImagePredictor:
     """Return a predictor in a runtime, and print one line if it is not torch.
 
-    A network is converted once and kept in torch's cache folder. It is used if it changes depth by at most `LIMITS`.
+    A network is converted once and kept in torch's cache folder. It is used if depth changes by at most `LIMITS`.
 
     Args:
         predictor: A loaded model.
         checkpoint: Where it came from.
         runtime: ``torch``, ``openvino``, ``onnx``; ``openvino-bf16``, which may change depth by as much as `ASKED`; or
-            ``auto``, the first of the installed ones that is faster than torch, if ``frames`` are worth a conversion
-            or there has been one.
-        frames: How many frames will be predicted, at most.
+            ``auto``, the first installed one that is faster than torch, if ``frames`` are worth a conversion or one
+            exists already.
+        frames: Largest number of frames that will be predicted.
 
     Raises:
-        ConfigError: if a runtime is asked for that is missing, does not fit, or changes depth too much.
+        ConfigError: if the requested runtime is missing, does not fit, or changes depth too much.
     """
     one_of("runtime", runtime, RUNTIMES)
     if runtime == "torch":
@@ -140,7 +140,7 @@ def choose_runtime(
         raise
     if plain != runtime and precision != "bf16":
         raise ConfigError(
-            f"runtime={runtime} needs a processor that computes in bfloat16, and this one does not; set runtime={plain}"
+            f"runtime={runtime} needs a processor with bfloat16, which this one does not have; set runtime={plain}"
         )
     images, limit, hint = random_images(predictor.height, predictor.width), LIMITS[precision], ""
     if plain != runtime:
@@ -152,7 +152,7 @@ def choose_runtime(
         precision, limit, run = "f32", LIMITS["f32"], run_openvino(path, path.with_suffix(".bin"))
         change = _largest_change(eager, run, images)
     if not change.within(limit):
-        found_it = f"{name} changes depth by {change}, and allowed is {limit}"
+        found_it = f"{name} changes depth by {change}, but only {limit} is allowed"
         if not auto:
             raise ConfigError(f"{found_it}; set runtime=torch")
         print(f"runtime: torch ({found_it})")
@@ -173,16 +173,16 @@ def _largest_change(eager: Run, converted: Run, images: Sequence[Float32[np.ndar
 
 
 def _why_not(predictor: ImagePredictor) -> str:
-    """Return why a model runs in no other runtime; empty if it may."""
+    """Return why a model cannot run in another runtime; empty if it can."""
     if type(predictor) is not Predictor:
         return "is for checkpoints and safetensors"
     if predictor.device.type != "cpu":
         return f"is for the CPU, not for device={predictor.device.type}"
-    return "takes one size of images, which does not go with keep_aspect" if predictor.keep_aspect else ""
+    return "takes images of one size, which cannot be combined with keep_aspect" if predictor.keep_aspect else ""
 
 
 def _cached(predictor: Predictor, name: str) -> Path:
-    """Return where a conversion of exactly these weights at this size by these versions is kept."""
+    """Return the path of a conversion of exactly these weights at this size by these versions."""
     versions = [f"{package} {version(package)}" for package in ("torch", *_PACKAGES[name])]
     text = repr((predictor.weights_hash, predictor.height, predictor.width, versions))
     key = hashlib.sha256(text.encode()).hexdigest()[:24]
@@ -190,14 +190,14 @@ def _cached(predictor: Predictor, name: str) -> Path:
 
 
 def _open(name: str, path: Path, predictor: Predictor, checkpoint: str | Path) -> tuple[str, Run]:
-    """Return a converted network and its precision; convert it if that was not done before, or cannot be read."""
+    """Return a converted network and its precision; convert it if there is no readable conversion yet."""
     precision = "bf16" if name == "openvino" and has_bf16() else "f32"
     openers: dict[str, Callable[[], Run]] = {
         "openvino": lambda: run_openvino(path, path.with_suffix(".bin"), precision),
         "onnx": lambda: exporters.run_onnx(path),
     }
     if path.is_file():
-        with contextlib.suppress(CheckpointError):  # damaged: made again
+        with contextlib.suppress(CheckpointError):  # damaged: convert again
             return precision, openers[name]()
     print(f"converting the network for {name}, once")
     record = replace(read_model(checkpoint).record, height=predictor.height, width=predictor.width)
@@ -205,7 +205,7 @@ def _open(name: str, path: Path, predictor: Predictor, checkpoint: str | Path) -
     if name == "onnx":
         with replacing(path) as temporary:
             exporters.export_onnx(predictor.network, record, temporary, batch="one")
-    else:  # the weights first: with the graph, the conversion is there
+    else:  # the weights first: the graph marks the conversion as complete
         with replacing(path) as temporary, replacing(path.with_suffix(".bin")) as weights:
             export_openvino(predictor.network, record, temporary, weights, batch="one")
     return precision, openers[name]()

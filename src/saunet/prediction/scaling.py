@@ -1,4 +1,4 @@
-"""Metric scale for prediction: measured on the input's own frames, as `ScaleOptions` asks for, and reported."""
+"""Metric scale for prediction, measured on the input's own frames according to `ScaleOptions`, and reported."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from saunet.types import TrainBatch
 
 _ALIGNED = 3000
-"""Frames, evenly spread, whose motion a table of speeds is compared with."""
+"""Number of frames, evenly spread, to compare with a table of speeds."""
 
 
 def apply_scale(
@@ -36,10 +36,10 @@ def apply_scale(
     camera_height: float | None = None,
     store_in: Path | None = None,
 ) -> None:
-    """Give a predictor the scale that is asked for; print and write down what was measured.
+    """Set a predictor's scale according to the options; print and record the measurement.
 
-    The camera's height is the one of its file, and counts unless the options give one. ``store_in`` is the file of the
-    model that is to keep the factor.
+    The camera's height in its file applies unless the options give one. ``store_in`` is the file of the model that keeps
+    the factor.
     """
     if options.measures:
         import torch
@@ -62,7 +62,7 @@ def apply_scale(
         predictor.scale = keep_scale(estimate, store_in, folder)
         path = locate(checkpoint)
         if store_in is None and (path.suffix == ".ckpt" or ((path / WEIGHTS).is_file() and not is_shipped(path))):
-            print("it counts for this command; scale.store=true keeps it in the model, for all later ones")
+            print("it applies to this command only; scale.store=true keeps it in the model for all later ones")
     predictor.scale = options.chosen(predictor.scale)
 
 
@@ -81,8 +81,8 @@ def _batches(
     method, more, size = options.method, dict[str, Any](), (predictor.height, predictor.width)
     if live_source(source) is not None:
         raise ConfigError(
-            f"scale.method={method} measures over a whole recording and a live camera cannot be looked at beforehand; "
-            "measure with scale.store=true on recorded frames, then leave scale.method out"
+            f"scale.method={method} needs a whole recording, which a live camera does not have; measure with "
+            "scale.store=true on recorded frames first, then leave scale.method out"
         )
     if method != "speed":
         K = _needed(method, "camera", camera, "camera.yaml, or [fx,fy,cx,cy] in pixels of the images")
@@ -111,7 +111,7 @@ def _batches(
             more["distance"] = functools.partial(table.distance, "", fps=fps, times=clock)
         if method == "stereo":
             images = _needed(method, "scale.stereo", options.stereo, "the other camera's images")
-            baseline = _needed(method, "scale.baseline", options.baseline, "meters to the right camera")
+            baseline = _needed(method, "scale.baseline", options.baseline, "the distance to the right camera in meters")
             other = stack.enter_context(contextlib.closing(Recording(images)))
             more |= {"stereo": (frame.read() for frame in other), "baseline": baseline}
         yield clip_batches(pictures(), *size, offsets=offsets, most=options.frames, count=recording.declared, **more)
@@ -120,7 +120,7 @@ def _batches(
 def _aligned(
     table: SpeedTable, recording: Recording, fps: float | None, pose: Any, offsets: Sequence[int], size: tuple[int, int]
 ) -> SpeedTable:
-    """Return a table on the clock of the frames, found by the motion that the pose network predicts; say the offset."""
+    """Align a table's clock with the frames, by the pose network's predicted motion; report the offset."""
     import torch
 
     from saunet.io.alignment import align_speeds

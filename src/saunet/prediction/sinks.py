@@ -1,4 +1,4 @@
-"""What predictions go into: files an image, a video, a page, a trajectory, and the one pass that fills all of them."""
+"""Outputs of predictions: files per image, a video, a page, a trajectory, and the one pass that fills them all."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ if TYPE_CHECKING:
 
 ENDINGS = {"color": "_disparity.png", "png16": "_depth.png", "npy": "_depth.npy", "ply": "_points.ply"}
 OUTPUTS: tuple[str, ...] = (*ENDINGS, "pairs")
-"""What can be written for each image: disparity in colors, depth as 16-bit PNG (x 256) or float32 array, points; image
-and depth as a pair to train on, which Ultralytics and ``data=pairs`` read."""
+"""Outputs per image: disparity in colors, depth as 16-bit PNG (x 256) or float32 array, points; image and depth as a
+pair to train on, for Ultralytics and ``data=pairs``."""
 LAYOUTS: tuple[str, ...] = ("auto", "stacked", "beside")
-"""Depth below the image, beside it, or whichever comes nearer to a screen's shape."""
+"""Depth below the image, beside it, or whichever is closer to a screen's shape."""
 MANIFEST = "predictions.json"
-"""Written into the output folder: which model and settings its files come from."""
+"""File in the output folder that records the model and settings of its results."""
 
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """How results are drawn and written."""
+    """Settings for drawing and writing results."""
 
     colormap: str = "magma"
     limits: tuple[float, float] | None = None
@@ -59,27 +59,27 @@ class Style:
 
 @dataclass(frozen=True, slots=True)
 class ClipInfo:
-    """What an output of a whole recording is made for."""
+    """The recording and settings that an output is made for."""
 
     stem: str
-    """How the names of its files begin, with their folder: ``out/drive_``."""
+    """Folder and beginning of its file names: ``out/drive_``."""
     title: str
-    """Of the recording."""
+    """Title of the recording."""
     fps: float
     """Frames per second of results."""
     timed: bool
-    """Whether frames have times of their own."""
+    """Whether frames have their own times."""
     style: Style
     retimed: bool = False
-    """Whether results run at a rate of their own all the same."""
+    """Whether results nevertheless run at a fixed rate."""
     layout: str = "auto"
     codec: str = "h264"
     odometer: Odometer | None = None
-    """What follows the camera, where a trajectory is asked for too."""
+    """The odometer, if a trajectory is requested too."""
 
 
 class Manifest:
-    """What an output folder says its files come from."""
+    """The record of an output folder: the model and settings of its files."""
 
     def __init__(self, folder: Path, predictor: ImagePredictor, style: Style, overwrite: bool) -> None:
         self.path = folder / MANIFEST
@@ -91,7 +91,7 @@ class Manifest:
             "camera": style.camera.K.tolist() if style.camera else None,
         }
         self.clips: dict[str, Any] = {}
-        """How results of whole recordings were made, by the names of their files."""
+        """Settings of results of whole recordings, by the names of their files."""
         self.written = False
         if overwrite or not self.path.exists():
             return
@@ -113,14 +113,14 @@ class Manifest:
         self.written, self.clips = True, clips if isinstance(clips, dict) else {}
 
     def write(self, clips: Mapping[str, Any] | None = None) -> None:
-        """Write it, with further results of whole recordings."""
+        """Write the record, with further results of whole recordings."""
         self.clips.update(clips or {})
         write_json(self.path, {**self.settings, **({"clips": self.clips} if self.clips else {})})
         self.written = True
 
 
 def output_paths(output: str, folder: Path, stem: str) -> tuple[Path, ...]:
-    """Return the files of one of `OUTPUTS` of an image."""
+    """Return an image's files for one of `OUTPUTS`."""
     if output == "pairs":
         return folder / "images" / f"{stem}.png", folder / "depth" / f"{stem}.npy"
     return (folder / f"{stem}{ENDINGS[output]}",)
@@ -139,7 +139,7 @@ def write_output(output: str, folder: Path, stem: str, result: Prediction, style
         write_image(paths[0], result.image)
         result.save(paths[1])
     else:
-        assert style.camera is not None  # the options have asked for it
+        assert style.camera is not None  # the options require it
         point_cloud(result, style.camera, max_depth=style.max_depth).save(paths[0])
     return paths
 
@@ -155,28 +155,28 @@ def write_pairs_camera(folder: Path, camera: Camera, fps: float | None) -> None:
 
 
 class Sink(Session, abc.ABC):
-    """Takes predictions in order; leaving it by an error discards what is not complete."""
+    """Takes predictions in order; an error discards incomplete files."""
 
     paths: tuple[Path, ...]
-    """What it writes, or the folder that it writes into."""
+    """The files it writes, or their folder."""
 
     @abc.abstractmethod
     def add(self, frame: Frame, result: Prediction, limits: tuple[float, float]) -> None:
-        """Take one more frame, and the color limits of the clip so far."""
+        """Add one more frame, with the color limits of the clip so far."""
 
 
 class ImageFilesSink(Sink):
-    """Files of each image beside each other, each in its own colors; those that are finished stay."""
+    """Files of each image side by side, each in its own colors; finished ones are kept."""
 
     def __init__(self, folder: Path, outputs: Sequence[str], style: Style, manifest: Manifest, overwrite: bool) -> None:
         self.paths, self.outputs, self.written = (folder,), tuple(outputs), list[Path]()
         self._style, self._manifest, self._overwrite = style, manifest, overwrite
 
     def wanted(self, frame: Frame) -> Sequence[str]:
-        """Return the outputs that are not there yet, or of another version of their image.
+        """Return the outputs that are missing, or belong to another version of their image.
 
-        Files appear only when complete, and have the time stamp of their image: whatever a clock does, a changed image
-        has another one.
+        Files appear only when complete, and get the time stamp of their image: a changed image has another stamp,
+        whatever the clock does.
         """
         if self._overwrite:
             return self.outputs
@@ -196,7 +196,7 @@ class ImageFilesSink(Sink):
                 changed = frame.image.stat()
                 for path in paths:
                     os.utime(path, ns=(changed.st_atime_ns, changed.st_mtime_ns))
-            if not self._manifest.written:  # only now: a run that writes nothing leaves nothing
+            if not self._manifest.written:  # only now, so that a run that writes nothing leaves nothing
                 self._manifest.write()
 
 
@@ -205,9 +205,9 @@ def _made_from(path: Path, changed: float | None) -> bool:
 
 
 class FrameFilesSink(Sink):
-    """Files of each frame of a video in a folder of their own (``000000_depth.png``), in the colors of the clip.
+    """Files of each frame of a video in one folder (``000000_depth.png``), in the colors of the clip.
 
-    Frames that an earlier clip left in the folder are removed first: they would be taken for this one's.
+    Frames of an earlier clip in the folder are removed first, because they would be mistaken for this clip's.
     """
 
     def __init__(self, folder: Path, outputs: Sequence[str], style: Style) -> None:
@@ -250,7 +250,7 @@ class VideoSink(Sink):
 
 
 class ViewerSink(Sink):
-    """A page to orbit the points and scrub through the clip; see `ViewerWriter`."""
+    """A page for orbiting the points and scrubbing through the clip; see `ViewerWriter`."""
 
     def __init__(self, path: Path, camera: Camera, fps: float, max_depth: float | int | None, title: str) -> None:
         self._writer = ViewerWriter(path, camera, fps=fps, max_depth=max_depth, title=title)
@@ -265,7 +265,7 @@ class ViewerSink(Sink):
 
 
 class TrajectorySink(Sink):
-    """The camera's path: drawn from above, as KITTI poses (``.txt``), and where times are known in TUM's format."""
+    """The camera's path: drawn from above, as KITTI poses (``.txt``) and, if times are known, in TUM's format."""
 
     def __init__(self, path: Path, odometer: Odometer, timed: bool, camera: Camera | None = None) -> None:
         self._odometer, self._times, self._camera = odometer, list[float](), camera
@@ -300,7 +300,7 @@ def _video(clip: ClipInfo) -> Sink:
 
 @clip_outputs.register("html")
 def _viewer(clip: ClipInfo) -> Sink | None:
-    """Points to orbit; nothing for a recording without a frame, whose camera is unknown."""
+    """Points to orbit; nothing for a recording without frames, because its camera is unknown."""
     path, style = Path(f"{clip.stem}points.html"), clip.style
     return None if style.camera is None else ViewerSink(path, style.camera, clip.fps, style.max_depth, clip.title)
 
@@ -314,7 +314,7 @@ def _trajectory(clip: ClipInfo) -> Sink:
 
 @clip_outputs.register("rrd")
 def _rerun(clip: ClipInfo) -> Sink:
-    """All of it for Rerun's viewer."""
+    """Everything for Rerun's viewer."""
     from saunet.prediction.rerun import RerunSink
 
     return RerunSink(Path(f"{clip.stem}rerun.rrd"), clip.style.camera, clip.style.max_depth, clip.odometer)
@@ -323,7 +323,7 @@ def _rerun(clip: ClipInfo) -> Sink:
 def compose(
     image: UInt8[np.ndarray, "h w 3"], painted: UInt8[np.ndarray, "_ _ 3"], layout: str = "auto", name: str = ""
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return one frame of a side-by-side video, with names above the halves if one is given."""
+    """Return one frame of a side-by-side video, with names above the halves if given."""
     height, width = image.shape[:2]
     halves = [image, fit(painted, height, width)]
     if name:
@@ -344,11 +344,11 @@ def fill(
     failures: list[str] | None = None,
     check: Callable[[], None] = lambda: None,
 ) -> int:
-    """Predict every frame into every sink, with a few pictures in memory; return how many.
+    """Predict every frame into every sink, holding only a few pictures in memory; return the number of frames.
 
-    A thread writes one batch while the network has the next one; what a ``live`` camera shows is written at once. A
-    picture that cannot be read becomes one sentence in ``failures`` if that is given, and is an error else; ``check``
-    has the last word before sinks are completed. Ctrl-C completes what a live camera has given so far.
+    A thread writes one batch while the network computes the next; frames of a ``live`` camera are written at once. A
+    picture that cannot be read becomes one sentence in ``failures`` if that is given, and an error otherwise; ``check``
+    runs before sinks are completed. With a live camera, Ctrl-C completes the results so far.
     """
     count, left, limits = 0, iter(frames), RunningRange(range_smoothing)
 
@@ -362,7 +362,7 @@ def fill(
         stopped = stack.enter_context(_interrupt_noted(live))
         for sink in sinks:
             stack.enter_context(sink)
-        writer = stack.enter_context(ThreadPoolExecutor(1))  # ends before the sinks do
+        writer = stack.enter_context(ThreadPoolExecutor(1))  # ends before the sinks
         writing: Future[None] | None = None
         shown = stack.enter_context(bar())
         task = shown.add_task("predicting", total=total)
@@ -401,10 +401,10 @@ def fill(
 
 @contextlib.contextmanager
 def _interrupt_noted(live: CameraReader | None) -> Iterator[Callable[[], bool]]:
-    """Note the first Ctrl-C of the block instead of raising, and stop the camera; a second one raises as ever.
+    """On the first Ctrl-C in the block, stop the camera instead of raising; a second one raises as usual.
 
-    Raised in the middle of writing a frame, it would leave nobody knowing whether the frame is in the file. Where
-    Ctrl-C is ignored or another program handles it, and outside of the main thread, everything stays as it is.
+    Raised while a frame is being written, it would be unknown whether the frame is in the file. If Ctrl-C is ignored or
+    handled elsewhere, and outside the main thread, nothing changes.
     """
     noted, usual = threading.Event(), signal.default_int_handler
     main = threading.current_thread() is threading.main_thread()

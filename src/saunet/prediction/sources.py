@@ -1,4 +1,4 @@
-"""What an input names (images, a video, a camera, arrays), one picture at a time, and what results are to be called."""
+"""Inputs (images, a video, a camera, arrays), read one picture at a time, and the names of their results."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from saunet.io.video import VIDEO_SUFFIXES, VideoReader
 from saunet.prediction.prediction import ImageLike, as_image
 
 IMAGE_FPS = 10.0
-"""Frames per second of images, KITTI's rate; files do not say."""
+"""Frames per second assumed for images: KITTI's rate."""
 STREAM_FPS = 25.0
-"""Frames per second of a bare video stream that does not contain its rate."""
+"""Frames per second assumed for a bare video stream without its rate."""
 
 Input = str | Path | int | Sequence[str | Path] | Iterable[Any]
 """A video file, images (files, folders, patterns), a live camera (its number, device or address), or RGB arrays."""
@@ -35,27 +35,27 @@ class Frame:
     """One picture to predict."""
 
     image: ImageLike
-    """Its file, if it has one, which is read when it is needed."""
+    """Its file, if it has one; it is read when needed."""
     stem: str
-    """What its results are called, relative to the output folder."""
+    """Name of its results, relative to the output folder."""
     time: float | None = None
-    """Seconds since the first of a video, or by the stamps that names of images are; None if unknown."""
+    """Seconds since the first frame of a video, or the time stamp in an image's name; None if unknown."""
     arrived: float | None = None
-    """When it came from a live camera, on the monotonic clock."""
+    """Arrival from a live camera, on the monotonic clock."""
 
     def read(self) -> UInt8[np.ndarray, "_ _ 3"]:
         return as_image(self.image)
 
 
 class Recording:
-    """Pictures in order, of whatever kind.
+    """Pictures of any kind, in order.
 
     Attributes:
-        title: What to call results of the whole.
-        images: The files, if it is images; else None.
-        live: The live camera, if it is one: it ends when somebody stops it.
-        declared: How many pictures there are, as far as known.
-        fps: Frames per second: as given, as recorded, or assumed.
+        title: Name of results of the whole recording.
+        images: The files if the input is images, else None.
+        live: The live camera, if it is one; it runs until stopped.
+        declared: Number of pictures, as far as known.
+        fps: Frames per second: given, recorded or assumed.
         timed: Whether frames have times.
     """
 
@@ -115,21 +115,21 @@ class Recording:
 
     @property
     def problems(self) -> list[str]:
-        """What was wrong with a video that has been read to its end, or with a camera; a sentence each."""
+        """Problems of a video that has been read to its end, or of a camera, one sentence each."""
         reader = self._reader
         if reader is None or isinstance(reader, CameraReader):
             return reader.problems if reader else []
         name = reader.name
         found = {
-            f"{name} ends {reader.missing} frames earlier than it declares: it is truncated": reader.missing,
+            f"{name} is truncated: it ends {reader.missing} frames earlier than it declares": reader.missing,
             f"{reader.damaged} frames of {name} are damaged and could not be decoded in full": reader.damaged,
-            f"{reader.plain} of {reader.count} frames of {name} have one single color; look at the video": reader.plain,
+            f"{reader.plain} of {reader.count} frames of {name} have one single color; check the video": reader.plain,
         }
         return [problem for problem, count in found.items() if count]
 
     @property
     def missing(self) -> int:
-        """Frames that a truncated video lacks."""
+        """Number of frames missing from a truncated video."""
         return self._reader.missing if self._reader is not None else 0
 
     def close(self) -> None:
@@ -143,7 +143,7 @@ def _is_video(path: Path) -> bool:
 
 
 def title_of(source: Input) -> str:
-    """Return what to call a source's results."""
+    """Return the name of a source's results."""
     camera = live_source(source)
     if camera is not None:
         return live_title(camera)
@@ -156,7 +156,7 @@ def title_of(source: Input) -> str:
 
 
 def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Path | None = None) -> list[Frame]:
-    """Return the images that ``inputs`` name, ``frame_2`` before ``frame_10``, without what lies in ``output_dir``.
+    """Return the images that ``inputs`` name, ``frame_2`` before ``frame_10``, except those in ``output_dir``.
 
     Results must not lie among the originals: the next run would read them as images.
     """
@@ -169,7 +169,7 @@ def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Pa
     found: dict[Path, Path] = {}  # image -> its path relative to the input that named it
     for item in several:
         base, paths = _expand(item)
-        if own is not None and base.resolve() in own.parents:  # an earlier run's results are no inputs
+        if own is not None and base.resolve() in own.parents:  # an earlier run's results are not inputs
             paths = [path for path in paths if own not in path.resolve().parents]
         if not paths:
             raise DataError(f"no images in {item}; looked for files ending in {' '.join(sorted(IMAGE_SUFFIXES))}")
@@ -199,7 +199,9 @@ def find_sources(inputs: str | Path | Sequence[str | Path], output_dir: str | Pa
 
 def _holds_originals(folder: str | Path | None, original: Path) -> ConfigError:
     other = Path(str(folder), "depth")
-    return ConfigError(f"the output folder {folder} holds the originals ({original}); choose another, such as {other}")
+    return ConfigError(
+        f"the output folder {folder} contains the input images ({original}); choose another, such as {other}"
+    )
 
 
 def clips_of(source: Input, images: Sequence[Frame] | None) -> dict[Path, Path]:
@@ -234,9 +236,9 @@ def _expand(item: str | Path) -> tuple[Path, list[Path]]:
 
 
 def _below(folder: Path) -> Iterator[Path]:
-    """Yield the files at any depth, also through links, a folder once; not the thumbnails and notes of other programs.
+    """Yield files at any depth, following links but each folder once, without thumbnails and notes of other programs.
 
-    Such are ``._a.png`` (macOS), ``@eaDir`` (Synology), ``.ipynb_checkpoints`` and ``__MACOSX``.
+    Examples: ``._a.png`` (macOS), ``@eaDir`` (Synology), ``.ipynb_checkpoints`` and ``__MACOSX``.
     """
     seen: set[str] = set()
     for place, folders, files in os.walk(folder, followlinks=True):

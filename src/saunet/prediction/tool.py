@@ -37,51 +37,52 @@ RUNTIMES: tuple[str, ...] = ("auto", "torch", "openvino", "openvino-bf16", "onnx
 @checked
 @dataclass(frozen=True, kw_only=True)
 class PredictOptions:
-    """What `predict` reads, how it predicts, and what it writes.
+    """Options of `predict`: what it reads, how it predicts, and what it writes.
 
-    Images are predicted into files of their own, and finished ones are skipped, so that an interrupted run can be
-    started again. A video, a camera or arrays are predicted once, with colors that are stable over the recording.
+    Each image gets its own files, and finished ones are skipped, so you can start an interrupted run again. A video, a
+    camera or arrays are predicted once, with colors that are stable over the recording.
 
     Args:
         checkpoint: The model: a checkpoint, an exported folder or file, a shipped model's name, or ``hf://owner/name``.
         input: An image, a folder (with everything below), a pattern (``frames/*.png``), a video, or a live
             camera (its number, ``/dev/video0``, an ``rtsp://`` or ``http://`` address);
             in Python also several images, or RGB arrays h x w x 3.
-        output: The folder of the results, made if missing; names follow the inputs.
+        output: The folder for the results, created if missing; file names follow the inputs.
         outputs: ``color`` (disparity in colors), ``png16`` (depth x 256), ``npy`` (depth in float32), ``ply`` (points),
             ``pairs`` (images and depth in meters, to train on) for each image; ``mp4`` (image and disparity), ``html``
-            (points to orbit), ``trajectory`` (from above, as KITTI poses, and where times are known for TUM's tools)
-            and ``rrd`` (all of it for Rerun's viewer) for the whole; and what plugins register. By default color and
-            png16 of images, mp4 of videos.
+            (points to orbit), ``trajectory`` (from above, as KITTI poses and, if times are known, for TUM's tools) and
+            ``rrd`` (everything for Rerun's viewer) for the whole recording; and what plugins register. By default color
+            and png16 for images, mp4 for videos.
         colormap: magma, inferno, viridis, turbo or gray.
         camera: True intrinsics, which ``ply`` and ``html`` need: a camera.yaml; fx, fy, cx, cy in pixels of the first
-            image; the nine numbers of K; one number, the horizontal field of view in degrees; or ``checkpoint`` for the
+            image; the nine numbers of K; one number, the horizontal field of view in degrees; or ``checkpoint``, the
             mean focal length that the model's training found (``model.intrinsics``). By default, where one is needed,
             the nearest camera.yaml in or above the folder of the images or the video, up to the input.
-        undistort: A camera.yaml: undistort and crop the images first, as training on that camera's clips does.
+        undistort: A camera.yaml with which to undistort and crop the images first, as training on that camera's clips
+            does.
         max_depth: Leave out points that are farther, in the unit of depth.
-        max_frames: Predict the first so many images or frames only.
+        max_frames: Predict only this many images or frames from the start.
         fps: Frames per second of results; by default a video keeps its times, images those in their names, and others
-            have 10.
-        layout: Of the video: ``stacked`` (disparity below), ``beside``, or ``auto``.
+            get 10.
+        layout: Layout of the video: ``stacked`` (disparity below), ``beside``, or ``auto``.
         range_smoothing: Weight of the past in the running color range of a recording, from 0 to below 1.
-        codec: Of the video: ``h264``, ``mp4v`` (quickest) or ``vp09``.
-        flip: Average with the prediction of the mirrored image: twice the time, a little less error.
-        keep_aspect: Feed each image at its own aspect ratio.
-        motion: Where the camera's motion of a ``trajectory`` comes from: from points ``tracked`` between frames, which
-            needs ``camera``, its length from the predicted depth; ``auto`` takes the pose network if the model has one.
+        codec: Codec of the video: ``h264``, ``mp4v`` (quickest) or ``vp09``.
+        flip: Average with the prediction of the mirrored image: twice the time, slightly less error.
+        keep_aspect: Keep each image's aspect ratio instead of the training's.
+        motion: Source of the camera's motion for ``trajectory``: points ``tracked`` between frames, with ``camera`` set
+            and the length from the predicted depth; ``auto`` uses the pose network if the model has one.
         scale: How depth becomes meters.
-        foreign: What an ONNX or TorchScript model of another system takes and gives.
-        overwrite: Replace results that are already there, whoever made them.
-        batch_size: Images that go through the network together.
-        device: Where to predict; ``auto`` takes a GPU if there is one.
+        foreign: Input and output of another system's ONNX or TorchScript model.
+        overwrite: Replace existing results, whatever made them.
+        batch_size: Images per run of the network.
+        device: Where to predict; ``auto`` uses a GPU if there is one.
         runtime: What runs the network on a CPU: ``torch``, ``openvino`` (extra ``openvino``), ``onnx`` (extra
             ``export``); ``auto`` is the first installed one that is faster than torch and changes depth by at most
-            1e-4 (2e-3 in bfloat16), where the number of frames is worth a conversion or there has been one.
-            ``openvino-bf16`` computes in bfloat16 although depth changes more.
+            1e-4 (2e-3 in bfloat16), if the number of frames is worth a conversion or one exists already.
+            ``openvino-bf16`` computes in bfloat16 even though depth changes more.
 
     Raises:
-        ConfigError: if an option cannot work, or not beside another one.
+        ConfigError: if an option is invalid, or cannot be combined with another.
 
     Examples:
         >>> saunet.PredictOptions(checkpoint="last.ckpt", input="drive.mp4", output="out").codec
@@ -123,8 +124,8 @@ class PredictOptions:
         if suffix in {*VIDEO_SUFFIXES, *IMAGE_SUFFIXES, *(f".{kind}" for kind in kinds)} and not folder.exists():
             kind = "mp4" if suffix in VIDEO_SUFFIXES else suffix[1:] if suffix[1:] in kinds else "color"
             raise ConfigError(
-                f"output is '{folder}', which ends like a file, and it names the folder of the results; "
-                f"set output={folder.with_suffix('')} outputs=[{kind}]"
+                f"output is '{folder}', which looks like a file, but output is the folder for the results; set "
+                f"output={folder.with_suffix('')} outputs=[{kind}]"
             )
         one_of("colormap", self.colormap, COLORMAPS)
         one_of("layout", self.layout, LAYOUTS)
@@ -133,7 +134,7 @@ class PredictOptions:
         one_of("motion", self.motion, MOTIONS)
         if self.motion != "auto" and "trajectory" not in (self.outputs or ()):
             raise ConfigError(
-                f"motion is '{self.motion}', which decides the camera's path, and no path is asked for; "
+                f"motion is '{self.motion}', which only affects the camera's path, but outputs has no trajectory; "
                 "add outputs=[trajectory], or leave motion out"
             )
         positive("batch_size", self.batch_size)
@@ -144,38 +145,38 @@ class PredictOptions:
         if self.undistort is not None:
             if self.camera is not None:
                 raise ConfigError(
-                    "camera and undistort are both set; undistort=FILE has the intrinsics, leave camera out"
+                    "camera and undistort are both set; undistort=FILE has the intrinsics, so leave camera out"
                 )
             if self.scale.measures:
                 raise ConfigError(
-                    f"scale.method={self.scale.method} measures on the images as they are, so it does not go with "
-                    "undistort; measure with saunet evaluate data=video scale.store=true first"
+                    f"scale.method={self.scale.method} measures on the original images, so it cannot be combined "
+                    "with undistort; measure with saunet evaluate data=video scale.store=true first"
                 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class PredictResult:
-    """What `predict` did."""
+    """The results of `predict`."""
 
     output: Path
     unit: str
-    """What one unit of depth is."""
+    """The unit of depth."""
     frames: int
     """Images or frames predicted now."""
     written: tuple[Path, ...] = ()
     """Files of single images written now."""
     skipped: int | None = None
-    """Images whose files were all finished before; None if no such files were asked for."""
+    """Images whose files were all finished before; None if no such files were requested."""
     clips: tuple[Path, ...] = ()
-    """Results of the whole recording written now; for files of its frames, their folder."""
+    """Results of the whole recording written now; for files per frame, their folder."""
     finished: tuple[Path, ...] = ()
     """Results of the whole recording that were finished before."""
     missing: int = 0
-    """Frames that a truncated video lacks."""
+    """Number of frames missing from a truncated video."""
     failures: tuple[str, ...] = ()
-    """One sentence for each image that could not be read, and for what was wrong with a video."""
+    """One sentence for each image that could not be read, and for each problem of a video."""
     notes: tuple[str, ...] = ()
-    """How it went with a live camera: latency, frames passed over, connections lost; a sentence each."""
+    """Notes about a live camera, one sentence each: latency, skipped frames, lost connections."""
 
     @property
     def exit_code(self) -> int:
@@ -202,16 +203,16 @@ def predict(
 
     Args:
         options: What to read and write.
-        predictor: A model that is loaded already; then the checkpoint is read for its pose network only.
-        odometer: What follows the camera; then the checkpoint is not read for it.
+        predictor: A model that is loaded already; the checkpoint is then only read for its pose network.
+        odometer: Follows the camera; the checkpoint is then not read for it.
 
     Returns:
-        What was written, and what was wrong.
+        The files written, and any problems.
 
     Raises:
-        ConfigError: for options that do not fit the input, or results that are there already and not known to be these.
+        ConfigError: for options that do not fit the input, or existing results of unknown origin.
         CheckpointError: if the model cannot be read.
-        DataError: if the input cannot be read, nothing in it can, or the system refuses to write.
+        DataError: if the input, or everything in it, cannot be read, or the results cannot be written.
 
     Examples:
         >>> options = saunet.PredictOptions(checkpoint="last.ckpt", input="road.png", output="out", device="cpu")
@@ -238,8 +239,8 @@ def predict(
         print(f"depth is {predictor.unit}")
         if "pairs" in outputs and predictor.scale is None:
             raise ConfigError(
-                "outputs has 'pairs', whose depth is in meters, and this model's is relative; set scale.method "
-                "(docs/scale.md), or write outputs=[npy]"
+                "outputs has 'pairs', which need depth in meters, but this model's depth is relative; set "
+                "scale.method (docs/scale.md), or write outputs=[npy]"
             )
         remove_partial_files(folder)
         if "trajectory" in outputs and odometer is None:
@@ -253,8 +254,8 @@ def predict(
             if odometer.tracks and camera is None:
                 why = "motion is 'tracked'" if options.motion == "tracked" else "the model has no pose network"
                 raise ConfigError(
-                    f"outputs has 'trajectory', and {why}; tracked points tell the path "
-                    "with the camera: set camera=camera.yaml or camera=[fx,fy,cx,cy], or use a model trained on video"
+                    f"outputs has 'trajectory', and {why}, so points are tracked, which needs the camera: set "
+                    "camera=camera.yaml or camera=[fx,fy,cx,cy], or use a model trained on video"
                 )
             if odometer.tracks:
                 print(f"trajectory: {odometer.told}")
@@ -294,7 +295,7 @@ def _predict_images(
     clips: Sequence[Sink],
     style: Style,
 ) -> PredictResult:
-    """Predict images into files of their own, and into results of the whole; what is finished and newer is skipped."""
+    """Predict images into their own files and into results of the whole; finished and newer files are skipped."""
     folder, again = Path(options.output), options.overwrite
     frames = (recording.images or [])[: options.max_frames]
     smoothing, batch = float(options.range_smoothing), options.batch_size
@@ -303,7 +304,7 @@ def _predict_images(
     manifest = sinks.Manifest(folder, predictor, style, again)
     todo, finished = list[Sink](), list[Sink]()
     for sink in clips:
-        made = manifest.clips.get(sink.paths[0].name)  # with overwrite, nothing counts as made
+        made = manifest.clips.get(sink.paths[0].name)  # with overwrite, nothing counts as finished
         made = made if isinstance(made, dict) else {}
         ours = look.items() <= made.items()
         if not ours:
@@ -320,8 +321,8 @@ def _predict_images(
             raise DataError(failures[0] + (f" (and {rest} more images cannot be read)" if rest else ""))
         if failures and todo:
             names = ", ".join(path.name for sink in todo for path in sink.paths)
-            raise DataError(f"{failures[0]}; {names} would lack it, so nothing but single images was written")
-        if todo:  # a run that is killed before it notes which images they show may replace them
+            raise DataError(f"{failures[0]}; {names} would lack it, so only single images were written")
+        if todo:  # if this run is killed before it records their images, the next run may replace them
             manifest.write({sink.paths[0].name: {"images": None, **look} for sink in todo})
 
     count, wanted, into = 0, frames if todo else unfinished, [files, *todo]
@@ -345,7 +346,7 @@ def _predict_images(
 def _clip_sinks(
     options: PredictOptions, outputs: Sequence[str], recording: Recording, style: Style, odometer: Odometer | None
 ) -> list[Sink]:
-    """Return what takes the outputs that are made of a recording as a whole."""
+    """Return the sinks of the outputs made from a whole recording."""
     clip = sinks.ClipInfo(
         stem=f"{Path(options.output) / recording.title}_",
         title=recording.title,
@@ -366,14 +367,14 @@ def _clip_sinks(
 
 
 def _state(frames: Sequence[Frame]) -> str:
-    """Return what changes when an image does, or joins or leaves, whatever the clock says."""
+    """Return a state that changes when an image is changed, added or removed, whatever the clock says."""
     found = [(frame.stem, frame.image.stat() if frame.image.exists() else None) for frame in frames]
     text = "\n".join(f"{stem} {now and (now.st_size, now.st_mtime_ns)}" for stem, now in found)
     return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:16]
 
 
 def _refuse_existing(sink: Sink, overwrite: bool) -> None:
-    """Check that a sink would not replace a file, or fill a folder that holds some, unless it is told to."""
+    """Check that a sink would not replace a file or fill a non-empty folder, unless ``overwrite`` is set."""
     for path in sink.paths:
         if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
             raise ConfigError(f"{path} exists; choose another output folder, or set overwrite=true")
