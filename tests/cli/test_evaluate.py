@@ -162,7 +162,7 @@ def test_exported_depth_is_scaled_by_the_first_protocol(
     for folder, more in (("alone", ""), ("first", ",eigen_camera_z")):
         outcome = tool("evaluate", *arguments, f"protocols=[eigen_lidar_x{more}]", f"export={folder}", "output_dir=out")
         assert outcome.code == 0, outcome.err
-        assert f"export: 12 images as 'eigen_lidar_x' scales them; in {folder}" in outcome.out
+        assert f"export: 12 images, scaled as in 'eigen_lidar_x'; in {folder}" in outcome.out
     alone, first = (
         {path.name: path.read_bytes() for path in (tmp_path / each).iterdir()} for each in ("alone", "first")
     )

@@ -217,7 +217,7 @@ def test_only_snippets_of_five_frames_are_as_published():
 
 def test_a_segment_that_does_not_fit_is_said():
     text = table_text(path_errors(a_path(31), lengths=[1000.0]))
-    assert "no segment of 1000 m or more fits into the 60.0 m of odometry/99 l" in text
+    assert "odometry/99 l is only 60.0 m long, too short for a segment of 1000 m" in text
     assert "nan" not in text
 
 

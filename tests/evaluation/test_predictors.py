@@ -137,7 +137,7 @@ def test_wrong_count(tmp_path):
     [
         (b"not numpy", "as a numpy array"),
         (np.zeros((5, 6), np.float32), r"holds shape \(5, 6\)"),
-        (np.zeros((5, 6, 10), np.uint8), "does not hold floating-point numbers"),
+        (np.zeros((5, 6, 10), np.uint8), "does not contain floating-point numbers"),
     ],
 )
 def test_broken_arrays(tmp_path, content, message):
@@ -170,7 +170,7 @@ def test_broken_files_of_a_folder(tmp_path):
     with pytest.raises(DataError, match="a depth map is one channel of 16-bit numbers"):
         read_all(tmp_path)
     cv2.imwrite(str(path), np.zeros((6, 10), np.uint16))
-    with pytest.raises(DataError, match="pixels without depth"):
+    with pytest.raises(DataError, match="pixels without valid depth"):
         read_all(tmp_path)
     cv2.imwrite(str(path), np.full((6, 10), 2560, np.uint16))
     cv2.imwrite(str(tmp_path / "0001.png"), np.full((6, 9), 2560, np.uint16))
@@ -190,7 +190,7 @@ def test_disparity_that_is_nowhere_positive_is_no_prediction(tmp_path, value):
     np.save(tmp_path / "disps.npy", maps)
     predict = FilePredictor(tmp_path / "disps.npy", ["a", "b"])
     assert predict({"name": ["a"]}).max() == 0.5
-    with pytest.raises(DataError, match=r"disps.npy' has disparity that is nowhere above 0 in an image"):
+    with pytest.raises(DataError, match=r"disps.npy' has an image without disparity above 0"):
         predict({"name": ["b"]})
 
 

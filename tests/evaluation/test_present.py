@@ -174,7 +174,7 @@ def test_nothing_there_and_options_of_one_data_set_are_refused(place: Path, tmp_
         evaluate_present(options(place, root=None))
     with pytest.raises(ConfigError, match="data set is 'kiti'"):
         evaluate_present(options(place, sets=["kiti"]))
-    with pytest.raises(ConfigError, match="compare belongs to one data set"):
+    with pytest.raises(ConfigError, match="compare applies to a single data set"):
         evaluate_present(EvaluateOptions(data=options(place).data, checkpoint="x", compare=str(tmp_path)))
     with pytest.raises(ConfigError, match="for saunet evaluate"):
         Spec.of("data", "all_present", root=str(tmp_path)).build().setup("fit")

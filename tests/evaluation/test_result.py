@@ -71,9 +71,9 @@ def test_joined_refuses_what_does_not_belong_together():
     changed = dataclasses.replace(
         other, protocols=tuple(dataclasses.replace(rules, max_depth=50.0) for rules in other.protocols)
     )
-    with pytest.raises(ConfigError, match="different rules by protocol 'eigen_camera_z'"):
+    with pytest.raises(ConfigError, match="different rules for protocol 'eigen_camera_z'"):
         result().joined(changed)
-    with pytest.raises(ConfigError, match="4 and 3 images that are not the same"):
+    with pytest.raises(ConfigError, match="different images \(4 and 3\)"):
         result().joined(result(predictors=("other",), blank=False))
 
 
@@ -89,7 +89,7 @@ def test_terminal_table_is_whole_on_a_narrow_terminal(width):
         assert len(line.removeprefix(predictor).split()) == 7 + 3
     assert "0.200" in text
     assert "3 ± 0.82" in text
-    assert "3 images; 1 more without a ground-truth pixel" in text
+    assert "3 images; 1 more without ground-truth pixels" in text
     words = [heading.split()[-2:] for heading in ERROR_HEADINGS]
     assert all(word in text for pair in words for word in pair)
 

@@ -114,8 +114,8 @@ def test_only_one_batch_is_pulled_at_a_time():
 @pytest.mark.parametrize(
     ("predictors", "protocols", "ground_truth", "message"),
     [
-        ({}, PROTOCOLS, "camera_z", "0 predictors under 2 protocols"),
-        ({"m": ConstantDepth()}, [], "camera_z", "1 predictors under 0 protocols"),
+        ({}, PROTOCOLS, "camera_z", "0 predictors and 2 protocols"),
+        ({"m": ConstantDepth()}, [], "camera_z", "1 predictors and 0 protocols"),
         ({"m": ConstantDepth()}, PROTOCOLS * 2, "camera_z", "share a name"),
         ({"m": ConstantDepth()}, PROTOCOLS, "lidar_x", "'eigen_camera_z' is defined on 'camera_z' .* give 'lidar_x'"),
         ({"m": ConstantDepth()}, PROTOCOLS, "lidar", "did you mean 'lidar_x'"),
@@ -177,7 +177,7 @@ def test_bad_predictions():
     def short(batch):
         return torch.ones(1, 1, 4, 4)
 
-    with pytest.raises(DataError, match="'m' gives values that are not finite for image 'drive 000'"):
+    with pytest.raises(DataError, match="'m' returned non-finite values for image 'drive 000'"):
         score({"m": nan}, batches(), PROTOCOLS, progress=False)
     with pytest.raises(DataError, match=r"returned shape \(1, 1, 4, 4\) for 2 images"):
         score({"m": short}, batches(), PROTOCOLS, progress=False)

@@ -212,7 +212,7 @@ def test_the_motion_of_tracked_points_is_the_true_one_and_where_there_are_none_a
     assert views["true", "all"] == 3
     (kept,) = [row for row in read_rows(write_results(result, tmp_path)["views.csv"].parent) if np.isnan(row.warped)]
     assert kept.compared == {}  # it does not take part in a comparison
-    with pytest.raises(DataError, match="motion is known for none of the 1 images: too few points"):
+    with pytest.raises(DataError, match="motion is unknown for all 1 images: too few points"):
         score_views({"m": (depth, _tracked)}, batches[2:], **rules)
 
 

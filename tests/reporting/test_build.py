@@ -274,7 +274,7 @@ def test_what_cannot_be_paired_is_said(tmp_path: Path) -> None:
     make_evaluation(runs[0] / "test", "x")
     make_evaluation(runs[1] / "test", "x", images=5)
     text = " ".join(_compared(*runs).split())
-    assert "do not pair up" in text
+    assert "cannot be paired" in text
     assert "are not compared (c not evaluated)" in text
     with pytest.raises(DataError, match="not enough to compare"):
         _compared(runs[0])

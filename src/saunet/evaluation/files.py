@@ -1,4 +1,4 @@
-"""An evaluation as files: written, and rows read back for comparisons."""
+"""Files of an evaluation: writing them, and reading rows back for comparisons."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def markdown(result: EvaluationResult) -> str:
 def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
     """Write ``metrics.json``, ``metrics.csv``, ``metrics.md`` and ``per_image.csv``, each whole or not at all.
 
-    What else the result holds goes to ``buckets.csv``, ``shapes.csv`` and ``views.csv`` (an image a line) and
+    The rest of the result goes to ``buckets.csv``, ``shapes.csv`` and ``views.csv`` (one image per line) and
     ``comparison.csv``.
     """
     summaries = [_summary(summary, result.spreads) for summary in result.summaries()]
@@ -50,7 +50,7 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
     for name, text in texts.items():
         write_bytes(folder / name, text.encode())
     for name in {"buckets.csv", "shapes.csv", "views.csv", "comparison.csv"} - texts.keys():
-        (folder / name).unlink(missing_ok=True)  # of an earlier evaluation in this folder, which these replace
+        (folder / name).unlink(missing_ok=True)  # from an earlier evaluation in this folder, replaced by these
     write_json(folder / "metrics.json", as_json(result))
     return {name: folder / name for name in (*texts, "metrics.json")}
 
@@ -58,7 +58,7 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
 def as_json(result: EvaluationResult) -> dict[str, object]:
     """Return the summaries and the exact rules they were computed under as plain data; NaN becomes None.
 
-    ``images`` holds the `fingerprint` of each protocol's images, which shows whether numbers are comparable.
+    ``images`` holds the `fingerprint` of each protocol's images, to check whether numbers are comparable.
     """
     content: dict[str, object] = {
         "settings": dict(result.settings),
@@ -110,11 +110,11 @@ def _read(path: Path, kind: type, made: Callable[[Mapping[str, str]], T]) -> lis
     except OSError as error:
         raise DataError(f"cannot read '{path}': {error.strerror}; give a per_image.csv of an evaluation") from error
     except (ValueError, TypeError, csv.Error) as error:
-        raise DataError(f"'{path}' holds a line that is not a row of numbers ({error}); evaluate again") from error
+        raise DataError(f"'{path}' has a line that is not a row of numbers ({error}); evaluate again") from error
 
 
 def without_nan(value: Any) -> Any:
-    """Return plain data with None in place of NaN, which JSON cannot hold."""
+    """Return plain data with None instead of NaN, which JSON does not have."""
     if isinstance(value, dict):
         return {key: without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -123,7 +123,7 @@ def without_nan(value: Any) -> Any:
 
 
 def _names(kind: type) -> list[str]:
-    """Return the names of a row's values, each error by its own."""
+    """Return the names of a row's values, each error under its own name."""
     names = (each.name for each in fields(kind))
     return [each for name in names for each in (ERROR_NAMES if name == "errors" else (name,))]
 

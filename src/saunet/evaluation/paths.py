@@ -1,4 +1,4 @@
-"""`odometry`: the path of the camera through whole sequences, its errors, its files and its picture."""
+"""`odometry`: the path of the camera through whole sequences, its errors, files and picture."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from saunet.weights.files import read_model
 from saunet.weights.locate import locate
 
 PUBLISHED_SNIPPET = 5
-"""Frames in a snippet of the published numbers."""
+"""Frames per snippet in published numbers."""
 MODEL, TRACKED = "pose network", "tracked points"
 STRAIGHT = "constant motion straight ahead"
 
@@ -52,14 +52,14 @@ class PathErrors:
     meters: float
     """Length of the true path."""
     snippet: int
-    """Frames in a snippet."""
+    """Frames per snippet."""
     snippet_ate: float
-    """Mean error of snippets in meters, each with its own scale; of five frames as published (Zhou et al.)."""
+    """Mean error of snippets in meters, each with its own scale; published numbers use five frames (Zhou et al.)."""
     snippet_std: float
     ate: float
     """Root mean square distance of positions in meters after 7-DoF alignment of the whole path."""
     scale: float
-    """Meters a unit of the prediction: the scale of that alignment."""
+    """Meters per unit of the prediction: the scale of that alignment."""
     turn: float
     """Degrees by which that alignment turned the path; see `Path3d.turn`."""
     t_rel: float
@@ -67,38 +67,38 @@ class PathErrors:
     r_rel: float
     """KITTI's rotation error, degrees per 100 m; NaN if no segment fits."""
     segments: int
-    """How many segments these are the mean of."""
+    """Number of segments in these means."""
     lengths: tuple[float, ...]
-    """Their lengths in meters; other than KITTI's where its shortest, 100 m, does not fit."""
+    """Their lengths in meters; shorter than KITTI's if the path is shorter than 100 m."""
 
 
 @dataclass(frozen=True)
 class Path3d:
-    """A predicted path, with the true one where it is known."""
+    """A predicted path, with the true one if known."""
 
     sequence: str
     predicted: Float64[ndarray, "n 4 4"]
     """``T_world_cam``; the world is the first camera, the scale the network's own."""
     times: Float64[ndarray, " n"] | None = None
-    """Seconds of each frame; None if the recording does not know them."""
+    """Seconds of each frame; None if unknown."""
     true: Float64[ndarray, "n 4 4"] | None = None
     """``T_world_cam`` in meters."""
     predictor: str = MODEL
 
     @cached_property
     def alignment(self) -> Similarity:
-        """The similarity that brings the prediction onto the truth; nothing moves where there is no truth."""
+        """The similarity transform from the prediction to the truth; the identity if there is no truth."""
         if self.true is None:
             return Similarity(1.0, np.eye(3), np.zeros(3))
         return umeyama(self.predicted[:, :3, 3], self.true[:, :3, 3])
 
     @property
     def turn(self) -> float:
-        """Degrees by which the alignment turns the path, against one on which the first cameras coincide.
+        """Degrees by which the alignment turns the path, compared with aligning the first cameras.
 
-        A network that takes sideways for ahead on a straight road has a small error after alignment, and this says
-        why. Positions weigh by their squared distance from the middle, so that a roll about a straight road, which
-        the alignment may choose freely, does not count. 0 without a truth.
+        A network that confuses sideways with ahead on a straight road has a small error after alignment, and a large
+        turn here. Positions are weighted by their squared distance from the middle, so a roll about a straight road,
+        which the alignment may choose freely, does not count. 0 without a truth.
         """
         if self.true is None:
             return 0.0
@@ -115,7 +115,7 @@ class Path3d:
 
 
 def path_of(drive: Drive, predicted: Float64[ndarray, "n 4 4"], predictor: str = MODEL) -> Path3d:
-    """Return a predicted path beside what its recording knows of all frames: when they were taken, and true poses."""
+    """Return a predicted path with the times and true poses that its recording has."""
     times = drive.timestamps
     poses = [pose for number in drive.indices if (pose := drive.pose(number)) is not None]
     times = None if times is None or np.isnan(times).any() else times
@@ -126,7 +126,7 @@ def path_of(drive: Drive, predicted: Float64[ndarray, "n 4 4"], predictor: str =
 def straight_ahead(path: Path3d) -> Path3d:
     """Return the path of a camera that moves by one unit along its axis from each frame to the next.
 
-    It looks at no image: a network that does not beat it has learned nothing about motion.
+    It uses no image: a network that does not beat it has learned nothing about motion.
     """
     poses = np.tile(np.eye(4), (len(path.predicted), 1, 1))
     poses[:, 2, 3] = np.arange(len(poses))
@@ -134,7 +134,7 @@ def straight_ahead(path: Path3d) -> Path3d:
 
 
 def path_errors(path: Path3d, snippet: int = 5, lengths: Sequence[float] | None = None) -> PathErrors:
-    """Compute the errors of a path whose truth is known."""
+    """Compute the errors of a path with a known truth."""
     true = path.true
     assert true is not None, "errors need the true path"
     meters = float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum())
@@ -170,7 +170,7 @@ def path_table(errors: Sequence[PathErrors]) -> Table:
         notes.append(f"t_rel and r_rel over segments of {', '.join(sorted(lengths))}")
     bare = {row.sequence: row for row in errors if not row.segments}
     notes += [
-        f"no segment of {min(row.lengths):g} m or more fits into the {row.meters:.1f} m of {name}"
+        f"{name} is only {row.meters:.1f} m long, too short for a segment of {min(row.lengths):g} m"
         for name, row in bare.items()
     ]
     title = f"odometry: the path of the camera from {'tracked points' if tracked else 'the pose network'}"
@@ -201,7 +201,7 @@ def write_errors(errors: Sequence[PathErrors], folder: Path, settings: dict[str,
 
 
 def draw_path(path: Path3d, file: Path, errors: Sequence[PathErrors] = ()) -> None:
-    """Draw a path from above and, where the true one is known, both and the distance between them."""
+    """Draw a path from above; if the true one is known, draw both and the distance between them."""
     known, red = path.true is not None, "tab:red"
     figure, (above, *more) = new_figure(1 + known, 9.0 if known else 5.0, 4.5)
     ours = spots = path.aligned[:, :3, 3]
@@ -218,7 +218,7 @@ def draw_path(path: Path3d, file: Path, errors: Sequence[PathErrors] = ()) -> No
     label = "predicted,\n7-DoF aligned" if known else "predicted"
     above.plot(ours[:, 0], ours[:, 2], color=red, linewidth=1.5, label=label)
     above.plot(ours[0, 0], ours[0, 2], "o", color=red, markersize=6, label="start")
-    # Equal scales, and room to the sides of a straight road, which would otherwise be a line in a sliver.
+    # Equal scales, and room on both sides of a straight road, which would otherwise be a narrow sliver.
     center, reach = (spots.max(0) + spots.min(0)) / 2, max(np.ptp(spots[:, 0]), np.ptp(spots[:, 2]), 1e-6) * 0.55
     above.set(xlim=(center[0] - reach, center[0] + reach), ylim=(center[2] - reach, center[2] + reach))
     above.set(xlabel=f"x to the right ({unit})", ylabel=f"z forward ({unit})", aspect="equal")
@@ -230,7 +230,7 @@ def draw_path(path: Path3d, file: Path, errors: Sequence[PathErrors] = ()) -> No
 
 
 def _told(errors: PathErrors) -> str:
-    """Say how good a path is before any alignment could flatter it, and how far that had to turn it."""
+    """Describe how good a path is before alignment improves it, and how far the alignment turned it."""
     relative = f", t_rel {errors.t_rel:.1f} %" if errors.segments else ""
     snippets = f"{errors.snippet}-frame ATE {errors.snippet_ate:.4f} m"
     return f"{errors.predictor}: {snippets}{relative}, turned by {errors.turn:.0f}° to align"
@@ -239,23 +239,23 @@ def _told(errors: PathErrors) -> str:
 @checked
 @dataclass(frozen=True, kw_only=True)
 class OdometryOptions:
-    """Which path `odometry` predicts, and how it is compared.
+    """Options of `odometry`: which paths to predict, and how to compare them.
 
     Args:
         checkpoint: A trained model.
-        data: The data module, whose test split is followed; the size of its images follows the checkpoint.
-        motion: Where the camera's motion comes from: from points ``tracked`` between frames, its length from the
-            predicted depth; ``auto`` takes the pose network if the model has one.
-        snippet: Frames in a snippet; published numbers use 5.
+        data: The data module; its test split is used, at the checkpoint's image size.
+        motion: Source of the camera's motion: points ``tracked`` between frames, with the length from the predicted
+            depth; ``auto`` uses the pose network if the model has one.
+        snippet: Frames per snippet; published numbers use 5.
         lengths: Segment lengths in meters for t_rel and r_rel; by default KITTI's 100 to 800 m, or 20 to 80 % of a path
-            that is shorter than 100 m.
-        batch_size: Frames that the network sees at once.
+            shorter than 100 m.
+        batch_size: Frames per run of the network.
         figure: Draw each path, if matplotlib is installed.
-        device: Where to predict; ``auto`` takes a GPU if there is one.
+        device: Where to predict; ``auto`` uses a GPU if there is one.
         output_dir: Folder for the results; None writes none.
 
     Raises:
-        ConfigError: if an option cannot work.
+        ConfigError: if an option is invalid.
 
     Examples:
         >>> data = saunet.Spec.of("data", "kitti_odometry", root="/data/kitti_odometry")
@@ -290,11 +290,11 @@ class OdometryResult:
 
     paths: tuple[Path3d, ...]
     errors: tuple[PathErrors, ...]
-    """Of each path with a true one, followed by those of constant motion straight ahead."""
+    """Errors of each path with a known truth, followed by those of constant motion straight ahead."""
     notes: tuple[str, ...] = ()
-    """What could not be done, and why."""
+    """Sentences about what could not be done, and why."""
     folder: Path | None = None
-    """Where the files were written."""
+    """Folder of the files."""
 
     @property
     def table(self) -> Table | None:
@@ -310,10 +310,10 @@ class OdometryResult:
 
 
 def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda text: None) -> OdometryResult:
-    """Predict the path through each test sequence and compare it with the true one where that is known.
+    """Predict the path through each test sequence, and compare it with the true one if known.
 
     Args:
-        options: What and how.
+        options: What to predict, and how.
         progress: Called with the name of each sequence.
 
     Returns:
@@ -347,7 +347,7 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
         if path.true is not None:
             mine = [path_errors(each, options.snippet, options.lengths) for each in (path, straight_ahead(path))]
         else:
-            notes.append(f"{drive.name}: no true poses, so the path is written and not compared")
+            notes.append(f"{drive.name}: no true poses, so the path is written but not compared")
         if path.times is None:
             notes.append(f"{drive.name}: the times of its frames are unknown, so no TUM files are written")
         if folder is not None:
@@ -358,7 +358,7 @@ def odometry(options: OdometryOptions, progress: Callable[[str], None] = lambda 
         paths.append(path)
         errors += mine
     if options.figure and not drawn:
-        notes.append("paths are not drawn, which needs matplotlib: run `pip install 'saunet[plot]'`")
+        notes.append("paths are not drawn, because that needs matplotlib: run `pip install 'saunet[plot]'`")
     scale = None if record.scale is None else {"factor": record.scale.factor, "source": record.scale.source}
     if folder is not None:
         motion = {"motion": "tracked"} if odometer.tracks else {}

@@ -1,4 +1,4 @@
-"""What can be scored: a depth network, or the predictions of another system in files; and how predictions are kept."""
+"""Predictors to score: a depth network, or another system's predictions in files; and exporting predictions."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ Motion: TypeAlias = Callable[[EvalBatch, Tensor], Tensor]
 """Gives ``T_src_tgt`` of a batch's sources, b x s x 4 x 4, in the unit of its predicted depth, b x 1 x h x w; NaN where
 unknown."""
 SUFFIXES: tuple[str, ...] = (".npy", ".png")
-"""Files of a folder that are read: arrays, and 16-bit PNG with values x 256 (KITTI's format)."""
+"""Files that are read from a folder: arrays, and 16-bit PNG with values x 256 (KITTI's format)."""
 
 
 class NetworkPredictor:
-    """A depth network, or a trivial predictor, as something that can be scored; put into evaluation mode.
+    """Make a depth network or a trivial predictor scorable; it is put into evaluation mode.
 
-    ``flip`` also predicts the mirrored image and blends: slower and a little better.
+    ``flip`` also predicts the mirrored image and blends: slower and slightly better.
     """
 
     def __init__(self, network: nn.Module, flip: bool = False) -> None:
@@ -69,16 +69,16 @@ class PredictorNetwork(nn.Module):
 
 
 class FilePredictor:
-    """Predictions of another system, read from files as they are needed.
+    """Predictions of another system, read from files when needed.
 
     Args:
         path: A ``.npy`` array, images x height x width (a channel of 1 is accepted), such as Monodepth2's
             ``disps_eigen_split.npy``; or a folder with one file per image, ``.npy`` (height x width) or 16-bit ``.png``
             (values x 256).
-        names: The images in the order of the predictions; some need not be evaluated (for want of ground truth).
+        names: The images in the order of the predictions; those without ground truth are not evaluated.
         values: ``disparity`` (up to scale) or ``depth``; by default disparity in an array and depth in a folder.
-        match: How files of a folder find their image: ``order`` takes them by the numbers in their names, ``name``
-            looks for the `file_stem` of each image's name.
+        match: How files of a folder are assigned to images: ``order`` sorts them by the numbers in their names,
+            ``name`` looks for the `file_stem` of each image's name.
     """
 
     def __init__(self, path: Path, names: Sequence[str] = (), values: str | None = None, match: str = "order") -> None:
@@ -87,7 +87,8 @@ class FilePredictor:
         self._by_stem = path.is_dir() and match == "name"
         if not self._by_stem and len(found) != len(names):
             raise DataError(
-                f"'{path}' holds {len(found)} predictions for {len(names)} images; give one for each, in the same order"
+                f"'{path}' holds {len(found)} predictions for {len(names)} images; give one for each image, in the "
+                "same order"
             )
         keys = [file.stem for file in found] if self._by_stem else names
         self._found: dict[str, Path | ndarray] = dict(zip(keys, found, strict=True))
@@ -104,8 +105,8 @@ class FilePredictor:
         source = self._found.get(stem if self._by_stem else name)
         if source is None and self._by_stem:
             raise DataError(
-                f"'{self.path}' has no file '{stem}.npy' or '.png' for image '{name}'; "
-                "name the files so, or let them follow the order of the images (match=order)"
+                f"'{self.path}' has no file '{stem}.npy' or '.png' for image '{name}'; rename the files, or use the "
+                "order of the images (match=order)"
             )
         if source is None:
             raise DataError(f"'{self.path}' has no prediction for image '{name}'; it belongs to another split")
@@ -120,23 +121,23 @@ class FilePredictor:
 
     def _disparity(self, values: ndarray, path: Path) -> Float[Tensor, "1 h w"]:
         if self.values == "disparity":
-            if (values <= 0).all():  # it would score like depth that is the same everywhere
+            if (values <= 0).all():  # it would score like constant depth
                 raise DataError(
-                    f"'{path}' has disparity that is nowhere above 0 in an image; disparity is 1/depth, so give "
-                    "positive numbers (predicted=depth for depth)"
+                    f"'{path}' has an image without disparity above 0; disparity is 1/depth, so give positive "
+                    "numbers (predicted=depth for depth)"
                 )
             return torch.from_numpy(values)[None]
         if not (values > 0).all():
-            raise DataError(f"'{path}' has pixels without depth (0, negative or NaN); predictions must be dense")
+            raise DataError(f"'{path}' has pixels without valid depth (0, negative or NaN); predictions must be dense")
         return torch.from_numpy(1 / values)[None]
 
 
 class ExportingPredictor:
-    """A predictor that also writes what it predicts, one 16-bit PNG per image (KITTI's format), named by `file_stem`.
+    """A predictor that also writes its predictions, one 16-bit PNG per image (KITTI's format), named by `file_stem`.
 
     The folder can be scored again (``predictions=FOLDER match=name``) with the same result, up to the PNG's 1/256 m.
-    The protocol's factor, alignment and limits make depth of disparity. For an alignment an image needs ground truth,
-    and one that has none is not written.
+    The protocol's factor, alignment and limits turn disparity into depth. An alignment needs ground truth, so images
+    without any are not written.
     """
 
     def __init__(self, predict: Predictor, folder: Path, protocol: Protocol) -> None:
@@ -155,8 +156,8 @@ class ExportingPredictor:
         return disparity
 
     def __str__(self) -> str:
-        rest = f", {self.left_out} left out that have no ground truth to be scaled by" if self.left_out else ""
-        return f"export: {self.written} images as '{self.protocol.name}' scales them{rest}; in {self.folder}"
+        rest = f", {self.left_out} left out because they have no ground truth for scaling" if self.left_out else ""
+        return f"export: {self.written} images, scaled as in '{self.protocol.name}'{rest}; in {self.folder}"
 
     def _depth(self, disparity: Float[Tensor, "h w"], truth: Float[Tensor, "hg wg"]) -> Float[Tensor, "_ _"] | None:
         rules = self.protocol
@@ -183,7 +184,7 @@ def existing(path: Path) -> Path:
 
 
 def file_stem(name: str) -> str:
-    """Return the file name, without ending, that stands for an image: all but letters, digits, - and . become ``_``."""
+    """Return an image's file name without ending: everything but letters, digits, - and . becomes ``_``."""
     return re.sub(r"[^A-Za-z0-9.-]+", "_", name)
 
 
@@ -209,5 +210,5 @@ def _load_array(path: Path) -> ndarray:
     except (OSError, ValueError, EOFError) as error:
         raise DataError(f"cannot read '{path}' as a numpy array ({error}); give a .npy file of numbers") from error
     if not isinstance(array, ndarray) or array.dtype.kind != "f":
-        raise DataError(f"'{path}' does not hold floating-point numbers; give a .npy file of disparity or depth")
+        raise DataError(f"'{path}' does not contain floating-point numbers; give a .npy file of disparity or depth")
     return array

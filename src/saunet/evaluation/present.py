@@ -1,4 +1,4 @@
-"""One model on every data set that is there: one table, and the results of each in a folder of its own."""
+"""One model on every data set present: one table, and a folder with the results of each data set."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class PresentResult:
     """The results of one model on several data sets."""
 
     results: Mapping[str, EvaluationResult]
-    """By data set."""
+    """Results by data set."""
     left_out: Mapping[str, str]
-    """Data sets that are there but could not be evaluated, and why."""
+    """Data sets that are present but could not be evaluated, and why."""
     absent: tuple[str, ...]
     """Data sets that were not found."""
     folder: Path | None = None
@@ -33,7 +33,7 @@ class PresentResult:
 
     @property
     def table(self) -> Table:
-        """A row for each data set, under its own protocol: the first that was asked for."""
+        """One row per data set, under its own protocol (the first requested one)."""
         rows = []
         for name, result in self.results.items():
             first = result.summaries()[0]
@@ -52,7 +52,7 @@ class PresentResult:
 
 
 def run(options: EvaluateOptions) -> EvaluationResult | PresentResult:
-    """Do what ``saunet evaluate`` does: `evaluate`, or `evaluate_present` with ``data=all_present``."""
+    """Run ``saunet evaluate``: `evaluate`, or `evaluate_present` with ``data=all_present``."""
     return evaluate_present(options) if _present(options.data) else evaluate(options)
 
 
@@ -60,23 +60,23 @@ def evaluate_present(options: EvaluateOptions) -> PresentResult:
     """Evaluate a model on every data set that its `PresentDataModule` finds.
 
     Args:
-        options: As for `evaluate`, with the data ``all_present``; each data set's results go to a folder of its name.
+        options: As for `evaluate`, with the data ``all_present``; each data set's results go to a folder with its name.
 
     Returns:
         The results by data set; `PresentResult.show` prints one table.
 
     Raises:
-        ConfigError: if an option is about one data set.
+        ConfigError: if an option applies to a single data set.
         CheckpointError: if the checkpoint cannot be read.
         DataError: if no data set can be evaluated.
     """
     for key in ("predictions", "compare"):
         if getattr(options, key):
             raise ConfigError(
-                f"{key} belongs to one data set; leave it out with data=all_present, or name the data set"
+                f"{key} applies to a single data set; leave it out with data=all_present, or choose one data set"
             )
     if options.scale.store:
-        raise ConfigError("scale.store=true stores one scale; leave it out with data=all_present")
+        raise ConfigError("scale.store=true stores a single scale; leave it out with data=all_present")
     folder = None if options.output_dir is None else check_folder(options.output_dir)
     data: PresentDataModule = options.data.build()
     with joined() as team:

@@ -1,4 +1,4 @@
-"""What an evaluation found, as an object: its rows, their means as tables and pictures, parts of it and joins."""
+"""The result of an evaluation as an object: rows, their means as tables and pictures, parts and joins."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ from saunet.tables.drawing import Drawing, colors, new_figure, svg
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """All rows of an evaluation, with the protocols that they were computed under; a notebook shows the tables."""
+    """All rows of an evaluation, with the protocols that they were computed with; a notebook shows the tables."""
 
     protocols: tuple[Protocol, ...]
     predictors: tuple[str, ...]
     rows: tuple[ImageRow, ...]
     buckets: tuple[BucketRow, ...] = ()
-    """Errors by distance, region and edges, where they were asked for."""
+    """Errors by distance, region and edges, if requested."""
     shapes: tuple[ShapeRow, ...] = ()
-    """Scores of edges and point clouds, where they were asked for."""
+    """Scores of edges and point clouds, if requested."""
     views: tuple[ViewRow, ...] = ()
-    """Rows under protocols that need no ground truth."""
+    """Rows of protocols that need no ground truth."""
     spreads: tuple[Spread, ...] = ()
-    """Intervals of the means, where they were asked for."""
+    """Intervals of the means, if requested."""
     comparisons: tuple[Comparison, ...] = ()
-    """Differences to another evaluation, where they were asked for."""
+    """Differences from another evaluation, if requested."""
     settings: Mapping[str, object] = field(default_factory=dict)
-    """What else the numbers depend on, such as post-processing; plain data."""
+    """Other settings that the numbers depend on, such as post-processing; plain data."""
     sources: tuple[str, ...] = ()
-    """Names of the sources of a mixture of data sets, whose images begin with them."""
+    """Names of the sources of a mixture of data sets; image names begin with them."""
     folder: Path | None = None
     """Where the files were written."""
     notes: tuple[str, ...] = ()
-    """Sentences about what else was done."""
+    """Further notes, one sentence each."""
 
     def select(self, predictor: str, protocol: str) -> tuple[ImageRow, ...]:
         """Return the rows of one predictor under one protocol, in the order they were computed."""
@@ -72,8 +72,8 @@ class EvaluationResult:
     def part(self, start: str) -> EvaluationResult:
         """Return the rows of the images whose names begin with ``start``, such as those of one source of a mixture.
 
-        Without the protocols under which none of them has ground truth, and without intervals and comparisons, which
-        are of all images.
+        Protocols without ground truth for these images are dropped, and so are intervals and comparisons, which are
+        about all images.
         """
         mine = [row for row in self.rows if row.name.startswith(start)]
         scored = {row.protocol for row in mine if row.pixels}
@@ -87,13 +87,13 @@ class EvaluationResult:
     def fingerprint(self, protocol: str) -> str:
         """Return the SHA-256 of the names of the images under one protocol, those without ground truth included.
 
-        It is that of the data module's split, which ``run.json`` holds for trainings.
+        It is the hash of the data module's split, which a training's ``run.json`` records.
         """
         rows: tuple[ImageRow | ViewRow, ...] = (*self.rows, *self.views)
         return fingerprint({row.name for row in rows if row.protocol == protocol})
 
     def summaries(self) -> tuple[Summary, ...]:
-        """Return one summary for each protocol and predictor that has rows, in the order they were asked for."""
+        """Return one summary for each protocol and predictor with rows, in the requested order."""
         found = []
         for rules, predictor in itertools.product(self.protocols, self.predictors):
             rows = self.select(predictor, rules.name)
@@ -136,9 +136,9 @@ class EvaluationResult:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One sentence for each predictor whose depth and motion explain the neighbors no better than doing nothing."""
+        """One sentence for each predictor whose depth and motion explain the neighbors no better than no warping."""
         tracked = self.settings.get("motion") == "tracked"
-        young = "" if tracked else ", or only the motion is not learned yet: motion=tracked tells"
+        young = "" if tracked else ", or only the motion is not learned yet: check with motion=tracked"
         return tuple(
             f"'{view.predictor}' under {view.protocol}: warped ({view.warped:.4f}) is not below unwarped "
             f"({view.unwarped:.4f}), so nothing was learned{young}"
@@ -147,7 +147,7 @@ class EvaluationResult:
         )
 
     def joined(self, other: EvaluationResult) -> EvaluationResult:
-        """Return both results as one: other protocols (another ground truth) or other predictors of the same images."""
+        """Join both results: other protocols (another ground truth) or other predictors on the same images."""
         mine, theirs = ({(row.predictor, row.protocol) for row in result.rows} for result in (self, other))
         if both := sorted(mine & theirs):
             raise ConfigError(
@@ -157,12 +157,14 @@ class EvaluationResult:
         rules = {protocol.name: protocol for protocol in self.protocols}
         for protocol in other.protocols:
             if rules.setdefault(protocol.name, protocol) != protocol:
-                raise ConfigError(f"the results mean different rules by protocol '{protocol.name}'; rename one of them")
+                raise ConfigError(
+                    f"the results have different rules for protocol '{protocol.name}'; rename one of them"
+                )
             names = [{row.name for row in result.rows if row.protocol == protocol.name} for result in (self, other)]
             if all(names) and names[0] != names[1]:
                 raise ConfigError(
-                    f"the results under '{protocol.name}' come from {len(names[0])} and {len(names[1])} images that "
-                    "are not the same; evaluate both on one split"
+                    f"the results under '{protocol.name}' come from different images ({len(names[0])} and "
+                    f"{len(names[1])}); evaluate both on the same split"
                 )
         return replace(
             self,
@@ -178,7 +180,7 @@ class EvaluationResult:
         )
 
     def tables(self, ranges: bool = False) -> list[Table]:
-        """Return one table per protocol, then where the errors of the first predictor are, then comparisons."""
+        """Return one table per protocol, then the first predictor's errors by place, then comparisons."""
         found = []
         summaries, views = self.summaries(), self.view_summaries()
         for protocol in self.protocols:
@@ -186,7 +188,7 @@ class EvaluationResult:
                 found.append(self._means(protocol, mine, ranges))
             if seen := [view for view in views if view.protocol == protocol.name]:
                 found.append(_view_table(protocol, seen))
-        for protocol in self.protocols:  # of the other predictors, the places of their errors are in the files
+        for protocol in self.protocols:  # the other predictors' errors by place are only in the files
             place = (protocol.name, self.predictors[0])
             if rows := [row for row in self.buckets if (row.protocol, row.predictor) == place]:
                 found.append(_bucket_table(rows))
@@ -202,15 +204,15 @@ class EvaluationResult:
         """Return the images with the largest errors under the first protocol, the worst first.
 
         Args:
-            count: How many.
-            error: By which, one of `saunet.metrics.functional.ERROR_NAMES`.
-            predictor: Whose errors; the first predictor's by default.
+            count: Number of images.
+            error: The error to sort by, one of `saunet.metrics.functional.ERROR_NAMES`.
+            predictor: The predictor; the first one by default.
 
         Returns:
             A table with a row per image.
 
         Raises:
-            ConfigError: for a word that is none of those, or if no protocol compares with ground truth.
+            ConfigError: for an unknown error or predictor, or if no protocol compares with ground truth.
         """
         column = ERROR_NAMES.index(one_of("error", error, ERROR_NAMES))
         protocol, who = self._compared(), predictor or self.predictors[0]
@@ -221,17 +223,16 @@ class EvaluationResult:
         return Table("worst", title, (*columns("image"), *ERROR_COLUMNS, *columns("pixels")), cells, bold_best=False)
 
     def plot(self, error: str = "abs_rel") -> Drawing:
-        """Draw the errors of all images from the smallest to the largest, a line per predictor.
+        """Draw the errors of all images from the smallest to the largest, one line per predictor.
 
         Args:
-            error: Which, one of `saunet.metrics.functional.ERROR_NAMES`.
+            error: The error, one of `saunet.metrics.functional.ERROR_NAMES`.
 
         Returns:
-            What a notebook shows and `Drawing.save` writes.
+            The drawing; a notebook shows it, and `Drawing.save` writes it.
 
         Raises:
-            ConfigError: for a word that is none of those, if matplotlib is missing, or if no protocol compares with
-                ground truth.
+            ConfigError: for an unknown error, if matplotlib is missing, or if no protocol compares with ground truth.
         """
         column = ERROR_NAMES.index(one_of("error", error, ERROR_NAMES))
         require_matplotlib("a plot needs", "nothing, and use .table")
@@ -248,7 +249,7 @@ class EvaluationResult:
     def _compared(self) -> Protocol:
         """Return the first protocol that compares with ground truth."""
         if not self.rows:
-            raise ConfigError("nothing was compared with ground truth, so no image has errors; see .table")
+            raise ConfigError("nothing was compared with ground truth, so there are no errors per image; see .table")
         return next(rules for rules in self.protocols if any(row.protocol == rules.name for row in self.rows))
 
     def _repr_html_(self) -> str:
@@ -270,7 +271,7 @@ class EvaluationResult:
         first = summaries[0]
         note = f"{first.images} image{'' if first.images == 1 else 's'}"
         if first.images_without_truth:
-            note += f"; {first.images_without_truth} more without a ground-truth pixel to compare, left out"
+            note += f"; {first.images_without_truth} more without ground-truth pixels, left out"
         rows, notes = [], [note]
         for summary in summaries:
             rows.append(Row((summary.predictor, *summary.errors, f"{summary.scale:.3g} ± {summary.scale_std:.2g}")))
@@ -288,7 +289,7 @@ def _view_table(protocol: Protocol, views: Sequence[ViewSummary]) -> Table:
         "predictor", "condition", "warped ↓|.4f", "unwarped|.4f", "explained ↑|.4f", "visible|.4f", "images"
     )
     rows = [Row((v.predictor, v.condition, v.warped, v.unwarped, v.explained, v.visible, v.images)) for v in views]
-    note = "photometric errors of neighbors, warped and as they are; fractions of pixels"
+    note = "photometric errors of neighbors, warped and unwarped; fractions of pixels"
     title = f"{protocol.name}: {protocol.summary}"
     return Table("views", title, headings, tuple(rows), (note,), bold_best=False)
 
@@ -301,7 +302,7 @@ def _bucket_table(rows: Sequence[BucketRow]) -> Table:
 
 
 def _shape_tables(protocols: Sequence[Protocol], shapes: Sequence[ShapeSummary], cloud: object) -> list[Table]:
-    """Return the scores of edges and of point clouds under each protocol, as far as they were measured."""
+    """Return the scores of edges and of point clouds under each protocol, as far as measured."""
     found = []
     for protocol in protocols:
         mine = [shape for shape in shapes if shape.protocol == protocol.name]

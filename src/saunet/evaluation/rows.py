@@ -1,4 +1,4 @@
-"""What an evaluation measures: rows for each image, predictor and protocol, their means, intervals and differences."""
+"""Measurements of an evaluation: rows for each image, predictor and protocol, with means, intervals, differences."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ERROR_COLUMNS = columns(*(f"{heading}|.3f" for heading in ERROR_HEADINGS))
 COMPARED = dict(
     zip((*ERROR_NAMES, "warped", "explained"), (*ERROR_COLUMNS, *columns("warped ↓", "explained ↑")), strict=True)
 )
-"""What of an image is compared between two predictors, by name."""
+"""Values of an image that are compared between two predictors, by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,35 +22,35 @@ class ImageRow:
     protocol: str
     name: str
     pixels: int
-    """Pixels compared; 0 where the image has no ground truth, and then the numbers are NaN."""
+    """Number of pixels compared; 0 if the image has no ground truth, and the values are then NaN."""
     scale: float
-    """Factor on the depth: that of the alignment, or under none median(truth)/median(prediction)."""
+    """Factor on the depth: from the alignment, or without one median(truth)/median(prediction)."""
     errors: tuple[float, ...]
     """In the order of `saunet.metrics.functional.ERROR_NAMES`, as everywhere below."""
 
     @property
     def compared(self) -> dict[str, float]:
-        """What two predictors are compared by, one of `COMPARED` each; empty where nothing was measured."""
+        """Values that two predictors are compared by, from `COMPARED`; empty if nothing was measured."""
         return dict(zip(ERROR_NAMES, self.errors, strict=True)) if self.pixels else {}
 
 
 @dataclass(frozen=True, slots=True)
 class BucketRow:
-    """Errors over all pixels of all images that fall into one bucket (not a mean over images: some have few there)."""
+    """Errors over all pixels of all images in one bucket (not a mean over images: some have few pixels there)."""
 
     predictor: str
     protocol: str
     group: str
-    """What the buckets of one group divide, such as ``distance``."""
+    """The quantity that the buckets of a group divide, such as ``distance``."""
     bucket: str
-    """Such as ``10-20 m``, ``bottom third`` or ``near an edge``."""
+    """The bucket, such as ``10-20 m``, ``bottom third`` or ``near an edge``."""
     pixels: int
     errors: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class ShapeRow:
-    """How well one predictor keeps the shapes of one image under one protocol; NaN for what was not measured."""
+    """How well one predictor preserves shapes in one image under one protocol; NaN if not measured."""
 
     predictor: str
     protocol: str
@@ -68,9 +68,9 @@ class ShapeRow:
 
 @dataclass(frozen=True, slots=True)
 class ViewRow:
-    """How well a prediction explains the neighboring frames of one image, where no depth is known.
+    """How well a prediction explains the neighboring frames of one image, for data without depth.
 
-    NaN, and visible nowhere, where the motion of the camera is unknown.
+    NaN, and visible nowhere, if the motion of the camera is unknown.
     """
 
     predictor: str
@@ -81,15 +81,15 @@ class ViewRow:
     warped: float
     """Photometric error after warping the neighbors by depth and motion, SAU-Net eqs. (8) to (10)."""
     unwarped: float
-    """The same without warping: what a network that has learned nothing reaches."""
+    """The same without warping: the error of a network that has learned nothing."""
     explained: float
     """Fraction of pixels that warping brings closer, SAU-Net eq. (11)."""
     visible: float
-    """Fraction of pixels that any neighbor sees."""
+    """Fraction of pixels visible in any neighbor."""
 
     @property
     def compared(self) -> dict[str, float]:
-        """As in `ImageRow`."""
+        """See `ImageRow`."""
         return {"warped": self.warped, "explained": self.explained} if self.visible else {}
 
 
@@ -132,20 +132,20 @@ class ShapeSummary:
     recall: float
     f_score: float
     edge_images: int
-    """Images whose ground truth is dense and has edges."""
+    """Number of images whose ground truth is dense and has edges."""
     cloud_images: int
-    """Images whose point clouds were compared."""
+    """Number of images whose point clouds were compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """How sure the means of one predictor under one protocol are: bootstrap intervals."""
+    """Bootstrap intervals of the means of one predictor under one protocol."""
 
     predictor: str
     protocol: str
     level: float
     by: str
-    """What was resampled: whole ``drive``s, or single ``image``s where there are too few drives."""
+    """What was resampled: whole ``drive``s, or single ``image``s if there are too few drives."""
     groups: int
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -165,9 +165,9 @@ class Difference:
     high: float
     """Bootstrap interval of the difference; with zero outside it, the predictors differ."""
     better: float
-    """Fraction of images on which the second is better, ties counted half."""
+    """Fraction of images on which the second is better; ties count half."""
     p_value: float | None
-    """Chance of a difference at least this large if the labels were exchanged at random drive by drive (two-sided);
+    """Probability of a difference at least this large if the labels were swapped at random drive by drive (two-sided);
     None with too few drives."""
 
 
@@ -185,7 +185,7 @@ class Comparison:
     differences: tuple[Difference, ...]
 
     def table(self, *notes: str) -> Table:
-        """Return the differences as a table; bold where the interval leaves out zero."""
+        """Return the differences as a table; bold if the interval excludes zero."""
         level = f"{self.level:.0%}".replace("%", " %")
         headings = (
             *columns("error"),
@@ -207,6 +207,6 @@ class Comparison:
 
 
 def interval(of: Spread | Comparison) -> str:
-    """Return what intervals mean, such as ``95 % bootstrap over 28 drives``."""
+    """Return how intervals were computed, such as ``95 % bootstrap over 28 drives``."""
     note = f"{of.level:.0%} bootstrap over {of.groups} {of.by}s".replace("%", " %")
-    return note if of.by == "drive" else f"{note}; neighboring frames are alike, so this is too narrow"
+    return note if of.by == "drive" else f"{note}; neighboring frames are similar, so this is too narrow"

@@ -1,4 +1,4 @@
-"""Scoring predictors on batches: against ground truth, also by bucket, or by how they explain neighboring frames."""
+"""Scoring predictors on batches: against ground truth, optionally by bucket, or by explaining neighboring frames."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ from saunet.types import EvalBatch
 R = TypeVar("R", ImageRow, ShapeRow, ViewRow)
 _NO_IMAGE = "there is no image to evaluate; check the split and the data root"
 EDGE_RATIO = 1.25
-"""Depths that differ by more than this factor make an edge, the strictest threshold of Bochkovskii et al., Depth Pro,
-2024, who compare neighboring pixels by this ratio too."""
+"""Depths that differ by more than this factor make an edge: the strictest threshold of Bochkovskii et al., Depth Pro,
+2024, who also compare neighboring pixels by this ratio."""
 
 
 @dataclass(frozen=True)
 class Buckets:
-    """How pixels are sorted."""
+    """Settings for sorting pixels into buckets."""
 
     distances: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0, 50.0, 80.0)
     """Limits of the distance ranges in meters, ascending."""
     edge_radius: int = 4
-    """Pixels of the ground truth to the left and right that are looked at for a depth edge."""
+    """Distance in ground-truth pixels, to the left and right, to look for a depth edge."""
     edge_ratio: float = EDGE_RATIO
     """Depths that differ by more than this factor make an edge."""
 
@@ -64,7 +64,7 @@ class Buckets:
 
     @property
     def names(self) -> tuple[tuple[str, str], ...]:
-        """(group, bucket) of each map that `maps` returns."""
+        """(group, bucket) of each map from `maps`."""
         return (
             *(("distance", f"{low:g}-{high:g} m") for low, high in pairwise(self.distances)),
             *(("row", f"{name} third") for name in ("top", "middle", "bottom")),
@@ -88,13 +88,14 @@ class Buckets:
 def near_edge(truth: Float[Tensor, "h w"], radius: int, ratio: float) -> Bool[Tensor, "h w"]:
     """Find pixels whose measured neighbors in the same row differ in depth by more than a factor.
 
-    Only pixels of the same row are compared: along it a flat road keeps its depth, while upwards it recedes without any
-    edge. Works for dense depth and for scan lines, but takes in walls that recede fast; `depth_edges` is sharper.
+    Only pixels of the same row are compared: along a row a flat road keeps its depth, while upwards it recedes without
+    any edge. This works for dense depth and for scan lines, but includes walls that recede fast; `depth_edges` is more
+    precise.
     """
     if truth.numel() == 0:
         return truth > 0
     closeness = torch.where(truth > 0, 1 / truth.clamp(min=1e-6), 0.0)
-    near = _row_maximum(closeness, radius)  # inverse of the nearest depth; 0 where none is known
+    near = _row_maximum(closeness, radius)  # inverse of the nearest depth; 0 if none is known
     return _row_maximum(truth, radius) * near > ratio
 
 
@@ -102,9 +103,9 @@ def depth_edges(truth: Float[Tensor, "h w"], radius: int = 2) -> Bool[Tensor, "h
     """Find pixels at depth edges of a dense ground truth and on thin things, which lie between two edges.
 
     Two neighbors in a row or column make an edge if their depths differ by more than `EDGE_RATIO` and neither surface
-    continues to the other. A plane's inverse depth is linear in the image, so the change from each pixel to the one
-    beyond it predicts the step between the two, and roads and walls that recede fast are no edges. Both pixels and all
-    within ``radius`` of either are returned. Unknown pixels make no edges.
+    continues to the other. A plane's inverse depth is linear in the image, so the change beyond each pixel predicts the
+    step between the two, and roads and walls that recede fast are not edges. Both pixels and all within ``radius`` of
+    either are returned. Unknown pixels make no edges.
     """
     if truth.numel() == 0:
         return truth > 0
@@ -114,7 +115,7 @@ def depth_edges(truth: Float[Tensor, "h w"], radius: int = 2) -> Bool[Tensor, "h
 
 
 def _row_edges(truth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Mark both pixels of each pair of neighbors in a row between which there is an edge."""
+    """Mark both pixels of each pair of neighbors in a row with an edge between them."""
     inverse = torch.where(truth > 0, 1 / truth.clamp(min=1e-6), torch.nan)
     step = inverse.diff(dim=1)  # NaN beside an unknown pixel compares as False
     first, second = inverse[:, :-1], inverse[:, 1:]
@@ -127,7 +128,7 @@ def _row_edges(truth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
 
 
 def _row_maximum(values: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
-    """Largest of the non-negative values within ``radius`` columns, by windows that double: faster than pooling."""
+    """Largest of the non-negative values within ``radius`` columns, by doubling windows: faster than pooling."""
     found, window, wanted = pad(values, (radius, radius)), 1, 2 * radius + 1
     while window < wanted:
         step = min(window, wanted - window)
@@ -145,18 +146,18 @@ class BucketSums:
         self._counts = torch.zeros(len(buckets.names), dtype=torch.float64)
 
     def add(self, sample: Sample, maps: Bool[Tensor, "k h w"]) -> None:
-        """Add an image; ``maps`` are those of its ground truth."""
+        """Add an image; ``maps`` come from its ground truth."""
         inside = maps[:, sample.mask].double()
         self._sums += (inside @ error_terms(sample.prediction, sample.target).T).cpu()
         self._counts += inside.sum(1).cpu()
 
     def total(self, team: Team) -> None:
-        """Add up the sums of all processes."""
+        """Sum over all processes."""
         sums, counts = zip(*team.everyones((self._sums, self._counts)), strict=True)
         self._sums, self._counts = torch.stack(sums).sum(0), torch.stack(counts).sum(0)
 
     def rows(self, predictor: str, protocol: str) -> tuple[BucketRow, ...]:
-        """Return the buckets that hold pixels."""
+        """Return the non-empty buckets."""
         errors = root_terms(self._sums / self._counts[:, None]).tolist()
         counted: list[int] = self._counts.long().tolist()
         return tuple(
@@ -168,12 +169,12 @@ class BucketSums:
 
 @dataclass(frozen=True)
 class Shapes:
-    """What to measure of shapes."""
+    """Which shape scores to measure."""
 
     boundaries: bool = False
-    """Accuracy and completeness of depth edges, where the ground truth is dense."""
+    """Accuracy and completeness of depth edges, if the ground truth is dense."""
     cloud: float | None = None
-    """Meters within which points agree, for precision, recall and F-score of point clouds; None for no such scores."""
+    """Meters within which points agree, for precision, recall and F-score of point clouds; None to skip these."""
 
     def __post_init__(self) -> None:
         if self.cloud is not None:
@@ -214,12 +215,12 @@ def score(
     progress: bool = True,
     team: Team = ALONE,
 ) -> EvaluationResult:
-    """Score predictors, by the name that tables show, on the same images under protocols for their ground truth.
+    """Score predictors, given by name, on the same images under protocols for their ground truth.
 
-    Only one batch is held at a time; one in which no image has depth may come without ``depth``. Batches and
-    predictions may lie on any device; numbers are computed where the ground truth lies. Each predictor, protocol and
-    image becomes a row, also an image without ground truth. With a ``team``, each process is given other batches, and
-    all return the result of all.
+    Only one batch is held at a time; a batch in which no image has depth may come without ``depth``. Batches and
+    predictions may be on any device; scores are computed on the device of the ground truth. Each predictor, protocol
+    and image becomes a row, including images without ground truth. With a ``team``, each process gets different
+    batches, and all return the complete result.
     """
     _check_request(predictors, protocols, ground_truth)
     rows: list[ImageRow] = []
@@ -252,13 +253,13 @@ def _check_request(predictors: Mapping[str, Predictor], protocols: Sequence[Prot
     one_of("ground_truth", ground_truth, GROUND_TRUTHS)
     names = [protocol.name for protocol in protocols]
     if not predictors or not names:
-        raise ConfigError(f"{len(predictors)} predictors under {len(names)} protocols; give at least one of each")
+        raise ConfigError(f"got {len(predictors)} predictors and {len(names)} protocols; give at least one of each")
     if len(set(names)) != len(names):
         raise ConfigError(f"protocols {', '.join(names)} share a name; give each its own")
     for protocol in protocols:
         if not protocol.accepts(ground_truth):
             raise ConfigError(
-                f"protocol '{protocol.name}' is defined on '{protocol.ground_truth}' ground truth and the data give "
+                f"protocol '{protocol.name}' is defined on '{protocol.ground_truth}' ground truth but the data give "
                 f"'{ground_truth}'; load that ground truth or choose another protocol"
             )
 
@@ -286,7 +287,7 @@ def _score_batch(
         finite = disparity.isfinite().flatten(1).all(1).tolist()
         for place, (name, image, truth, inside) in enumerate(zip(names, disparity[:, 0], truths, maps, strict=True)):
             if not finite[place]:
-                raise DataError(f"predictor '{predictor}' gives values that are not finite for image '{name}'")
+                raise DataError(f"predictor '{predictor}' returned non-finite values for image '{name}'")
             for protocol in protocols:
                 sample = sample_image(image, truth, protocol)
                 found = sample_errors(sample)
@@ -307,7 +308,7 @@ def _truth_intrinsics(batch: EvalBatch, place: int, truth: Float[Tensor, "h w"])
 
 
 def taken_in_turn(team: Team, rows: list[R]) -> list[R]:
-    """Return the rows of all processes, image by image as one process would: each has every so manieth image."""
+    """Return the rows of all processes in the order of a single one: the images were dealt out in turn."""
     if team.size == 1:
         return rows
     every = team.everyones(rows)
@@ -327,12 +328,11 @@ def score_views(
     progress: bool = True,
     team: Team = ALONE,
 ) -> EvaluationResult:
-    """Warp the neighbors of each image into it by predicted depth and motion, and compare.
+    """Warp the neighbors of each image into it with predicted depth and motion, and compare.
 
-    A small error does not prove good depth (a flat wall is explained by any), but a model that does not beat the
-    neighbors as they are has learned nothing, and conditions that are worse than others show. ``group_of`` gives the
-    condition or the recording of an image by its name. An image to no neighbor of which the motion is known gets
-    NaN.
+    A small error does not prove good depth (any depth explains a flat wall). But a model that does not beat unwarped
+    neighbors has learned nothing, and difficult conditions become visible. ``group_of`` returns the condition or the
+    recording of an image by its name. An image without a known motion to any neighbor gets NaN.
     """
     if protocol.ground_truth != "none":
         raise ConfigError(
@@ -359,7 +359,7 @@ def score_views(
         raise DataError(_NO_IMAGE)
     if all(math.isnan(row.warped) for row in rows):
         raise DataError(
-            f"the camera's motion is known for none of the {len(rows)} images: too few points can be followed (give "
+            f"the camera's motion is unknown for all {len(rows)} images: too few points can be tracked (give "
             "brighter or sharper frames, closer in time), or the pose network's weights are damaged"
         )
     return EvaluationResult((protocol,), tuple(predictors), (), views=tuple(rows))
@@ -368,11 +368,11 @@ def score_views(
 def _explain(
     depth: Float[Tensor, "b 1 h w"], T_src_tgt: Float[Tensor, "b s 4 4"], batch: EvalBatch
 ) -> list[list[float]]:
-    """Return what `ViewRow` holds of each image: warped, unwarped, explained, visible."""
+    """Return the values of `ViewRow` for each image: warped, unwarped, explained, visible."""
     view = synthesize(batch["sources"], depth, batch["K"], T_src_tgt)
     target = batch["target"][:, None]
     warped, seen = combine_sources(photometric_error(view.image, target), view.valid)
-    # Compared over the same pixels, or leaving out the hard ones would look like progress.
+    # Compare over the same pixels: leaving out hard ones must not look like progress.
     unwarped, _ = combine_sources(photometric_error(batch["sources"], target))
     explained = automask(warped, unwarped) & seen
     known = T_src_tgt.isfinite().flatten(2).all(2).any(1)

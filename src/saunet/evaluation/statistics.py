@@ -1,4 +1,4 @@
-"""How sure a mean over images is, and whether two predictors really differ on the same images."""
+"""The uncertainty of a mean over images, and whether two predictors really differ on the same images."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from saunet.evaluation.result import EvaluationResult
 from saunet.evaluation.rows import COMPARED, Comparison, Difference, ImageRow, Spread, ViewRow
 
 FEWEST_DRIVES = 5
-"""With fewer drives than this, resampling them says nothing: images are resampled, and the result says so."""
+"""With fewer drives than this, resampling them is meaningless: images are resampled, and the result says so."""
 RESAMPLES = 2000
 
 
 def groups_of(names: Sequence[str]) -> tuple[str, int, list[str]]:
-    """Choose what to resample: drives where there are `FEWEST_DRIVES`, else images."""
+    """Choose what to resample: drives if there are at least `FEWEST_DRIVES`, else images."""
     drives = [recording_of(name, with_side=False) for name in names]
     count = len(set(drives))
     return ("drive", count, drives) if count >= FEWEST_DRIVES else ("image", len(names), list(names))
 
 
 def spreads(result: EvaluationResult, level: float = 0.95) -> tuple[Spread, ...]:
-    """Compute intervals of all means of a result that rest on at least two images."""
+    """Compute intervals of all means of a result over at least two images."""
     found = []
     for protocol, predictor in itertools.product(result.protocols, result.predictors):
         values = result.errors(predictor, protocol.name)
@@ -52,11 +52,11 @@ def bootstrap_mean(
 ) -> tuple[Float64[ndarray, " k"], Float64[ndarray, " k"]]:
     """Compute the bounds of a bootstrap interval of the mean of each column; NaN for fewer than two groups of rows.
 
-    Whole groups are resampled: neighboring frames of a drive are alike, so resampling images makes intervals too
-    narrow. Percentiles of the resampled mean of few groups are too narrow as well: they see the spread over n, not over
-    n - 1 degrees of freedom, and the tails of a normal distribution, not of Student's t (Hesterberg, What Teachers
-    Should Know about the Bootstrap, The American Statistician 69, 2015). So both bounds are moved away from the mean by
-    sqrt(n / (n - 1)) * t / z. BCa intervals correct for neither.
+    Whole groups are resampled: neighboring frames of a drive are similar, so resampling images makes intervals too
+    narrow. With few groups, percentiles of the resampled mean are too narrow as well: they reflect the spread over n,
+    not over n - 1 degrees of freedom, and the tails of a normal distribution, not of Student's t (Hesterberg, What
+    Teachers Should Know about the Bootstrap, The American Statistician 69, 2015). So both bounds are moved away from
+    the mean by the factor sqrt(n / (n - 1)) * t / z. BCa intervals correct for neither.
     """
     sums, counts = _by_group(values, groups)
     number = len(sums)
@@ -90,10 +90,10 @@ def with_statistics(
     earlier: Sequence[ImageRow | ViewRow] | None = None,
     source: str | None = None,
 ) -> EvaluationResult:
-    """Add bootstrap intervals of the means, and what changed since another evaluation of the same images.
+    """Add bootstrap intervals of the means, and the changes since another evaluation of the same images.
 
-    The first predictors of both are compared, under each protocol that both have. Without a level there are no
-    intervals of the means, and comparisons use 0.95.
+    The first predictors of both are compared under each protocol that both have. If the level is None, the means have
+    no intervals, and comparisons use 0.95.
     """
     comparisons = []
     if earlier is not None:
@@ -124,8 +124,8 @@ def compare(
 ) -> Comparison:
     """Compare two predictors image by image, paired by name.
 
-    Whole drives are resampled and flipped, since frames of a drive are alike. With fewer than `FEWEST_DRIVES` drives,
-    images are resampled, intervals are too narrow, and there is no p value: frames that are alike would make chance
+    Whole drives are resampled and flipped, because frames of a drive are similar. With fewer than `FEWEST_DRIVES`
+    drives, images are resampled, intervals are too narrow, and there is no p value: similar frames would make chance
     look like proof.
     """
     one, other = ({row.name: row for row in rows} for rows in (first, second))
@@ -133,11 +133,13 @@ def compare(
         alone = sorted(one.keys() ^ other.keys())
         hint = f"'{alone[0]}' is only in one of them" if alone else "a name occurs twice"
         raise DataError(
-            f"{len(first)} and {len(second)} rows do not pair up: {hint}; compare results on the same images"
+            f"{len(first)} and {len(second)} rows cannot be paired: {hint}; compare results on the same images"
         )
     protocols = sorted({row.protocol for row in (*first, *second)})
     if len(protocols) != 1:
-        raise DataError(f"the rows come from protocols {', '.join(protocols) or 'without a row'}; compare under one")
+        raise DataError(
+            f"the rows come from protocols {', '.join(protocols) or 'without a row'}; compare under one protocol"
+        )
     pairs = {name: (row.compared, other[name].compared) for name, row in one.items()}
     pairs = {name: pair for name, pair in pairs.items() if all(pair)}
     if not pairs:
@@ -156,7 +158,7 @@ def compare(
 
 
 def _sign_flip(sums: Float64[ndarray, "g k"]) -> list[float]:
-    """Return two-sided p values of a permutation test that exchanges the predictors' labels within each group."""
+    """Return two-sided p values of a permutation test that swaps the predictors' labels within each group."""
     found = stats.permutation_test(
         (sums,),
         lambda x, axis: x.sum(axis),

@@ -1,4 +1,4 @@
-"""Several processes that share the images of one evaluation, as ``torchrun`` starts them."""
+"""Several processes, started by ``torchrun``, that share the images of one evaluation."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Team:
-    """The processes of an evaluation: this one's number and how many there are."""
+    """The processes of an evaluation: this one's number and their count."""
 
     rank: int = 0
     size: int = 1
 
     @property
     def place(self) -> tuple[int, int] | None:
-        """What `DepthDataModule.batches` takes; None for a process on its own."""
+        """The argument for `DepthDataModule.batches`; None for a single process."""
         return (self.rank, self.size) if self.size > 1 else None
 
     def everyones(self, mine: T) -> list[T]:
-        """Return what each process has, by its number; all must ask at the same time."""
+        """Return each process's value, by its number; all processes must call this together."""
         if self.size == 1:
             return [mine]
         found: list[T | None] = [None] * self.size
@@ -37,7 +37,7 @@ class Team:
         return found  # type: ignore[return-value]  # each was replaced
 
     def device(self, device: torch.device) -> torch.device:
-        """Return a GPU of this process's own."""
+        """Return this process's own GPU."""
         local = int(os.environ.get("LOCAL_RANK", self.rank))
         own = str(device) == "cuda" and self.size > 1  # "cuda:1" names one
         return torch.device("cuda", local % torch.cuda.device_count()) if own else device
@@ -48,7 +48,7 @@ ALONE = Team()
 
 @contextlib.contextmanager
 def joined() -> Iterator[Team]:
-    """Join the processes that ``torchrun`` started, if it did; all but the first are silent."""
+    """Join the processes started by ``torchrun``, if any; all but the first are silent."""
     size = int(os.environ.get("WORLD_SIZE", 1))
     if size == 1 or distributed.is_initialized():
         yield ALONE

@@ -1,4 +1,4 @@
-"""`evaluate`: score a checkpoint, or predictions made elsewhere, beside predictors that look at no image."""
+"""`evaluate`: score a checkpoint, or predictions made elsewhere, beside predictors that use no image."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ from saunet.weights.files import read_model
 from saunet.weights.locate import locate
 
 STAGES = {"test": "test", "val": "validate"}
-"""Splits that can be evaluated, and the stage that sets each up."""
+"""Splits that can be evaluated, with the stage that sets each up."""
 
 
 @runtime_checkable
 class EvaluationData(Protocol):
-    """What an evaluation needs of a data module."""
+    """The interface that an evaluation needs from a data module."""
 
     ground_truth: str
     neighbors: Sequence[str]
@@ -85,37 +85,36 @@ class EvaluationData(Protocol):
 @checked
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """What `evaluate` scores, on which images, and how.
+    """Options of `evaluate`: what to score, on which images, and how.
 
     Args:
-        data: The data module; the size of its images follows the checkpoint.
+        data: The data module; its image size follows the checkpoint.
         checkpoint: A trained model. Give either it or ``predictions``.
-        predictions: What another system predicted: a ``.npy`` array, or a folder of ``.npy`` or 16-bit ``.png`` files.
-        predicted: ``disparity`` or ``depth``: what ``predictions`` hold; by default disparity in an array and depth in
-            a folder.
-        match: How files of a folder find their images: by ``order`` or ``name``.
-        protocols: Names of protocols, side by side, each on the ground truth that it needs; the data set's own by
-            default.
+        predictions: Another system's predictions: a ``.npy`` array, or a folder of ``.npy`` or 16-bit ``.png`` files.
+        predicted: ``disparity`` or ``depth``, the content of ``predictions``; by default disparity for an array and
+            depth for a folder.
+        match: How files of a folder are assigned to images: by ``order`` or ``name``.
+        protocols: Names of protocols, each with the ground truth it needs; the data set's own by default.
         split: ``test`` or ``val``.
-        motion: Where the camera's motion comes from on data without ground truth: from points ``tracked`` between
-            frames, its length from the predicted depth; ``auto`` takes the pose network if the model has one.
+        motion: Source of the camera's motion on data without ground truth: points ``tracked`` between frames, with the
+            length from the predicted depth; ``auto`` uses the pose network if the model has one.
         flip: Blend with the prediction of the mirrored image (Monodepth's post-processing).
-        baselines: Also score predictors that look at no image.
+        baselines: Also score predictors that use no image.
         scale: How depth becomes meters.
-        foreign: What an ONNX or TorchScript model of another system takes and gives.
+        foreign: Input and output of another system's ONNX or TorchScript model.
         buckets: Also report errors by distance, image region and at depth edges.
         distances: Limits of the distance ranges in meters, ascending.
-        boundaries: Also measure how near depth edges are to true ones, in pixels, where ground truth is dense.
-        cloud: Also compare point clouds: how many points have one of the truth within this many meters, such as 0.1.
+        boundaries: Also measure the distance between depth edges and true ones, in pixels, if ground truth is dense.
+        cloud: Also compare point clouds: the fraction of points with a true point within this many meters, such as 0.1.
         intervals: Level of the bootstrap intervals of the means; None for none.
         compare: Folder of another evaluation of the same images, to compare with.
-        truth_cache: Folder that keeps projected LiDAR ground truth.
+        truth_cache: Folder for keeping projected LiDAR ground truth.
         export: Folder for the predictions as 16-bit PNG, meters x 256.
-        device: Where to predict; ``auto`` takes a GPU if there is one.
-        output_dir: Folder for the results; None, as in Python, writes none.
+        device: Where to predict; ``auto`` uses a GPU if there is one.
+        output_dir: Folder for the results; None, the default in Python, writes none.
 
     Raises:
-        ConfigError: if an option cannot work, or not beside another one.
+        ConfigError: if an option is invalid, or cannot be combined with another.
 
     Examples:
         >>> data = saunet.Spec.of("data", "synthetic_tiny")
@@ -149,8 +148,8 @@ class EvaluateOptions:
     def __post_init__(self) -> None:
         if (self.checkpoint is None) == (self.predictions is None):
             raise ConfigError(
-                "give checkpoint=FILE to score a model, or predictions=FILE_OR_FOLDER to score what another system "
-                f"predicted; {'neither is' if self.checkpoint is None else 'both are'} set"
+                "give checkpoint=FILE to score a model, or predictions=FILE_OR_FOLDER to score another system's "
+                f"predictions; {'neither is' if self.checkpoint is None else 'both are'} set"
             )
         if self.intervals and not 0 < self.intervals < 1:
             raise ConfigError(f"intervals is {self.intervals:g}; it must lie between 0 and 1, such as intervals=0.95")
@@ -164,19 +163,17 @@ class EvaluateOptions:
         Buckets(tuple(self.distances))
         Shapes(self.boundaries, self.cloud)
         if self.predictions is not None and self.flip:
-            raise ConfigError("flip=true blends two predictions of a model; leave it out with predictions=...")
+            raise ConfigError("flip=true blends two predictions of a model, so leave it out with predictions=...")
         if self.predictions is not None and self.scale.method != "auto":
-            raise ConfigError("scale.method measures the scale of a model; leave it out with predictions=...")
+            raise ConfigError("scale.method measures the scale of a model, so leave it out with predictions=...")
 
 
 def evaluate(options: EvaluateOptions) -> EvaluationResult:
     """Score a model or the predictions of another system, and write the results.
 
     Args:
-        options: What and how.
-
-    Returns:
-        The errors of each image with their means and tables; `EvaluationResult.show` prints them.
+        options: What to score, and how. Returns: The errors of each image with their means and tables;
+            `EvaluationResult.show` prints them.
 
     Raises:
         ConfigError: if a protocol does not fit the data, or needs motion and there is none.
@@ -192,7 +189,7 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
 
 
 def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
-    """Evaluate with the processes of a team; each returns the result of all."""
+    """Evaluate with the processes of a team; each returns the complete result."""
     store_in = options.scale.storable(str(options.checkpoint))
     earlier = read_rows(Path(options.compare)) if options.compare else None
     device = team.device(usable_device(options.device))
@@ -211,7 +208,7 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         checkpoint = read_model(options.checkpoint)
         networks, found = checkpoint.networks(), checkpoint.record.intrinsics
         passes = _passes(options, _resized(options.data, checkpoint.record), motion=True)
-        _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth is of the same images
+        _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth has the same images
         if store_in is not None:
             _check_one_camera(passes[0][0], options.split)
         about_scale = {"first": team.rank == 0, "store_in": store_in}
@@ -228,7 +225,7 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
     result = replace(result, settings={**settings, **result.settings}, sources=sources, folder=folder, notes=exported)
     first = team.rank == 0
     if folder is not None and earlier is not None and first:
-        write_results(result, folder)  # an evaluation that does not compare is not lost
+        write_results(result, folder)  # so that an evaluation that cannot be compared is not lost
     result = with_statistics(result, options.intervals, earlier, options.compare)
     if folder is not None and first:
         write_results(result, folder)
@@ -236,13 +233,13 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
 
 
 def runs_alone(options: EvaluateOptions) -> bool:
-    """Return whether the checkpoint is a file that is run as it is: ONNX, or TorchScript of another system."""
+    """Return whether the checkpoint is a file to run directly: ONNX, or TorchScript of another system."""
     path = locate(str(options.checkpoint))
     alone = options.foreign.given or path.suffix.lower() == ".onnx" or is_foreign(path)
     if alone and options.scale.method not in ("auto", "none"):
         raise ConfigError(
-            f"scale.method={options.scale.method} measures with a saunet checkpoint, and '{options.checkpoint}' is "
-            "not one; leave it out"
+            f"scale.method={options.scale.method} needs a saunet checkpoint, but '{options.checkpoint}' is not one; "
+            "leave it out"
         )
     return alone
 
@@ -253,7 +250,7 @@ def evaluate_network(
     others: Mapping[str, Predictor] = MappingProxyType({}),
     shapes: Shapes | None = None,
 ) -> EvaluationResult:
-    """Score a depth network, on its device, beside others and the trivial predictors on test images of its size."""
+    """Score a depth network, on its device, beside other and trivial predictors on test images of its size."""
     _set_up(data, "test")
     predictors: dict[str, Predictor] = {"model": NetworkPredictor(network), **others, **trivial(data)}
     batches = data.batches("test", next(network.parameters()).device)
@@ -263,7 +260,7 @@ def evaluate_network(
 
 
 def _resized(data: Spec, record: ModelRecord) -> Spec:
-    """Return the data at the size of a model, with the neighbors that its pose network looks at, and its camera."""
+    """Return the data at the size of a model, with the neighbors that its pose network uses, and its camera."""
     wanted: dict[str, object] = {"height": record.height, "width": record.width}
     if record.pose:
         wanted["offsets"] = list(record.offsets)
@@ -278,14 +275,14 @@ def _set_up(data: EvaluationData, split: str) -> None:
 
 
 def _fitting(data: EvaluationData, motion: bool) -> list[str]:
-    """Return the data set's own protocols, of which those that need motion are left out where there is none."""
+    """Return the data set's own protocols, without those that need motion if there is none."""
     return [name for name in data.protocols if motion or protocol(name).ground_truth != "none"] or list(data.protocols)
 
 
 def _passes(
     options: EvaluateOptions, spec: Spec, motion: bool, shifted: bool = False
 ) -> list[tuple[EvaluationData, list[Rules]]]:
-    """Return the data modules to go through, not set up, one for each ground truth, with the protocols for each."""
+    """Return the data modules to evaluate, not set up, one per ground truth, with the protocols for each."""
     spare: list[EvaluationData] = [spec.build()]
     own, choice = spare[0].ground_truth, spec.parameters.get("depth")
     kinds = tuple(dict.fromkeys([own, *get_args(choice.annotation if choice else None)]))
@@ -294,20 +291,20 @@ def _passes(
     for rule in rules if shifted else ():
         if rule.alignment != "least_squares_disparity":
             raise ConfigError(
-                f"protocol '{rule.name}' aligns by a factor at most, and the model's disparity has an unknown shift "
-                f"too; ask for {rule.name.partition('/')[0]}/least_squares_disparity, or set foreign.factor and "
+                f"protocol '{rule.name}' aligns at most by a factor, but the model's disparity also has an unknown "
+                f"shift; use {rule.name.partition('/')[0]}/least_squares_disparity, or set foreign.factor and "
                 "foreign.shift"
             )
     found = []
     for kind, each in passes(rules, own).items():
         if kind not in ("none", *kinds):
             raise ConfigError(
-                f"protocols names '{each[0].name}', which is defined on '{kind}' ground truth, and "
-                f"these data give {' or '.join(kinds)}; choose other protocols or data"
+                f"protocols names '{each[0].name}', which is defined on '{kind}' ground truth, but these data give "
+                f"{' or '.join(kinds)}; choose other protocols or data"
             )
         if kind == "none" and not motion:
             raise ConfigError(
-                f"protocol '{each[0].name}' needs the motion of the camera, whose length comes from a model's depth "
+                f"protocol '{each[0].name}' needs the motion of the camera, with its length from a model's depth "
                 "(without an unknown shift); evaluate such a model, or choose a protocol with ground truth"
             )
         truth = {} if kind in (own, "none") else {"depth": kind}
@@ -319,7 +316,7 @@ def _passes(
 
 
 def passes(protocols: Sequence[Rules], own: str) -> dict[str, list[Rules]]:
-    """Sort protocols by the ground truth to load for them: the data set's own wherever it serves."""
+    """Group protocols by the ground truth to load for them: the data set's own if possible."""
     found: dict[str, list[Rules]] = {}
     for rules in protocols:
         found.setdefault(own if rules.accepts(own) else rules.ground_truth, []).append(rules)
@@ -335,7 +332,7 @@ def _score_passes(
     team: Team,
     found: Intrinsics | None,
 ) -> tuple[EvaluationResult, tuple[str, ...]]:
-    """Go through the images once for each ground truth; return the result, and what was exported."""
+    """Go through the images once for each ground truth; return the result and the export."""
     split, name, exporter = options.split, "model" if model else "predictions", None
     motion = _tracked if pose is None or options.motion == "tracked" else _predicted_by(pose)
     buckets = Buckets(tuple(options.distances)) if options.buckets else None
@@ -348,7 +345,7 @@ def _score_passes(
         predictor: Predictor = model or FilePredictor(
             Path(str(options.predictions)), data.listed(split), options.predicted, options.match
         )
-        if options.export and exporter is None:  # in the first pass, which is of the first protocol's truth
+        if options.export and exporter is None:  # in the first pass, with the first protocol's truth
             predictor = exporter = ExportingPredictor(predictor, Path(options.export), rules[0])
         share = {} if team.place is None else {"place": team.place}
         batches, total = data.batches(split, device, **share), len(data.datasets[split])
@@ -385,11 +382,11 @@ def _predicted_by(pose: nn.Module) -> Motion:
 
 
 def _told(result: EvaluationResult, asked_for: bool) -> str:
-    """Say where the motion came from, and how many images have none."""
+    """Describe the source of the motion, and how many images have none."""
     unknown = sum(math.isnan(row.warped) for row in result.views)
-    rest = f"; left out: {unknown} of {len(result.views)} images, too few points to follow" if unknown else ""
-    why = "asked for with motion=tracked" if asked_for else "the model has no pose network"
-    return f"motion: from tracked points ({why}), with the length that the predicted depth gives it{rest}"
+    rest = f"; left out: {unknown} of {len(result.views)} images with too few points to track" if unknown else ""
+    why = "requested by motion=tracked" if asked_for else "the model has no pose network"
+    return f"motion: from tracked points ({why}), with its length from the predicted depth{rest}"
 
 
 def _conditions(data: EvaluationData, split: str) -> Callable[[str], str]:
@@ -402,7 +399,7 @@ def _conditions(data: EvaluationData, split: str) -> Callable[[str], str]:
 
 
 def trivial(data: EvaluationData, truth_cache: str | None = None) -> dict[str, Predictor]:
-    """Return constant depth and, where the training split has depth, its mean map; say so where it has none."""
+    """Return constant depth and, if the training split has depth, its mean map; report if it has none."""
     found: dict[str, Predictor] = {"constant depth": NetworkPredictor(ConstantDepth())}
     mean = MeanDepthMap()
     try:
@@ -428,7 +425,7 @@ def _scaled(
     first: bool,
     store_in: Path | None = None,
 ) -> tuple[nn.Module, nn.Module | None, dict[str, object]]:
-    """Return depth and pose network on the device, in meters if the options ask for it, and what to report of that."""
+    """Return depth and pose network on the device, in meters if requested, and what to report about that."""
     depth, pose = networks[0].to(device).eval(), None if networks[1] is None else networks[1].to(device).eval()
     method, scale, report = options.scale.method, record.scale, dict[str, object]()
     if options.scale.measures:
@@ -480,7 +477,7 @@ def _refined(batches: Iterable[EvalBatch], found: Intrinsics | None) -> Iterator
 
 
 def _odometer(options: EvaluateOptions, data: EvaluationData) -> Callable[[Drive, int, int], float]:
-    """Return the odometer of the recordings, or of a table of speeds, which counts frames as they were recorded."""
+    """Return the odometer of the recordings, or of a table of speeds, which uses recorded frame numbers."""
     if options.scale.align:
         raise ConfigError(
             "scale.align=true is for saunet predict; for clips with a speeds.csv, set data.align_speeds=true"
