@@ -59,7 +59,7 @@ def test_accuracy_of_a_changed_model_may_be_given(tool: Tool, tmp_path: Path, mo
 
 @pytest.mark.parametrize("change", ["model/encoder=resnet18", "model.min_depth=0.5", "model=mono_r18"])
 def test_named_models_are_not_changed(tool: Tool, change: str) -> None:
-    tool("benchmark", "models=[sau_net_nano]", change, *QUICK).says(f"'{change}' would change nothing")
+    tool("benchmark", "models=[sau_net_nano]", change, *QUICK).says(f"'{change}' would have no effect")
 
 
 @pytest.mark.parametrize("threads", [-1, 0])

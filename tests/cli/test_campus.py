@@ -114,10 +114,10 @@ def test_the_doctor_ends_with_an_error_where_training_would(tool: Tool, tmp_path
     outcome = tool("doctor", *arguments, "data.val_share=0.3")
     assert outcome.code == 0, outcome.out
     assert "note: training and validation share 'a.avi'" in outcome.out
-    left_out = re.search(r"names (\d+) frames? to leave out \(judged: all\)", outcome.out)
+    left_out = re.search(r"lists (\d+) frames? to leave out \(checked: all\)", outcome.out)
     assert left_out
     assert ("train with data.manifest=doctor/manifest.json" in outcome.out) == (left_out[1] != "0")
-    assert "(judged: 5 of 14; frames=0 judges all)" in tool("doctor", *arguments, "data.val_share=0.3", "frames=5").out
+    assert "(checked: 5 of 14; frames=0 checks all)" in tool("doctor", *arguments, "data.val_share=0.3", "frames=5").out
     tool("doctor", *arguments, "splits=[tset]").says("splits is 'tset'; did you mean 'test'?")
 
 

@@ -213,7 +213,7 @@ def test_what_is_wrong_is_said(tmp_path):
         packed(tmp_path / "none").setup("fit")
     source = clips(tmp_path)
     pack(source, tmp_path / "packed", shard_mb=1)
-    with pytest.raises(DataError, match="packed data already"):
+    with pytest.raises(DataError, match="already has packed data"):
         pack(source, tmp_path / "packed", shard_mb=1)
     with pytest.raises(DataError, match="not empty"):
         pack(source, tmp_path / "clips", shard_mb=1)

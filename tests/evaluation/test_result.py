@@ -73,7 +73,7 @@ def test_joined_refuses_what_does_not_belong_together():
     )
     with pytest.raises(ConfigError, match="different rules for protocol 'eigen_camera_z'"):
         result().joined(changed)
-    with pytest.raises(ConfigError, match="different images \(4 and 3\)"):
+    with pytest.raises(ConfigError, match=r"different images \(4 and 3\)"):
         result().joined(result(predictors=("other",), blank=False))
 
 

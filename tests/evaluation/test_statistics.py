@@ -146,7 +146,7 @@ def test_pairs_by_name_in_any_order_and_skips_images_without_truth():
 
 def test_what_cannot_be_compared():
     base = np.ones((5, 7))
-    with pytest.raises(DataError, match="5 and 4 rows do not pair up: 'drive4 0004 l' is only in one"):
+    with pytest.raises(DataError, match="5 and 4 rows cannot be paired: 'drive4 0004 l' is only in one"):
         compare(rows(base), rows(base[:4]))
     with pytest.raises(DataError, match="a name occurs twice"):
         compare(rows(base) * 2, rows(base))

@@ -101,7 +101,7 @@ def test_sizes_are_checked_before_anything_is_measured() -> None:
         ({"modes": ["complied"]}, "did you mean 'compiled'"),
         ({"devices": ["tpu9"]}, "device 'tpu9' cannot be used here"),
         ({"batch_sizes": [0]}, "batch_sizes is 0"),
-        ({"batch_sizes": []}, "batch_sizes is empty, so nothing would be measured; give some, such as 1"),
+        ({"batch_sizes": []}, "batch_sizes is empty, so nothing would be measured; give at least one, such as 1"),
         ({"sizes": []}, "sizes is empty, .* such as 192x640"),
         ({"modes": ()}, "modes is empty"),
         ({"runs": 0}, "runs is 0"),

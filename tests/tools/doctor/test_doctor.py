@@ -88,7 +88,7 @@ def test_bad_frames_are_found_and_left_out(tmp_path):
     assert "0000000012.png is empty" in text
     assert "mixes frame sizes" in text
     assert "1 frames are almost black" in text
-    assert "are the same picture as their neighbor" in text
+    assert "are identical to their neighbor" in text
     assert findings[0].level == "error"
     manifest = manifest_of(found, findings, tmp_path / "m.json")
     write_manifest(tmp_path / "m.json", manifest)
@@ -105,14 +105,14 @@ def test_bad_frames_are_found_and_left_out(tmp_path):
 @pytest.mark.parametrize("hole", ["zeros", "cut"])
 def test_a_picture_with_a_hole_and_a_whole_end_is_noticed(tmp_path, capfd, hole):
     folder = make_clip(tmp_path / "r", "a", frames(10, 1), suffix=".jpg")
-    assert "damaged inside" not in look(campus(tmp_path / "r"))[2]
+    assert "partly damaged" not in look(campus(tmp_path / "r"))[2]
     file = folder / "frame_4.jpg"
     data = bytearray(file.read_bytes())
     middle = len(data) * 2 // 3
     data[middle : middle + 200] = bytes(200) if hole == "zeros" else b""
     file.write_bytes(data)
     found, _, text = look(campus(tmp_path / "r"))
-    assert "warning: 1 frames are damaged inside, such as 4 of" in text
+    assert "warning: 1 frames are partly damaged, such as 4 of" in text
     assert "Corrupt JPEG data" in text
     assert [frame.index for frame in found.frames if frame.damage] == [4]
     os.write(2, b"as before\n")
@@ -194,10 +194,10 @@ def test_a_bonnet_is_seen(tmp_path):
     bonnet = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (50, 320, 3), dtype=np.uint8), (0, 0), 2)
     make_clip(tmp_path / "r", "a", [np.concatenate([picture[:150], bonnet]) for picture in frames(16, 6)])
     text = look(campus(tmp_path / "r"))[2]
-    assert "of the picture do not move: the car's bonnet" in text
+    assert "of the picture does not move: the car's hood" in text
     share = float(re.search(r"data.crop=\[0,([\d.]+),0,0\]", text)[1])
     assert 0.15 < share < 0.29
-    assert "do not move" not in look(campus(tmp_path / "r", crop=[0.0, 0.27, 0.0, 0.0]))[2]
+    assert "does not move" not in look(campus(tmp_path / "r", crop=[0.0, 0.27, 0.0, 0.0]))[2]
 
 
 @pytest.mark.parametrize(("step", "words"), [(1, "too little to tell depths apart"), (0, "nothing moves")])
@@ -227,7 +227,7 @@ def test_a_part_of_a_split_is_told_from_gaps(tmp_path):
     )}  # fmt: skip
     assert found.windows["train"] == sum(0 < frame.number < 89 for frame in listed["train"]) > 0
     assert not listed["val"]
-    assert re.search(r"warning: \d+ of \d+ recordings of the train split are not there, with \d{5} of its \d{5} ", text)
+    assert re.search(r"warning: \d+ of \d+ recordings of the train split are missing, with \d{5} of its \d{5} ", text)
     assert "consecutive" not in text
     assert re.search(r"error: the val split cannot be used: none of the \d+ drives of the val split is below", text)
     assert "the train split cannot be used" not in text
@@ -251,7 +251,7 @@ def test_a_video_that_cannot_be_decoded_to_its_end_is_a_finding(tmp_path):
         lost = reader.declared - sum(1 for _ in reader)
     assert lost > 5
     text = look(campus(tmp_path / "r"))[2]
-    assert f"warning: {lost} frames that videos claim to hold cannot be decoded and are left out" in text
+    assert f"warning: {lost} frames that videos claim to have cannot be decoded and are left out" in text
 
 
 def test_the_manifest_says_how_much_was_judged_and_what_only_tests_read(tmp_path):
@@ -301,7 +301,7 @@ def test_different_recordings_of_one_name_are_kept_apart(tmp_path):
     found, findings, text = look(_TwoFolders(height=32, width=48, batch_size=2, workers=0), splits=["train", "val"])
     assert {frame.drive for frame in found.frames} == {"clip", "clip (val)"}
     assert len(found.frames) == found.known == 12
-    assert "error: 'clip' is the name of different recordings" in text
+    assert "error: 'clip' names different recordings" in text
     assert not manifest_of(found, findings, tmp_path / "m.json").leave_out
 
 

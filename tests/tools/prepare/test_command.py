@@ -38,13 +38,13 @@ def command(monkeypatch, tmp_path, capsys):
 def test_each_job_runs_and_leaves_only_its_results(command, tree, tmp_path):
     where = (f"root={tree}", "cameras=[left]")
     code, out, err = command("densify", *where, "workers=0", "folder=maps")
-    assert (code, out.strip()) == (0, "10 frames made, 0 were there, 0 have no scan, 0 skipped"), err
+    assert (code, out.strip()) == (0, "10 frames made, 0 existed already, 0 have no scan, 0 skipped"), err
     code, out, err = command("cache", *where, "folder=cache", "height=10", "width=30", "workers=0", "format=webp")
     assert code == 0, err
-    assert out.startswith("10 copies made (0 in place of damaged or outdated ones), 0 verified")
+    assert out.startswith("10 copies made (0 to replace damaged or outdated ones), 0 verified")
     teacher = f"input=maps/{name(1)}/depth_linear/l"
     code, out, err = command("teacher", *where, "drives=[0001_sync]", teacher, "folder=maps")
-    assert (code, out.strip()) == (0, "6 frames made, 0 were there, 0 skipped"), err
+    assert (code, out.strip()) == (0, "6 frames made, 0 existed already, 0 skipped"), err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cache", "maps", "raw"]
 
 
@@ -57,7 +57,7 @@ def test_each_job_runs_and_leaves_only_its_results(command, tree, tmp_path):
         (["cache", "data=synthetic", "folder=c"], "SyntheticDataModule reads no copies made by saunet prepare; use"),
         (["densify", "root=raw", "kinds=liner"], "kinds is 'liner'; did you mean 'linear'?"),
         (["densify", "root=raw", "executor=dask"], "executor=dask and scheduler="),
-        (["cache", "root=raw", "folder=c", "scheduler=tcp://10.0.0.1:8786"], "go together"),
+        (["cache", "root=raw", "folder=c", "scheduler=tcp://10.0.0.1:8786"], "belong together"),
         (["densify", "root=raw", "executor=dask", "scheduler=tcp://10.0.0.1:8786", "workers=2"], "workers counts"),
         (["densify", "root=raw", "workers=-1", "folder=maps"], "workers is -1; it must be at least 0"),
     ],

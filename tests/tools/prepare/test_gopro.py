@@ -165,7 +165,7 @@ def test_newer_cameras_know_fix_and_precision_of_each_sample() -> None:
 
 def test_refused(tmp_path: Path) -> None:
     plain = write_video(tmp_path / "plain.mp4", 5)
-    with pytest.raises(DataError, match=r"no data track of a GoPro.*data=video"):
+    with pytest.raises(DataError, match=r"no GoPro data track.*data=video"):
         import_recordings(plain, tmp_path / "clips")
     with pytest.raises(DataError, match="no bag below"):
         import_recordings(tmp_path, tmp_path / "clips")
@@ -176,7 +176,7 @@ def test_refused(tmp_path: Path) -> None:
     quiet = write_gopro(tmp_path / "quiet.mp4", [device()] * 2, frames=5)
     with pytest.raises(ConfigError, match="topics"):
         import_recordings(quiet, tmp_path / "clips", ["/image"])
-    assert "no speeds: the camera has no satellite receiver" in str(import_recordings(quiet, tmp_path / "clips"))
+    assert "no speeds: the camera has no GPS receiver" in str(import_recordings(quiet, tmp_path / "clips"))
     broken = write_gopro(tmp_path / "broken.mp4", [whole, whole[:-30]], frames=5)
     with pytest.raises(DataError, match=r"broken\.mp4, telemetry at 1\.0 s.*damaged"):
         import_recordings(broken, tmp_path / "clips")

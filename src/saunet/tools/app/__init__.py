@@ -1,1 +1,1 @@
-"""The app: a page in the browser on which a picture or a video is dropped and its depth looked at."""
+"""The app: a page in the browser on which you drop a picture or a video to see its depth."""

@@ -1,4 +1,4 @@
-"""What is on the page of the app, and what happens when something is dropped there."""
+"""The app's page, and what happens when a file is dropped there."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from saunet.tools.app.tool import AppOptions
 
 MAX_PIXELS = 40_000_000
-"""Of a picture or a frame; larger ones would fill the memory."""
+"""Most pixels of a picture or a frame; larger ones would fill the memory."""
 _EMBEDDED = 30_000_000
-"""Bytes of the page of points that is shown; a larger one is only offered as a file."""
+"""Largest page of points to show, in bytes; a larger one is only offered as a file."""
 _VIEW = 81.5
-"""Degrees from left to right that are assumed of an unknown camera: those of the camera that street was trained for."""
+"""Horizontal degrees assumed for an unknown camera: those of the camera that ``street`` was trained for."""
 
 LOOK = """
 footer { display: none !important; }
@@ -55,13 +55,13 @@ new MutationObserver(() => {
 
 
 def THEME() -> Any:  # noqa: N802
-    """Return a look that uses the machine's own fonts: Gradio's would be fetched."""
+    """Return a theme with the machine's own fonts: Gradio's would be downloaded."""
     import gradio
 
     theme = gradio.themes.Base(
         primary_hue="indigo", font=("system-ui", "sans-serif"), font_mono=("ui-monospace", "monospace")
     )
-    quiet, quiet_dark = "*neutral_600", "*neutral_300"  # Gradio's own are too pale to read
+    quiet, quiet_dark = "*neutral_600", "*neutral_300"  # Gradio's own colors are too pale to read
     return theme.set(
         body_text_color_subdued=quiet,
         body_text_color_subdued_dark=quiet_dark,
@@ -75,7 +75,7 @@ def THEME() -> Any:  # noqa: N802
 
 
 def build(options: AppOptions, folder: Path) -> Any:
-    """Return the page; results are made in the folder."""
+    """Return the page; results are written to the folder."""
     import gradio
 
     suffixes = sorted(IMAGE_SUFFIXES | VIDEO_SUFFIXES)
@@ -128,15 +128,15 @@ def answer(
     camera: str | None,
     height: float | int | None,
 ) -> tuple[Any, ...]:
-    """Predict one file, and return what each part of the page shows then."""
+    """Predict one file, and return the new content of each part of the page."""
     import gradio
 
     is_video = source.suffix.lower() in VIDEO_SUFFIXES
     size = _video_size(source) if is_video else image_size(source)
     if size[0] * size[1] > MAX_PIXELS:
         raise DataError(
-            f"{source.name} has {size[1]}x{size[0]} pixels (width x height); at most {MAX_PIXELS:,} are allowed here: "
-            "make it smaller, or use saunet predict"
+            f"{source.name} has {size[1]}x{size[0]} pixels (width x height); at most {MAX_PIXELS:,} are allowed "
+            "here: reduce it, or use saunet predict"
         )
     made = Path(tempfile.mkdtemp(prefix="result-", dir=folder))
     lens = read_camera(camera) if camera else None

@@ -1,4 +1,4 @@
-"""`app`: drop a picture or a video into the browser, see its depth, and take the results away; nothing is fetched."""
+"""`app`: drop a picture or a video into the browser, see its depth, and save the results; works offline."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from saunet.errors import ConfigError, checked, in_range, positive, usable_devic
 from saunet.weights.locate import DEFAULT, locate, shipped
 
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
-"""Names under which a server that answers this machine only may be asked for."""
+"""Host names accepted by a server for this machine only."""
 _KEPT = 1800.0
-"""Seconds after which what was uploaded or made is removed."""
+"""Seconds after which uploads and results are removed."""
 _POLICY = (
     "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'; connect-src 'self' data: blob: ws: wss:; "
     "form-action 'self'; object-src 'none'; base-uri 'self'"
 )
-"""What the browser may load: this server, whatever a library's page asks for."""
+"""What the browser may load: only from this server, whatever a library's page requests."""
 
 
 @checked
 @dataclass(frozen=True, kw_only=True)
 class AppOptions:
-    """What `app` offers, and where.
+    """Options of `app`: the models it offers, and its address.
 
     Args:
-        checkpoints: Models to choose from, beside those that come with saunet: checkpoints, exported folders or files.
+        checkpoints: Models to choose from, besides those that come with saunet: checkpoints, exported folders or files.
         host: Address to listen on; ``0.0.0.0`` lets other machines use the page too.
-        port: Port to listen on; 0 takes any that is free.
+        port: Port to listen on; 0 uses any free one.
         max_megabytes: Largest file that can be dropped.
-        max_frames: Frames of a video that are predicted at most.
-        device: Where to predict; ``auto`` takes a GPU if there is one.
+        max_frames: Largest number of frames of a video to predict.
+        device: Where to predict; ``auto`` uses a GPU if there is one.
 
     Raises:
-        ConfigError: for a number that cannot be.
+        ConfigError: if a number is out of range.
 
     Examples:
         >>> saunet.AppOptions(checkpoints=("last.ckpt",)).host
@@ -62,7 +62,7 @@ class AppOptions:
         positive("max_frames", self.max_frames)
 
     def models(self) -> list[str]:
-        """Return what can be chosen, the default first."""
+        """Return the available models, the default first."""
         own = sorted(shipped(), key=lambda name: name != DEFAULT)
         return list(dict.fromkeys([*own, *self.checkpoints]))
 
@@ -71,11 +71,11 @@ def app(options: AppOptions) -> None:
     """Serve the page until Ctrl-C.
 
     Args:
-        options: What it offers, and where.
+        options: The models it offers, and its address.
 
     Raises:
         ConfigError: if Gradio is missing, the port is taken, or there is no model to choose.
-        CheckpointError: if a model is not there.
+        CheckpointError: if a model does not exist.
 
     Examples:
         >>> saunet.app(saunet.AppOptions())  # doctest: +SKIP
@@ -89,7 +89,7 @@ def app(options: AppOptions) -> None:
 
 @contextlib.contextmanager
 def serving(options: AppOptions) -> Iterator[str]:
-    """Serve the page while the block runs; yields its address. What was uploaded and made is removed at the end."""
+    """Serve the page while the block runs; yields its address. Uploads and results are removed at the end."""
     os.environ.update(GRADIO_ANALYTICS_ENABLED="False", HF_HUB_DISABLE_TELEMETRY="1")  # read when it is imported
     try:
         import gradio
@@ -149,7 +149,7 @@ def _clean(folder: Path, ended: threading.Event) -> None:
 
 
 def remove_old(folder: Path) -> None:
-    """Remove what was uploaded or made long ago."""
+    """Remove old uploads and results."""
     for path in folder.iterdir():
         with contextlib.suppress(OSError):
             if time.time() - path.stat().st_mtime > _KEPT:
@@ -157,9 +157,9 @@ def remove_old(folder: Path) -> None:
 
 
 def guarded(served: Any, host: str) -> Any:
-    """Return an ASGI application that lets pages load nothing from elsewhere, and answers to its own name only.
+    """Return an ASGI application that keeps pages from loading anything else, and answers only to its own host name.
 
-    Another site's page could have its name made to point here, and would read what is served to this machine.
+    Another site could point its host name here, and its page would then read what is served to this machine.
     """
     local = host in ("127.0.0.1", "localhost", "::1")
 

@@ -27,22 +27,22 @@ _MODES = ("eager", "compiled")
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """How long a call takes, in seconds."""
+    """Duration of a call, in seconds."""
 
     median: float
     p90: float
     fastest: float
     warmup: float
-    """All warm-up calls together: compilation, first allocations, choice of algorithms."""
+    """Time of all warm-up calls: compilation, first allocations, choice of algorithms."""
 
 
 def count_parameters(module: nn.Module | None) -> int:
-    """Return the number of parameters, shared ones once; 0 for None."""
+    """Return the number of parameters, counting shared ones once; 0 for None."""
     return 0 if module is None else sum(parameter.numel() for parameter in module.parameters())
 
 
 def count_flops(module: nn.Module, *inputs: Tensor) -> int:
-    """Return the floating-point operations of convolutions and matrix products, a multiply-add counted as two."""
+    """Return the floating-point operations of convolutions and matrix products; a multiply-add counts as two."""
     training = module.training
     counter = FlopCounterMode(display=False)
     # fused attention kernels are not counted by every version of torch; their parts are
@@ -77,10 +77,10 @@ def measure_latency(
 
 
 def peak_memory(call: Callable[[], Any], device: torch.device) -> int | None:
-    """Return by how many bytes a call raises the memory in use at its peak; None where the system does not tell.
+    """Return by how many bytes a call raises the peak memory; None if the system does not report it.
 
-    On CUDA this is memory of tensors. On a CPU it is resident memory of the process (Linux only), after the allocator
-    has given back what earlier calls left it with.
+    On CUDA this is the memory of tensors. On a CPU it is the resident memory of the process (Linux only), after the
+    allocator has released memory left over from earlier calls.
     """
     gc.collect()
     if device.type == "cuda":
@@ -91,10 +91,10 @@ def peak_memory(call: Callable[[], Any], device: torch.device) -> int | None:
         torch.cuda.synchronize(device)
         return torch.cuda.max_memory_allocated(device) - before
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-    with contextlib.suppress(OSError, AttributeError):  # other C libraries than glibc keep what they have
+    with contextlib.suppress(OSError, AttributeError):  # C libraries other than glibc keep their memory
         ctypes.CDLL("libc.so.6").malloc_trim(0)
     try:
-        reset.write_text("5")  # lets the kernel forget the highest mark so far
+        reset.write_text("5")  # resets the kernel's high-water mark
         resident = _kilobytes(status, "VmRSS")
         call()
         return 1024 * (_kilobytes(status, "VmHWM") - resident)
@@ -107,7 +107,7 @@ def _kilobytes(status: Path, field: str) -> int:
 
 
 def matmul_ceiling(device: torch.device, dtype: torch.dtype, side: int = 0) -> float:
-    """Return the FLOPs per second that one large square matrix product reaches: what a network could at best."""
+    """Return the FLOPs per second of one large square matrix product: the most that a network could reach."""
     side = side or (1024 if device.type == "cpu" else 4096)
     factor = torch.randn(side, side, device=device).to(dtype)
     latency = measure_latency(lambda: factor @ factor, device, runs=10)
@@ -131,7 +131,7 @@ class Networks:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What to measure: every combination of the sequences; see `BenchmarkOptions`."""
+    """The combinations to measure: all of those of the sequences; see `BenchmarkOptions`."""
 
     sizes: Sequence[str] = ("192x640",)
     devices: Sequence[str] = ("cpu",)
@@ -145,7 +145,9 @@ class Plan:
         for field in fields(self):
             if isinstance(field.default, tuple) and field.default and not getattr(self, field.name):
                 usual = field.default[0]
-                raise ConfigError(f"{field.name} is empty, so nothing would be measured; give some, such as {usual}")
+                raise ConfigError(
+                    f"{field.name} is empty, so nothing would be measured; give at least one, such as {usual}"
+                )
         for size in self.sizes:
             _parse(size)
         for device in self.devices:
@@ -174,13 +176,13 @@ class Measurement(Latency):
     pose_parameters: int
     total_parameters: int
     flops: int
-    """Of the depth network, for one image."""
+    """FLOPs of the depth network, for one image."""
     throughput: float
     """Images per second, at the median."""
     memory: int | None
-    """Peak of the first call (not compiled) above what was in use before it; None where the system does not tell."""
+    """Peak memory of the first call (not compiled) above the use before it; None if the system does not report it."""
     ceiling_share: float
-    """FLOPs per second over what one large matrix product reaches on the same device in the same precision."""
+    """FLOPs per second relative to one large matrix product on the same device in the same precision."""
 
 
 def run_suite(
@@ -237,8 +239,8 @@ def _run(
     memory = peak_memory(lambda: network(image), image.device)
     forward: Callable[[Tensor], object] = network
     if compiled:
-        # As if nothing had been compiled before: else, after other shapes, the compiler would write code for any shape,
-        # and after eight of them fall back to eager.
+        # As if nothing had been compiled before: otherwise, after other shapes, the compiler would generate code for
+        # any shape, and after eight of them fall back to eager.
         torch.compiler.reset()
         forward = torch.compile(network, dynamic=False)
     return memory, measure_latency(lambda: forward(image), image.device, plan.runs, plan.warmup, tick)

@@ -20,33 +20,33 @@ from saunet.tables.drawing import Point, draw_speed, save
 from saunet.tools.benchmark.measure import Measurement, Networks, Plan, run_suite
 
 PAPER_METHODS = {"mono_r18": "Mono R18", "mono_r50": "Mono R50", "packnet": "PackNet", "sau_net": "SAU-Net"}
-"""What the paper calls our models."""
+"""The paper's names of our models."""
 CHANGED = " (changed)"
-"""Stands behind the name of a model that has other parameters: it is not what the paper measured."""
+"""Suffix of a model's name if its parameters differ from those in the paper."""
 
 
 @checked
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkOptions(Plan):
-    """What `benchmark` measures: every combination of the sequences, for ``model`` or each of ``models``.
+    """Options of `benchmark`: it measures every combination of the sequences, for ``model`` or each of ``models``.
 
     Args:
-        model: Networks; unused where ``models`` is given.
-        models: Registered models by name, to measure side by side; in Python also networks by the name to show.
+        model: Networks to measure; unused if ``models`` is given.
+        models: Registered models by name, to measure side by side; in Python also a mapping of names to networks.
         sizes: Image sizes, height x width.
-        devices: cpu, cuda or any other that torch knows; auto is a GPU if there is one.
+        devices: cpu, cuda or any other of torch's devices; auto is a GPU if there is one.
         precisions: fp32, bf16 or fp16: the format of weights and activations.
         modes: eager, compiled.
-        batch_sizes: Images per call. Latency is that of the call, throughput is in images.
-        runs: Timed calls.
-        warmup: Calls before that.
-        threads: Of torch on the CPU; as it is by default.
+        batch_sizes: Images per call. Latency is per call, throughput in images per second.
+        runs: Number of timed calls.
+        warmup: Number of calls before that.
+        threads: Threads of torch on the CPU; by default unchanged.
         figure: Also draw time against accuracy; needs matplotlib.
-        abs_rel: Accuracy by model for the figure; the paper's where a model is not named.
+        abs_rel: Accuracy by model for the figure; the paper's for models not named.
         output_dir: Folder for the results; None writes none.
 
     Raises:
-        ConfigError: if there is nothing to measure, or for a word, number or device that cannot work.
+        ConfigError: if there is nothing to measure, or a choice, number or device is invalid.
 
     Examples:
         >>> saunet.BenchmarkOptions(models=["sau_net", "street"], sizes=["192x640"]).runs
@@ -64,7 +64,7 @@ class BenchmarkOptions(Plan):
     def __post_init__(self) -> None:
         Plan.__post_init__(self)
         if not self.models and self.model is None:
-            raise ConfigError("models is empty, so nothing would be measured; name some, such as sau_net")
+            raise ConfigError("models is empty, so nothing would be measured; name at least one, such as sau_net")
         if self.threads is not None:
             positive("threads", self.threads)
         if self.figure:
@@ -73,14 +73,14 @@ class BenchmarkOptions(Plan):
 
 @dataclass(frozen=True)
 class BenchmarkResult:
-    """What was measured."""
+    """The measurements."""
 
     measurements: tuple[Measurement, ...]
     folder: Path | None = None
-    """Where the files were written."""
+    """Folder of the files."""
 
     def tables(self, width: int = 160) -> tuple[Table, Table]:
-        """Return the sizes, and times and memory in at most so many columns of text."""
+        """Return a table of sizes, and one of times and memory, at most this many characters wide."""
         return size_table(self.measurements), speed_table(self.measurements, width)
 
     def show(self) -> None:
@@ -98,14 +98,14 @@ def benchmark(
 
     Args:
         options: What to measure, and how.
-        choices: What the command line chose by name: ``model`` names the options' model.
-        overrides: What the command line changed.
+        choices: The choices of the command line: ``model`` names the options' model.
+        overrides: The overrides of the command line.
 
     Returns:
-        What was measured; `BenchmarkResult.show` prints the tables.
+        The measurements; `BenchmarkResult.show` prints the tables.
 
     Raises:
-        ConfigError: if a size does not fit a model, or ``models`` stands beside changes of a model; nothing has been
+        ConfigError: if a size does not fit a model, or ``models`` is combined with changes of a model; nothing is
             measured then.
         DataError: if a file cannot be written.
 
@@ -138,12 +138,12 @@ def benchmark(
 
 
 def _networks(options: BenchmarkOptions, name: str | None, overrides: Sequence[str]) -> dict[str, Networks]:
-    """Return what to measure by the name that it is shown under."""
+    """Return the networks to measure, by their displayed names."""
     changes = [change for change in overrides if re.match(r"[+~]*model[=./@]", change)]
     if options.models and changes:
         raise ConfigError(
-            f"models= measures each model as it is named, so '{changes[0]}' would change nothing; "
-            "leave out one of the two"
+            f"models= measures each named model unchanged, so '{changes[0]}' would have no effect; leave out one of "
+            "the two"
         )
     if isinstance(options.models, Mapping):
         return dict(options.models)
@@ -156,7 +156,7 @@ def _networks(options: BenchmarkOptions, name: str | None, overrides: Sequence[s
 
 
 def size_table(results: Sequence[Measurement]) -> Table:
-    """Return parameters and FLOPs by model and image size, with the paper's Table 2 where it has the system."""
+    """Return parameters and FLOPs by model and image size, with the paper's Table 2 if it has the system."""
     printed = {row.method: row.megaparameters for row in published().table2}
     rows = []
     for row in {(row.model, row.size): row for row in results}.values():
@@ -164,7 +164,7 @@ def size_table(results: Sequence[Measurement]) -> Table:
         counts = (count / 1e6 for count in (row.depth_parameters, row.pose_parameters, row.total_parameters))
         paper = f"{printed[method]} ({method})" if method else None
         rows.append(Row((row.model, row.size, *counts, paper, row.flops / 1e9)))
-    title = "Size: M = 10^6 parameters; GFLOP of the depth network for one image"
+    title = "Size: parameters in millions (M); GFLOP of the depth network for one image"
     headings = columns("model", "size", "depth M|.1f", "pose M|.1f", "total M|.1f", "paper M", "GFLOP|.1f")
     return Table("sizes", title, headings, tuple(rows))
 
@@ -172,8 +172,8 @@ def size_table(results: Sequence[Measurement]) -> Table:
 def speed_table(results: Sequence[Measurement], width: int = 160) -> Table:
     """Return time and memory of every measurement; times in milliseconds.
 
-    Settings that all measurements share are in the title. Where the rest does not fit into so many columns of text,
-    they stand in one column that wraps, so that no number is cut.
+    Settings shared by all measurements are in the title. If the rest is too wide, the settings share one column that
+    wraps, so no number is cut off.
     """
     keys = ("model", "size", "device", "precision", "mode", "batch_size")
     settings = {key.removesuffix("_size"): [str(getattr(row, key)) for row in results] for key in keys}
@@ -196,7 +196,7 @@ def speed_table(results: Sequence[Measurement], width: int = 160) -> Table:
 
 
 def write_measurements(results: Sequence[Measurement], path: Path) -> None:
-    """Write the measurements with the machine they were made on."""
+    """Write the measurements, with a description of the machine."""
     machine = {
         "torch": torch.__version__,
         "python": platform.python_version(),
@@ -208,7 +208,7 @@ def write_measurements(results: Sequence[Measurement], path: Path) -> None:
 
 
 def draw_figure(results: Sequence[Measurement], path: Path, abs_rel: Mapping[str, float] | None = None) -> None:
-    """Draw time per image against accuracy; models of unknown accuracy stand beside."""
+    """Draw time per image against accuracy; models of unknown accuracy are shown at the side."""
     printed = {row.method: row.errors[0] for row in published().table1}
     accuracy = {model: printed[method] for model, method in PAPER_METHODS.items()} | dict(abs_rel or {})
     points = []

@@ -1,4 +1,4 @@
-"""Where the cameras of a rig are, from the pictures in which two of them see the same board."""
+"""The poses of a rig's cameras, from pictures in which two of them see the same board."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from saunet.tools.calibrate.solve import FEWEST_CORNERS, FEWEST_VIEWS, BoardView
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a camera of a rig is, seen from the one before it."""
+    """Pose of a rig's camera relative to the previous camera."""
 
     T: NDArray[np.float64]
-    """T_this_before, 4 x 4: a point of the camera before times it is one of this camera; meters."""
+    """T_this_before, 4 x 4, meters: maps points of the previous camera to this one."""
     error: float
     """Root mean square reprojection error of both cameras, pixels."""
     deviation: float
-    """Standard deviation of its position, meters, by leaving out pictures."""
+    """Standard deviation of its position in meters, by leaving out pictures."""
     pairs: int
-    """Pictures in which both saw the board."""
+    """Number of pictures in which both saw the board."""
 
     def __str__(self) -> str:
         turn = float(np.degrees(np.linalg.norm(cv2.Rodrigues(self.T[:3, :3])[0])))
         distance = float(np.linalg.norm(self.T[:3, 3]))
         return (
-            f"{distance:.4f} m away (known to {1000 * self.deviation:.2g} mm), turned by {turn:.2f} degrees; "
+            f"{distance:.4f} m away (known to within {1000 * self.deviation:.2g} mm), turned by {turn:.2f} degrees; "
             f"error {self.error:.3f} px in {self.pairs} pairs"
         )
 
 
 def place(before: Calibration, after: Calibration) -> Placement:
-    """Find where a camera is, seen from another one, by the pictures in which both see the board.
+    """Find the pose of a camera relative to another one, from pictures in which both see the board.
 
-    Lenses are those calibrated; their views are straightened first, so that any two can be paired.
+    Views are undistorted with the calibrated lenses first, so any two can be paired.
     """
     if before.looked_at != after.looked_at:
         raise DataError(
-            f"{before.camera.path} has {before.looked_at} pictures and {after.camera.path} {after.looked_at}; the "
-            "cameras of a rig need as many, taken at the same moments"
+            f"{before.camera.path} has {before.looked_at} pictures but {after.camera.path} has {after.looked_at}; "
+            "the cameras of a rig need equally many, taken at the same moments"
         )
     others, pairs = {view.number: view for view in after.found}, []
     for view in before.found:

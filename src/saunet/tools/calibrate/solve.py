@@ -25,19 +25,19 @@ from saunet.io.video import VideoReader
 KINDS = ("chessboard", "charuco", "aprilgrid")
 _TAGS = cv2.aruco.DICT_APRILTAG_36h11
 _BORDER = 2
-"""Black modules around the 6x6 of a tag, as Kalibr prints them."""
+"""Width of the black border around a tag's 6x6 modules, as Kalibr prints it."""
 _REFINED = 0.1
-"""Half of the window in which a tag's corner is refined, over its side: smaller than its border and the space."""
+"""Half the window for refining a tag's corner, relative to its side: smaller than its border and the space."""
 _SEARCH_WIDTH = 1280
-"""Pictures are made this narrow to look for the board; corners are then refined in the picture itself."""
+"""Pictures are reduced to this width to look for the board; corners are then refined in the full picture."""
 FEWEST_CORNERS = 8
 FEWEST_VIEWS = 8
 UNCERTAIN = 0.02
-"""Relative standard deviation of the focal length from which a calibration is refused."""
+"""A calibration is refused from this relative standard deviation of the focal length on."""
 UNCERTAIN_CORNER = 0.005
-"""Standard deviation of a corner, over the width, from which a calibration is refused."""
+"""A calibration is refused from this standard deviation of a corner on, relative to the width."""
 MAGNIFIED = 50
-"""Length of a drawn residual over its own."""
+"""Magnification of drawn residuals."""
 _CELLS = (6, 8)
 """Rows and columns of the grid on which coverage is counted."""
 
@@ -51,7 +51,7 @@ class BoardView:
     pixels: NDArray[np.float32]
     """n x 2; integer coordinates are pixel centers."""
     number: int = 0
-    """Of the picture among those that were looked at."""
+    """Number of the picture among those examined."""
 
 
 class Board:
@@ -72,7 +72,9 @@ class Board:
             in_range("spacing", spacing, 0.05, 1.0)
             tags = len(cv2.aruco.getPredefinedDictionary(_TAGS).bytesList)
             if min(columns, rows) < 2 or columns * rows > tags:
-                raise ConfigError(f"the board has {columns}x{rows} tags; allowed are 2x2 to {tags} in all")
+                raise ConfigError(
+                    f"the board has {columns}x{rows} tags; allowed are at least 2x2, and at most {tags} in total"
+                )
         elif columns < 4 or rows < 4:
             raise ConfigError(f"the board has {columns}x{rows} squares; it needs at least 4 in both directions")
         self.columns, self.rows = columns, rows
@@ -89,16 +91,16 @@ class Board:
                 fix = "use fewer squares; the largest usual dictionaries, such as DICT_4X4_1000, have 1000"
                 if larger:
                     fix = f"choose a larger one, such as DICT_4X4_{larger}"
-                has = f"dictionary {dictionary} has {len(words.bytesList)} markers and the board needs {needed}"
+                has = f"dictionary {dictionary} has {len(words.bytesList)} markers but the board needs {needed}"
                 raise ConfigError(f"{has}; {fix}")
             self._charuco = cv2.aruco.CharucoBoard((columns, rows), self.square, marker * self.square, words)
             self._detectors = [cv2.aruco.CharucoDetector(self._charuco)]
-            if rows % 2 == 0:  # then OpenCV before 4.6 laid the markers out otherwise
+            if rows % 2 == 0:  # then OpenCV before 4.6 used another layout
                 old = cv2.aruco.CharucoBoard((columns, rows), self.square, marker * self.square, words)
                 old.setLegacyPattern(True)
                 self._detectors.append(cv2.aruco.CharucoDetector(old))
         self.legacy = 0
-        """Pictures in which only the layout of OpenCV before 4.6 was found."""
+        """Number of pictures in which only the layout of OpenCV before 4.6 was found."""
 
     def __str__(self) -> str:
         if self.kind == "aprilgrid":
@@ -118,14 +120,14 @@ class Board:
         return np.pad(inner, pixels_a_square, constant_values=255)
 
     def find(self, image: UInt8[np.ndarray, "h w 3"]) -> BoardView | None:
-        """Return the board in an RGB picture; None where it is not, or not enough of it."""
+        """Return the board in an RGB picture; None if it, or enough of it, is not visible."""
         gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         if self.kind == "aprilgrid":
             return self._find_aprilgrid(gray)
         return self._find_charuco(gray) if self._charuco is not None else self._find_chessboard(gray)
 
     def _aprilgrid(self, side: int) -> UInt8[np.ndarray, "h w"]:
-        """Return what Kalibr prints: tag 0 at the bottom left, and squares that make all corners saddles."""
+        """Return the board as Kalibr prints it: tag 0 at the bottom left, and squares that make all corners saddles."""
         words, gap = cv2.aruco.getPredefinedDictionary(_TAGS), round(self.spacing * side)
         left, top = (
             [round(n * (1 + self.spacing) * side) for n in range(count + 1)] for count in (self.columns, self.rows)
@@ -199,23 +201,23 @@ class Board:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was found."""
+    """The result of a calibration."""
 
     camera: CameraFile
     error: float
     """Root mean square reprojection error in pixels."""
     uncertainty: float
-    """Standard deviation of the focal length over the focal length."""
+    """Relative standard deviation of the focal length."""
     corner: float
-    """Standard deviation in pixels of where the least known corner of the picture lies."""
+    """Standard deviation in pixels of the picture's least certain corner."""
     coverage: float
     """Fraction of the image in which the board was seen."""
     views: tuple[BoardView, ...]
     misses: tuple[NDArray[np.float64], ...]
-    """Residuals of each view, n x 2: where the camera shows a corner, from where it was found, in pixels."""
+    """Residuals of each view, n x 2, in pixels: the camera's projection of a corner minus its detection."""
     looked_at: int
     dropped: int
-    """Views left out since they fit the others badly."""
+    """Number of views left out because they do not fit the others."""
     example: UInt8[np.ndarray, "h w 3"]
     """One of the pictures."""
     found: tuple[BoardView, ...] = ()
@@ -231,7 +233,7 @@ def solve(
     advance: Callable[[int, int | None], None] = lambda done, total: None,
     k3: bool = True,
 ) -> Calibration:
-    """Calibrate a camera from a video or a folder of pictures of a board; ``k3`` is the third radial number."""
+    """Calibrate a camera from a video or a folder of pictures of a board; ``k3`` is the third radial coefficient."""
     most = max(FEWEST_VIEWS, views)
     found: list[BoardView] = []
     looked_at, size, example = 0, (0, 0), None
@@ -263,11 +265,11 @@ def solve(
     problem = _problem(fit.error, uncertainty, max_error, float(fit.K[0, 0]) / size[1])
     corner = np.inf
     if not problem:
-        with contextlib.suppress(DataError):  # where there is no straight picture no corner is known
+        with contextlib.suppress(DataError):  # without an undistorted picture no corner is known
             corner = _corner(fit, covariance, Lens(camera, *size).K, size)
         problem = _outside(fit, used, corner, size)
     if problem:
-        raise DataError(f"the calibration from {source} is not to be trusted: {problem}")
+        raise DataError(f"the calibration from {source} cannot be trusted: {problem}")
     dropped = len(chosen) - len(used)
     coverage, misses = float(_covered(used, size).mean()), tuple(_misses(fit, used))
     return Calibration(
@@ -286,10 +288,10 @@ def solve(
 
 
 def check_picture(result: Calibration) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return a picture to judge a calibration by, and beside it the same picture undistorted.
+    """Return a picture for judging a calibration, beside its undistorted version.
 
-    On the left, each corner found has a line that is `MAGNIFIED` times its residual, and what the board never covered
-    is dark.
+    On the left, each detected corner has a line of `MAGNIFIED` times its residual, and parts never covered by the board
+    are dark.
     """
     left, (height, width) = result.example.copy(), result.example.shape[:2]
     seen = cv2.resize(_covered(result.views, (height, width)).astype(np.uint8), (width, height), interpolation=0)
@@ -305,7 +307,7 @@ def check_picture(result: Calibration) -> UInt8[np.ndarray, "_ _ 3"]:
 
 
 def _pictures(source: Path, most: int) -> Iterator[tuple[NDArray[np.uint8], int | None]]:
-    """Yield (image, number of pictures), evenly spread where there are more than ``most``."""
+    """Yield (image, number of pictures), evenly spread if there are more than ``most``."""
     if source.is_dir() or (not source.exists() and set("*?[") & set(str(source))):
         paths = frame_paths(source) if source.is_dir() else sorted(map(Path, glob(str(source))), key=natural_order)
         if not paths:
@@ -359,7 +361,7 @@ class _Fit:
 
 
 def _solve(views: Sequence[BoardView], size: tuple[int, int], model: str, k3: bool) -> tuple[_Fit, list[BoardView]]:
-    """Return the fit and the views used, without those that fit badly."""
+    """Return the fit and the views used, without outliers."""
     used = list(views)
     while True:
         fit = _fisheye(used, size) if model == "fisheye" else _pinhole(used, size, k3)
@@ -401,8 +403,8 @@ def _fisheye(views: Sequence[BoardView], size: tuple[int, int]) -> _Fit:
             problem = problem or str(reason).strip().splitlines()[-1]
     if best is None:
         raise DataError(
-            f"the views do not fit a fisheye lens ({problem}); "
-            "hold the board nearer to the middle and tilt it less, or use lens=pinhole"
+            f"the views do not fit a fisheye lens ({problem}); hold the board closer to the middle and tilt it less, "
+            "or use lens=pinhole"
         )
     error, K, distortion, rotations, shifts = best
     poses = tuple(zip(rotations, shifts, strict=True))
@@ -439,34 +441,36 @@ def _problem(error: float, uncertainty: float, max_error: float, focal: float) -
             f"the reprojection error is {error:.2f} pixels and at most {max_error:g} is accepted; "
             "use sharp pictures, a flat board and the right number of squares, or raise max_error"
         )
-    remedy = "the views are too alike: tilt the board by up to 45 degrees in all directions, near and far"
+    remedy = "the views are too similar: tilt the board by up to 45 degrees in all directions, near and far"
     if not 0.2 < focal < 10:
         return f"a focal length of {focal:.1f} picture widths is impossible; {remedy}"
     if uncertainty > UNCERTAIN:
-        return f"the focal length is known to {uncertainty:.1%} only; {remedy}"
+        return f"the focal length is only known to within {uncertainty:.1%}; {remedy}"
     return None
 
 
 def _outside(fit: _Fit, views: Sequence[BoardView], corner: float, size: tuple[int, int]) -> str | None:
-    """Return what is wrong with the model where the board was not seen; None if nothing is."""
+    """Return what is wrong with the model outside the area where the board was seen; None if nothing is."""
     center, (height, width) = fit.K[:2, 2], size
     seen = max(float(np.linalg.norm(view.pixels - center, axis=1).max()) for view in views)
     far = float(np.linalg.norm(np.maximum(center, [width - 1, height - 1] - center)))
     remedy = (
-        f"the board was seen up to {seen:.0f} pixels from the center and the picture reaches {far:.0f}: "
-        "film it along the edges and in all four corners too"
+        f"the board was seen up to {seen:.0f} pixels from the center but the picture reaches {far:.0f}: film it "
+        "along the edges and in all four corners too"
     )
     _, radius = fold(fit.model, fit.distortion, fit.K, height, width)
     if corner == np.inf:
-        what = f"folds back {radius:.0f} pixels from the center" if np.isfinite(radius) else "gives no straight picture"
+        what = (
+            f"folds back {radius:.0f} pixels from the center" if np.isfinite(radius) else "gives no undistorted picture"
+        )
         return f"the lens model {what}; {remedy}"
     if not corner <= UNCERTAIN_CORNER * width:
-        return f"the picture's corners are known to {corner:.0f} pixels only; {remedy}"
+        return f"the picture's corners are only known to within {corner:.0f} pixels; {remedy}"
     return None
 
 
 def _covered(views: Sequence[BoardView], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return in which cells of the picture the board was seen."""
+    """Return the cells of the picture in which the board was seen."""
     seen = np.zeros(_CELLS, dtype=bool)
     for view in views:
         cells = (view.pixels[:, ::-1] / np.array(size) * np.array(_CELLS)).astype(int)

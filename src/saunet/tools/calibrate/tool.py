@@ -29,10 +29,10 @@ from saunet.tools.calibrate.solve import MAGNIFIED, Board, Calibration, check_pi
 @checked
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
-    """What `calibrate` reads and writes; ``columns`` and ``rows`` count the board's squares.
+    """Options of `calibrate`: what it reads and writes; ``columns`` and ``rows`` count the board's squares.
 
     Raises:
-        ConfigError: for a board that cannot exist, another wrong value, or neither ``input`` nor ``print_board``.
+        ConfigError: for an impossible board, another invalid value, or neither ``input`` nor ``print_board``.
 
     Examples:
         >>> saunet.CalibrateOptions(input="board.mp4", columns=8, rows=6).output
@@ -40,44 +40,44 @@ class CalibrateOptions:
     """
 
     input: str | None = None
-    """A video, a folder or a pattern (``photos/*.jpg``) of pictures of the board held in many places and tilts; or a
-    calibration ``FILE[:camera]`` of another tool, to convert."""
+    """A video, a folder or a pattern (``photos/*.jpg``) of pictures of the board in many positions and tilts; or
+    another tool's calibration ``FILE[:camera]`` to convert."""
     video: str | None = None
-    """In place of ``input``: a driving video with turns, or a folder of its frames. Gives the focal length, the center
-    and the distortion (division model), if they can be known."""
+    """Instead of ``input``: a driving video with turns, or a folder of its frames. Gives the focal length, the center
+    and the distortion (division model), if they can be estimated."""
     output: str = "camera.yaml"
-    """The camera file to write; a picture to check it by is written beside it."""
+    """The camera file to write; a picture for checking it is written beside it."""
     rig: Sequence[str] = ()
-    """Videos or pictures of the same board by further cameras of a rig, taken at the same moments as ``input``. Where
-    each camera is, seen from the one before it, goes into a Kalibr camchain beside ``output``."""
+    """Videos or pictures of the same board from further cameras of a rig, taken at the same moments as ``input``. The
+    pose of each camera relative to the previous one goes into a Kalibr camchain beside ``output``."""
     board: Literal["chessboard", "charuco", "aprilgrid"] = "chessboard"
     """A ``charuco`` board or a Kalibr ``aprilgrid`` has markers and may be partly hidden."""
     columns: int = 10
-    """Squares (of an aprilgrid: tags) from left to right."""
+    """Number of squares (aprilgrid: tags) from left to right."""
     rows: int = 7
-    """The same from top to bottom."""
+    """Number of squares (aprilgrid: tags) from top to bottom."""
     square: float = 0.025
     """Side of a square, or of a tag with its black border, in meters."""
     spacing: float = 0.3
-    """Space between the tags of an aprilgrid over their side."""
+    """Space between the tags of an aprilgrid, relative to their side."""
     marker: float = 0.75
     """Side of a ChArUco marker as a fraction of the square."""
     dictionary: str = "DICT_4X4_100"
     """Name of the markers' ArUco dictionary."""
     lens: Literal["pinhole", "fisheye"] = "pinhole"
-    """The model: ``pinhole`` has five numbers of distortion, ``fisheye`` four. ``camera.yaml`` calls it ``model``."""
+    """The lens: ``pinhole`` has five distortion coefficients, ``fisheye`` four. It is ``model`` in ``camera.yaml``."""
     views: int = 40
-    """Pictures to use at most: those that differ most."""
+    """Largest number of pictures to use: those that differ most."""
     max_error: float = 1.0
-    """Reprojection error in pixels above which the result is refused."""
+    """Largest accepted reprojection error in pixels."""
     camera_height: float | None = None
     """Height of the camera above the road in meters, for the camera file."""
     condition: str | None = None
     """Weather or light, for the camera file."""
     fov: float | None = None
-    """Horizontal degrees of the straightened picture, for the camera file; as wide as it can be if None."""
+    """Horizontal degrees of the undistorted picture, for the camera file; None for the widest possible."""
     export: Literal["ros", "kalibr", "colmap", "opencv"] | None = None
-    """Also write the camera for this tool, beside ``output``."""
+    """Also write the camera in this tool's format, beside ``output``."""
     print_board: str | None = None
     """Write a picture of the board to this file, and do nothing else."""
     overwrite: bool = False
@@ -108,12 +108,12 @@ class CalibrateOptions:
             positive("camera_height", self.camera_height)
 
     def exported(self) -> Path | None:
-        """Return the file for another tool; None if none is wished."""
+        """Return the file for another tool; None if not requested."""
         output = Path(self.output)
         return output.with_name(output.stem + EXPORTS[self.export]) if self.export else None
 
     def rig_files(self) -> list[Path]:
-        """Return the camchain and the camera files of a rig's further cameras; none without a rig."""
+        """Return the camchain and the camera files of a rig's further cameras; nothing without a rig."""
         output = Path(self.output)
         names = ["rig", *map(str, range(1, len(self.rig) + 1))] if self.rig else []
         return [output.with_name(f"{output.stem}_{name}{output.suffix}") for name in names]
@@ -125,7 +125,7 @@ class CalibrateOptions:
 
 @dataclass(frozen=True)
 class CalibrateResult:
-    """What `calibrate` found and wrote; ``print`` shows it."""
+    """The result of `calibrate`; ``print`` shows it."""
 
     written: Path
     """The camera file, or the picture of the board."""
@@ -140,17 +140,17 @@ class CalibrateResult:
 def calibrate(
     options: CalibrateOptions, *, advance: Callable[[int, int | None], None] | None = None
 ) -> CalibrateResult:
-    """Find a board in pictures, solve for the camera, say how good that is, and write ``camera.yaml``.
+    """Find a board in pictures, solve for the camera, report the quality, and write ``camera.yaml``.
 
     Args:
         options: What to read, the board, and where to write.
-        advance: Called with the number of pictures looked at and their total; a progress bar if None.
+        advance: Called with the number of pictures examined and their total; a progress bar if None.
 
     Returns:
         The calibration, the file, and a summary.
 
     Raises:
-        DataError: if the pictures cannot be read, the board is hardly seen, or the result cannot be trusted.
+        DataError: if the pictures cannot be read, show too little of the board, or the result cannot be trusted.
 
     Examples:
         >>> print(saunet.calibrate(saunet.CalibrateOptions(print_board="board.png", columns=8)))
@@ -172,7 +172,7 @@ def calibrate(
         with bar() as shown:
             task = shown.add_task("looking for the board", total=None)
             advance = advance or (lambda done, total: shown.update(task, completed=done, total=total))
-            k3 = options.export != "kalibr" and not options.rig  # Kalibr has no such number
+            k3 = options.export != "kalibr" and not options.rig  # Kalibr has no such coefficient
             settings = board, options.lens, options.views, options.max_error, advance, k3
             result, *more = (solve(source, *settings) for source in (str(options.input), *options.rig))
         camera = result.camera
@@ -180,7 +180,7 @@ def calibrate(
     own: dict[str, Any] = {"camera_height": options.camera_height, "condition": options.condition, "fov": options.fov}
     camera = replace(camera, **{key: value for key, value in own.items() if value is not None})
     if camera.image_size:
-        Lens(camera, *camera.image_size)  # a lens that cannot be straightened is refused before anything is written
+        Lens(camera, *camera.image_size)  # a lens that cannot be undistorted is refused before anything is written
     output, exported, K = Path(options.output), options.exported(), camera.K
     told = _write_rig(options, [result, *more]) if result and more else []
     if exported and options.export:
@@ -193,23 +193,23 @@ def calibrate(
     picture = output.with_name(f"{output.stem}_check.png")
     write_image(picture, check_picture(replace(result, camera=camera)))
     lines = [
-        f"{note} ({result.looked_at} looked at, {result.dropped} left out as misfits)",
-        f"reprojection error {result.error:.3f} px; focal length known to {result.uncertainty:.2%}, "
-        f"the picture's corners to {result.corner:.2f} px",
+        f"{note} ({result.looked_at} examined, {result.dropped} left out as outliers)",
+        f"reprojection error {result.error:.3f} px; focal length known to within {result.uncertainty:.2%}, the "
+        f"picture's corners to {result.corner:.2f} px",
         known,
     ]
     if board.legacy:
         lines.append("the board has the layout of OpenCV before 4.6 (legacy pattern)")
     if result.coverage < 0.6:
-        lines.append(f"the board was seen in {result.coverage:.0%} of the image only: hold it into the corners too")
+        lines.append(f"the board was seen in only {result.coverage:.0%} of the image: hold it in the corners too")
     lines += told
-    drawn = f"on the left, residuals {MAGNIFIED} times and dark where the board was not seen"
-    lines.append(f"{files}; look at {picture}: straight lines must be straight on its right side; {drawn}")
+    drawn = f"on the left, residuals are magnified {MAGNIFIED} times, and parts without the board are dark"
+    lines.append(f"{files}; check {picture}: straight lines must be straight on its right side; {drawn}")
     return CalibrateResult(output, "\n".join(lines), result)
 
 
 def _write_rig(options: CalibrateOptions, results: Sequence[Calibration]) -> list[str]:
-    """Write the further cameras of a rig and the camchain; say where each camera is."""
+    """Write the further cameras of a rig and the camchain; report the pose of each camera."""
     chain, *files = options.rig_files()
     places = [place(before, after) for before, after in itertools.pairwise(results)]
     export_rig(chain, [each.camera for each in results], [each.T for each in places])
@@ -217,12 +217,14 @@ def _write_rig(options: CalibrateOptions, results: Sequence[Calibration]) -> lis
     for number, (file, found, placed) in enumerate(zip(files, results[1:], places, strict=True), start=1):
         write_camera(file, found.camera, f"saunet calibrate: camera {number} of a rig, see {chain.name}")
         lines.append(f"camera {number} ({file}), seen from camera {number - 1}: {placed}")
-        lines.append(f"  its own reprojection error {found.error:.3f} px, corners known to {found.corner:.2f} px")
+        lines.append(
+            f"  its own reprojection error {found.error:.3f} px, corners known to within {found.corner:.2f} px"
+        )
     return [*lines, f"rig: {chain} (Kalibr camchain)"]
 
 
 def _from_driving(source: str) -> tuple[CameraFile, str]:
-    """Estimate the focal length from a drive; refused where it cannot be known."""
+    """Estimate the focal length from a drive; an error if it cannot be estimated."""
     path, size = Path(source).expanduser(), list[tuple[int, int]]()
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
@@ -246,7 +248,8 @@ def _from_driving(source: str) -> tuple[CameraFile, str]:
     height, width = size[0]
     K = found.intrinsics(height, width, width)
     about = (
-        f"from {found.windows} windows of {WINDOW} frames of {path.name}: focal length known to {found.uncertainty:.2%}"
+        f"from {found.windows} windows of {WINDOW} frames of {path.name}: focal length known to within "
+        f"{found.uncertainty:.2%}"
     )
     lens = ((found.distortion,), "division") if found.bend else ()
     return CameraFile(path, K, size[0], *lens), f"{about}; {found.assumed}"

@@ -1,1 +1,1 @@
-"""Looking at a data set before hours of training: what is there, what is wrong with it, and what to do about it."""
+"""Checking a data set before hours of training: its content, its problems, and what to do about them."""

@@ -1,4 +1,4 @@
-"""From measurements to sentences and a manifest: what is wrong, what to do, and which frames to leave out."""
+"""Findings and the manifest from measurements: what is wrong, what to do, and which frames to leave out."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from saunet.errors import UnreadableError
 from saunet.tools.doctor.survey import ABSENT, BANDS, CameraFacts, FrameFacts, Survey, is_doubled
 
 DARK, BRIGHT = 0.08, 0.92
-"""Mean brightness outside which a frame shows nothing."""
+"""A frame with a mean brightness outside these shows nothing."""
 FLAT = 0.03
-"""Contrast under which a frame shows nothing (fog on the lens, a wall, a cap)."""
+"""A frame with less contrast shows nothing (fog on the lens, a wall, a cap)."""
 _STILL_BAND = 0.5
 """A band that moves less than this fraction of the whole picture is part of the car."""
 _UNEVEN = 1.5
-"""Highest over lowest rate of a recording from which it is worth a word."""
+"""A recording is mentioned from this ratio of highest to lowest rate on."""
 _USUAL_VIEW = (60, 120)
-"""Degrees that a car camera sees, from side to side."""
+"""Usual horizontal field of view of a car's camera, degrees."""
 _USE_MANIFEST = "train with data.manifest=<this manifest>"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing to know about a data set."""
+    """One finding about a data set."""
 
     level: Literal["error", "warning", "note"]
     text: str
@@ -41,7 +41,7 @@ class Finding:
 
 
 def diagnose(survey: Survey) -> list[Finding]:
-    """Return what there is to say about a data set, errors first."""
+    """Return the findings about a data set, errors first."""
     rules = (
         _splits,
         _names,
@@ -67,10 +67,10 @@ def _splits(survey: Survey) -> Iterator[Finding]:
         named = " and ".join([", ".join(splits[:-1]), splits[-1]] if len(splits) > 1 else splits)
         broken = isinstance(survey.problems[splits[0]], UnreadableError)
         text = f"the {named} split{'s' if len(splits) > 1 else ''} cannot be used: {problem}"
-        yield Finding("error", text, "data.on_error=skip counts all files that are broken" if broken else "")
+        yield Finding("error", text, "data.on_error=skip counts all broken files" if broken else "")
     count = survey.windows.get("train")
     if count is not None and count < 1000:
-        text = f"only {count} training samples; published models use some 40 000"
+        text = f"only {count} training samples; published models use about 40 000"
         yield Finding("warning", text, "add drives, or start from a trained model")
     if count is not None and "val" not in survey.windows and "val" not in survey.problems:
         yield Finding("warning", "nothing is held out for validation", "set data.val_share or name clips or drives")
@@ -78,8 +78,8 @@ def _splits(survey: Survey) -> Iterator[Finding]:
 
 def _names(survey: Survey) -> Iterator[Finding]:
     for name in survey.ambiguous:
-        text = f"'{name}' is the name of different recordings in different splits, so a manifest cannot tell them apart"
-        yield Finding("error", text, "give each recording a name of its own")
+        text = f"'{name}' names different recordings in different splits, so a manifest cannot distinguish them"
+        yield Finding("error", text, "give each recording its own name")
 
 
 def _unreadable(survey: Survey) -> Iterator[Finding]:
@@ -90,17 +90,17 @@ def _unreadable(survey: Survey) -> Iterator[Finding]:
     if unreadable:
         yield Finding("warning", f"{unreadable} frames cannot be read and are left out", "copy them again")
     if lost:
-        text = f"{lost} frames that videos claim to hold cannot be decoded and are left out"
+        text = f"{lost} frames that videos claim to have cannot be decoded and are left out"
         yield Finding("warning", text, "the end of a video is cut off or damaged: copy it again")
     broken = [each for each in survey.frames if each.problem and not each.of_camera]
     if broken:
-        text = f"{len(broken)} of {len(survey.frames)} frames cannot be read; the first: {broken[0].problem}"
+        text = f"{len(broken)} of {len(survey.frames)} frames cannot be read, first of all: {broken[0].problem}"
         yield Finding("error", text, f"copy them again, or {_USE_MANIFEST} or data.on_error=skip")
     damaged = [frame for frame in survey.frames if frame.damage]
     if damaged:
         first = damaged[0]
-        text = f"{len(damaged)} frames are damaged inside, such as {first.index} of '{first.drive}' ({first.damage})"
-        yield Finding("warning", text, "look at them, and copy them again if parts are gray or shifted")
+        text = f"{len(damaged)} frames are partly damaged, such as {first.index} of '{first.drive}' ({first.damage})"
+        yield Finding("warning", text, "check them, and copy them again if parts are gray or shifted")
 
 
 def _sizes(survey: Survey) -> Iterator[Finding]:
@@ -114,7 +114,7 @@ def _sizes(survey: Survey) -> Iterator[Finding]:
     if sizes:
         shapes = Counter(counts.most_common(1)[0][0] for counts in sizes.values())
         listed = ", ".join(f"{width}x{height} in {count}" for (height, width), count in shapes.most_common(4))
-        yield Finding("note", f"{len(survey.readable())} frames read of {len(sizes)} drives; sizes: {listed}")
+        yield Finding("note", f"{len(survey.readable())} frames read from {len(sizes)} drives; sizes: {listed}")
 
 
 def _cameras(survey: Survey) -> Iterator[Finding]:
@@ -130,20 +130,22 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
     looked, cameras = survey.focals
     if known:
         agree = sum(not each.estimate.contradicts(each.recorded) for each in known if each.estimate)
-        told = f"turns tell the focal length of {len(known)} of {len(survey.cameras)} drives"
+        told = f"the focal length was estimated from turns for {len(known)} of {len(survey.cameras)} drives"
         text = f"{told}, which agrees with K in {agree}"
         yield Finding("note", text)
     elif survey.cameras:
-        unknown = "no examined drive tells the focal length (turns do, through the lens as it is given)"
-        text = f"K was not checked, as {unknown}, and means a field of view of {view}"
+        unknown = (
+            "the focal length cannot be estimated from any examined drive (that needs turns, and the right lens model)"
+        )
+        text = f"K was not checked, because {unknown}; it means a field of view of {view}"
         if _USUAL_VIEW[0] <= low and high <= _USUAL_VIEW[1]:
             yield Finding("note", text, "is this your camera's?")
         else:
             fix = "give K in pixels of the image size it was calibrated for, or calibrate (saunet calibrate)"
             yield Finding("warning", f"{text}; car cameras usually have {_USUAL_VIEW[0]} to {_USUAL_VIEW[1]}", fix)
     if cameras > looked:
-        text = f"turns were looked for in the drives of {looked} of {cameras} different K"
-        yield Finding("note", text, "for another one: saunet calibrate video=DRIVE")
+        text = f"only the drives of {looked} of {cameras} different K were searched for turns"
+        yield Finding("note", text, "for another one, run saunet calibrate video=DRIVE")
     heights = {camera.height for camera in survey.cameras}
     if heights and None not in heights:
         listed = ", ".join(map(str, sorted({round(height or 0, 2) for height in heights})))
@@ -163,13 +165,13 @@ def _camera(camera: CameraFacts) -> Iterator[Finding]:
     if found is not None and found.contradicts(camera.recorded):
         given = camera.recorded * width
         text = (
-            f"'{camera.drive}': the given focal length, {given:.1f} pixels, contradicts the pictures: their turns say "
-            f"{found.focal * width:.1f}, {found.focal / camera.recorded:.2f} times the given one, known to "
-            f"{found.uncertainty:.1%} (both before any undistortion, as in camera.yaml)"
+            f"'{camera.drive}': the given focal length, {given:.1f} pixels, contradicts the pictures: their turns "
+            f"give {found.focal * width:.1f}, {found.focal / camera.recorded:.2f} times the given one, known to "
+            f"within {found.uncertainty:.1%} (both before any undistortion, as in camera.yaml)"
         )
         fix = (
-            "give the K and the distortion of this camera and this mode, calibrate (saunet calibrate with a board, or "
-            "video=DRIVE without), or leave it to the training with camera: unknown"
+            "give the K and the distortion of this camera in this mode, calibrate it (saunet calibrate with a "
+            "board, or video=DRIVE without), or let the training estimate it with camera: unknown"
         )
         yield Finding("error", text, fix)
     if not (0.35 < (cx + 0.5) / width < 0.65 and 0.2 < (cy + 0.5) / height < 0.8):
@@ -182,19 +184,19 @@ def _neighbors(survey: Survey) -> Iterator[Finding]:
         absent, listed = survey.absent[split]
         total, missing = survey.windows[split] + sum(reasons.values()), reasons.get(ABSENT, 0)
         if absent:
-            text = f"{absent} of {listed} recordings of the {split} split are not there"
-            fix = "add them, or choose a split of those that are there, such as data.split=all for KITTI"
+            text = f"{absent} of {listed} recordings of the {split} split are missing"
+            fix = "add them, or choose a split of the existing ones, such as data.split=all for KITTI"
             yield Finding("warning", f"{text}, with {missing} of its {total} frames", fix)
         total -= missing
         for reason, count in reasons.items():
             if reason in ("without neighbor", "missing") and count > max(10, 0.2 * total):
-                fix = "check that frame numbers are consecutive and that no frames were thinned out"
+                fix = "check that frame numbers are consecutive and that no frames were dropped"
                 yield Finding("warning", f"{count} of {total} {split} frames are left out, {reason}", fix)
 
 
 def _leak(survey: Survey) -> Iterator[Finding]:
     if survey.shared_frames:
-        text = f"{survey.shared_frames} frames are read by training and by validation samples"
+        text = f"{survey.shared_frames} frames are used by both training and validation samples"
         fix = "hold out whole drives or clips (data.val_drives, data.val_clips) for an honest validation"
         yield Finding("warning", text, fix)
     elif survey.overlap:
@@ -205,7 +207,9 @@ def _parallax(survey: Survey) -> Iterator[Finding]:
     flows = np.array([frame.flow for frame in survey.compared() if (frame.flow or 0) >= MIN_FLOW])
     if not flows.size:
         if survey.compared():
-            yield Finding("error", "nothing moves in any frame that was read", "is this a recording of a drive?")
+            yield Finding(
+                "error", "nothing moves in any frame that was read", "check whether this is a recording of a drive"
+            )
         return
     low, middle, high = np.quantile(flows, [0.05, 0.5, 0.95])
     rates = sorted({round(camera.fps, 2) for camera in survey.cameras if camera.fps})
@@ -217,10 +221,10 @@ def _parallax(survey: Survey) -> Iterator[Finding]:
     )
     if middle < 1.5:
         wider = max(2, round(survey.step * 4 / middle))
-        text = f"the picture moves by {middle:.1f} px a step, too little to tell depths apart"
+        text = f"the picture moves by {middle:.1f} px per step, too little to tell depths apart"
         yield Finding("warning", text, f"use data.offsets=[-{wider},{wider}] or a lower frame rate")
     elif middle > 25:
-        text = f"the picture moves by {middle:.0f} px a step, so that neighbors hardly overlap"
+        text = f"the picture moves by {middle:.0f} px per step, so neighbors hardly overlap"
         yield Finding("warning", text, "use more frames per second or smaller data.offsets")
 
 
@@ -232,7 +236,7 @@ def _times(survey: Survey) -> Iterator[Finding]:
         count = f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''} in time"
         where = f"in {len({drive for *_, drive in gaps})} of {len(lines)} recordings"
         text = f"{count} {where}, the longest {longest:.2f} s long, after {start:.2f} s of '{drive}'"
-        yield Finding("note", text, "no sample reaches across")
+        yield Finding("note", text, "no sample spans a gap")
     stamps = [line.drive for line in lines if (np.diff(line.times) <= 0).any()]
     if stamps:
         text = f"time stamps repeat or go back in {len(stamps)} of {len(lines)} recordings, such as '{stamps[0]}'"
@@ -241,7 +245,7 @@ def _times(survey: Survey) -> Iterator[Finding]:
     if uneven:
         line, (low, _, high) = uneven[0]
         text = f"the frame rate varies in {len(uneven)} of {len(lines)} recordings, such as '{line.drive}'"
-        fix = "data.fps (video) takes frames at equal steps of time"
+        fix = "data.fps (video) uses frames at equal time steps"
         yield Finding("note", f"{text} ({low:.3g} to {high:.3g} frames per second)", fix)
     unknown = [line.drive for line in lines if not line.times.size]
     if unknown and len(unknown) < len(lines):
@@ -252,15 +256,18 @@ def _times(survey: Survey) -> Iterator[Finding]:
 def _cuts(survey: Survey) -> Iterator[Finding]:
     split = max((reasons.get("split at cuts", 0) for reasons in survey.left_out.values()), default=0)
     if split:
-        text = f"places where the picture changes altogether (cuts, loops, recordings in one folder): {split}"
-        yield Finding("note", text, "clips are split there, so no sample reaches across")
+        text = f"positions where the picture changes completely (cuts, loops, recordings in one folder): {split}"
+        yield Finding("note", text, "clips are split there, so no sample spans a cut")
     usual = float(np.median([frame.change or 0 for frame in survey.compared()] or [0]))
     apart = [frame for frame in survey.compared() if (frame.change or 0) >= max(CUT, PEAK * usual)]
     if apart:
         text = (
             f"frames that hardly resemble their neighbor: {len(apart)}, such as {apart[0].index} of '{apart[0].drive}'"
         )
-        fix = "if there is a cut, or recordings share a folder, put each into its own; a fast turn can look so too"
+        fix = (
+            "if there is a cut, or recordings share a folder, give each its own folder; a fast turn can look like "
+            "this too"
+        )
         yield Finding("warning", text, fix)
 
 
@@ -268,7 +275,7 @@ def _doubled(survey: Survey) -> Iterator[Finding]:
     compared = survey.compared()
     doubled = sum(map(is_doubled, compared))
     if doubled > 0.02 * len(compared):
-        text = f"{doubled} of {len(compared)} frames are the same picture as their neighbor"
+        text = f"{doubled} of {len(compared)} frames are identical to their neighbor"
         fix = "the video's frame rate was raised: use the original, or data=video, which drops doubled frames"
         yield Finding("warning", text, fix)
 
@@ -277,12 +284,12 @@ def _static(survey: Survey) -> Iterator[Finding]:
     compared = survey.compared()
     still = sum((frame.flow or 0) < MIN_FLOW for frame in compared)
     if still > 0.05 * len(compared):
-        text = f"{still} of {len(compared)} frames show no motion; they teach nothing"
+        text = f"{still} of {len(compared)} frames show no motion, so nothing can be learned from them"
         yield Finding("warning", text, f"{_USE_MANIFEST}, or data.static=flow (kitti) or drop (video)")
 
 
 def band_profile(survey: Survey) -> np.ndarray | None:
-    """Return the motion of each band over the whole image's, one number a band, top to bottom; None with few frames."""
+    """Return each band's motion relative to the whole image's, from top to bottom; None with few frames."""
     rows = [f.bands / f.flow for f in survey.compared() if f.bands is not None and f.flow is not None and f.flow > 1]
     return np.median(rows, axis=0) if len(rows) >= 5 else None
 
@@ -293,7 +300,7 @@ def _bonnet(survey: Survey) -> Iterator[Finding]:
         return
     share = int(np.argmin(profile[::-1] < _STILL_BAND)) / BANDS
     if share:
-        text = f"the lowest {share:.0%} of the picture do not move: the car's bonnet, a dashboard or an imprint"
+        text = f"the lowest {share:.0%} of the picture does not move: the car's hood, a dashboard or an overlay"
         yield Finding("warning", text, f"cut it off with data.crop=[0,{share:.2f},0,0] (video), or crop in camera.yaml")
 
 
@@ -325,7 +332,7 @@ def _truth(survey: Survey) -> Iterator[Finding]:
     known = float(np.mean([truth.known for truth in truths]))
     low, high = min(truth.low for truth in truths), max(truth.high for truth in truths)
     middle = float(np.median([truth.middle for truth in truths]))
-    text = f"ground truth in {len(truths)} of {survey.truth_wanted} frames asked: {known:.1%} of the pixels"
+    text = f"ground truth in {len(truths)} of {survey.truth_wanted} checked frames: {known:.1%} of the pixels"
     yield Finding("note", f"{text}, {low:.1f} to {high:.1f} m, median {middle:.1f} m")
     if high > 1000 or not 1 <= middle <= 100:
         text = f"depths have a median of {middle:.1f} m and reach {high:.0f} m"
@@ -335,29 +342,29 @@ def _truth(survey: Survey) -> Iterator[Finding]:
 def _speed(survey: Survey) -> Iterator[Finding]:
     frames = survey.readable()
     seconds = float(np.median([frame.seconds for frame in frames])) if frames else 0.0
-    if seconds < 2e-5:  # nothing, or kept in memory
+    if seconds < 2e-5:  # no files, or kept in memory
         return
     sized = [frame for frame in frames if frame.file_bytes]
     rate = sum(f.file_bytes or 0 for f in sized) / max(1e-9, sum(f.seconds for f in sized)) / 1e6
     disk = f", {rate:.0f} MB/s" if sized else ""
-    text = f"reading and decoding takes {1000 * seconds:.1f} ms an image{disk}: {1 / seconds:.0f}/s a core"
+    text = f"reading and decoding takes {1000 * seconds:.1f} ms per image{disk}: {1 / seconds:.0f}/s per core"
     yield Finding("note", text)
     if seconds > 0.05:
         cache = "make a cache of small images once (saunet prepare cache), " if survey.cacheable else ""
         step = f"a training step of {survey.samples} samples needs {survey.samples * survey.images} images"
-        text = f"a core reads {1 / seconds:.0f} images per second; {step}"
+        text = f"one core reads {1 / seconds:.0f} images per second; {step}"
         yield Finding("warning", text, f"{cache}use more data.workers or a faster disk")
 
 
 def manifest_of(survey: Survey, findings: Sequence[Finding], path: str | Path) -> Manifest:
-    """Return what ``data.manifest=`` reads: each frame that was read and is of no use, under the first reason."""
+    """Return the manifest for ``data.manifest=``: each frame that was read and is useless, under its first reason."""
     leave_out: dict[str, dict[str, list[int]]] = {}
     for frame in survey.frames:
         reason = _reason(frame)
         if reason and frame.drive in survey.numbering:
             leave_out.setdefault(frame.drive, {}).setdefault(reason, []).append(frame.index)
     facts: dict[str, Any] = {
-        "read": f"{survey.judged} of {survey.known} frames read; only these are judged",
+        "read": f"{survey.judged} of {survey.known} frames read; only these were checked",
         "splits": {
             split: {"samples": count, "left_out": survey.left_out[split], "sha256": survey.fingerprints[split]}
             for split, count in survey.windows.items()

@@ -1,4 +1,4 @@
-"""The doctor's findings as one picture: frames, how much they move and how bright they are, and what was found."""
+"""The doctor's findings as one picture: frames, their motion and brightness, and the findings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _INK, _GRID, _BAR, _RED = (40, 40, 40), (210, 210, 210), (70, 130, 180), (190, 3
 _ORANGE, _WHITE = (190, 110, 0), (255, 255, 255)
 _COLORS = {"error": _RED, "warning": _ORANGE, "note": (60, 60, 60)}
 _TIMELINES = 16
-"""Recordings whose timeline is drawn."""
+"""Largest number of timelines."""
 _Picture = NDArray[np.uint8]
 
 
@@ -92,7 +92,7 @@ def _write(
     size: float = 0.42,
     thickness: int = 1,
 ) -> None:
-    ascii_only = text.encode("ascii", "replace").decode()  # what OpenCV's font can draw
+    ascii_only = text.encode("ascii", "replace").decode()  # characters that OpenCV's font can draw
     cv2.putText(picture, ascii_only, at, cv2.FONT_HERSHEY_SIMPLEX, size, color, thickness, cv2.LINE_AA)
 
 
@@ -115,7 +115,7 @@ def _histogram(values: NDArray[np.float64], low: float, high: float, title: str)
 
 
 def _profile(profile: NDArray[np.float64] | None) -> _Picture:
-    """Draw the motion of the image's bands as bars from the left, the top of the image on top."""
+    """Draw the motion of the image's bands as horizontal bars, from the top of the image down."""
     chart, (left, top, right, bottom) = _axes("motion by height in the image (top to bottom)", "still", "moves most")
     if profile is None:
         _write(chart, "not measured", (20, 60), size=0.45)
@@ -129,7 +129,7 @@ def _profile(profile: NDArray[np.float64] | None) -> _Picture:
 
 
 def _timelines(survey: Survey) -> list[_Picture]:
-    """Draw recordings as bars over their time, as high as the rate is; those with gaps and duplicates come first."""
+    """Draw recordings as bars over time, with the frame rate as height; those with gaps and duplicates come first."""
     lines = sorted(
         (line for line in survey.timelines if line.rates), key=lambda each: -len(each.gaps + each.duplicates)
     )

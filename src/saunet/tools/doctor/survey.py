@@ -1,4 +1,4 @@
-"""What a data set holds, measured: frames, motion, light, cameras, ground truth, and how fast it is read."""
+"""Measurements of a data set: frames, motion, light, cameras, ground truth, and reading speed."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from saunet.errors import CameraError, DataError, SaunetError
 
 SPLITS = ("train", "val", "test")
 ABSENT = "in absent recordings"
-"""The reason under which the frames of recordings without any frame are counted, apart from gaps in others."""
+"""Reason for counting the frames of recordings without any frame, separate from gaps in others."""
 BANDS = 32
-"""Horizontal bands of the image for which motion is told apart."""
+"""Number of horizontal bands of the image with separate motion."""
 _TRUTHS = 16
-"""Ground-truth maps that are looked at."""
+"""Number of ground-truth maps to examine."""
 _PICTURES = 8
 _FOCALS = 3
-"""Cameras whose focal length is estimated."""
+"""Number of cameras whose focal length is estimated."""
 FOCAL_SECONDS = 20.0
-"""Processor time for that, all of them together; three windows of each are looked at all the same."""
+"""Processor time for all of these, in seconds; at least three windows of each are examined anyway."""
 
 
 @dataclass(frozen=True)
@@ -48,24 +48,24 @@ class FrameFacts:
     size: tuple[int, int] = (0, 0)
     """(height, width)."""
     seconds: float = 0.0
-    """To read and decode it."""
+    """Seconds to read and decode it."""
     file_bytes: int | None = None
     brightness: float = 0.0
-    """Mean, 0 to 1."""
+    """Mean brightness, 0 to 1."""
     contrast: float = 0.0
-    """Standard deviation, 0 to 1."""
+    """Contrast (standard deviation), 0 to 1."""
     flow: float | None = None
     """Median motion against a neighbor, pixels at 320 width; None without a neighbor."""
     change: float | None = None
-    """Mean difference to the neighbor over the picture's standard deviation."""
+    """Mean difference from the neighbor, relative to the picture's standard deviation."""
     bands: NDArray[np.float64] | None = None
     """Mean motion of each horizontal band, from top to bottom."""
     problem: str | None = None
-    """Why it cannot be read."""
+    """Why it cannot be read; None if it can."""
     of_camera: bool = False
-    """Whether that lies in the camera, which is said once for all frames."""
+    """Whether the camera is the cause, which is reported once for all frames."""
     damage: str | None = None
-    """What its decoder made up for, where it says so."""
+    """Damage that its decoder hid, if reported."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,9 @@ class CameraFacts:
     height: float | None
     """Meters above the road."""
     recorded: float = 0.0
-    """The given focal length, in widths of the pictures before they are undistorted."""
+    """The given focal length, in widths of the pictures before undistortion."""
     estimate: FocalEstimate | None = None
-    """The one that those pictures tell; None if it was not looked for or nothing tells it."""
+    """The focal length estimated from those pictures; None if it was not, or could not be, estimated."""
 
     @property
     def view(self) -> float:
@@ -91,18 +91,18 @@ class CameraFacts:
 
 @dataclass(frozen=True)
 class Timeline:
-    """When the frames of one recording were taken; seconds count from the first."""
+    """Times of one recording's frames, in seconds from the first."""
 
     drive: str
     frames: int
     times: NDArray[np.float64]
-    """Of each frame; empty if unknown."""
+    """Time of each frame; empty if unknown."""
     gaps: tuple[tuple[float, float], ...] = ()
-    """Between which times frames are missing."""
+    """Pairs of times between which frames are missing."""
     duplicates: tuple[float, ...] = ()
-    """Times of frames that repeat the picture or the time stamp before them."""
+    """Times of frames that repeat the previous picture or time stamp."""
     recorded: float | None = None
-    """Frames per second of the file, of which only some may be used."""
+    """Frames per second of the file; only some frames may be used."""
 
     @property
     def rates(self) -> tuple[float, float, float] | None:
@@ -120,7 +120,7 @@ class TruthFacts:
     """One ground-truth map that was read."""
 
     known: float
-    """Fraction of the pixels."""
+    """Fraction of the pixels with depth."""
     low: float
     middle: float
     high: float
@@ -129,51 +129,51 @@ class TruthFacts:
 
 @dataclass
 class Survey:
-    """Everything that was measured."""
+    """All measurements."""
 
     problems: dict[str, SaunetError] = field(default_factory=dict)
     """Split -> why it cannot be used."""
     windows: dict[str, int] = field(default_factory=dict)
     left_out: dict[str, dict[str, int]] = field(default_factory=dict)
-    """Split -> reason -> frames."""
+    """Split -> reason -> number of frames."""
     absent: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Split -> recordings that it lists and that have no frame at all, and all that it lists."""
+    """Split -> number of its recordings without any frame, and of all its recordings."""
     test_only: frozenset[str] = frozenset()
     """Recordings that neither training nor validation read."""
     fingerprints: dict[str, str] = field(default_factory=dict)
     overlap: str | None = None
-    """Which splits share recordings, in a sentence."""
+    """A sentence about splits that share recordings."""
     shared_frames: int = 0
-    """Frames that training and validation windows both read."""
+    """Number of frames in both training and validation windows."""
     known: int = 0
-    """Frames that any split reads."""
+    """Number of frames that any split reads."""
     judged: int = 0
-    """Of them, those that were asked for."""
+    """Number of these that were to be read."""
     frames: list[FrameFacts] = field(default_factory=list)
     cameras: list[CameraFacts] = field(default_factory=list)
     focals: tuple[int, int] = 0, 0
-    """How many cameras (of one K each) were looked at for their focal length, and how many there are."""
+    """Number of cameras (with one K each) whose focal length was examined, and of all cameras."""
     camera_problems: list[str] = field(default_factory=list)
     timelines: list[Timeline] = field(default_factory=list)
     truths: list[TruthFacts] = field(default_factory=list)
     truth_wanted: int = 0
-    """Frames whose ground truth was asked for."""
+    """Number of frames whose ground truth was requested."""
     protocol: str = ""
     """The data set's own evaluation protocol."""
     pictures: list[tuple[str, NDArray[np.uint8]]] = field(default_factory=list)
-    """A few frames with their names, 320 wide."""
+    """A few frames with their names, 320 pixels wide."""
     numbering: dict[str, str] = field(default_factory=dict)
-    """Recording -> how its frames are numbered; without those of ambiguous names."""
+    """Recording -> the numbering of its frames; without ambiguous names."""
     ambiguous: list[str] = field(default_factory=list)
     """Names that different recordings share."""
     step: int = 1
     """Offset of the neighbor that motion is measured against."""
     samples: int = 12
-    """In a training step, over all devices."""
+    """Samples per training step, over all devices."""
     images: int = 3
-    """In a sample: the target and its sources."""
+    """Images per sample: the target and its sources."""
     cacheable: bool = False
-    """Whether the data module could read a cache of smaller images and does not."""
+    """Whether the data module could read a cache of smaller images but does not."""
 
     def readable(self) -> list[FrameFacts]:
         return [frame for frame in self.frames if frame.problem is None]
@@ -189,7 +189,7 @@ def survey(
     frames: int = 1000,
     advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> Survey:
-    """Set a data module's splits up, and read ``frames`` frames at most (0: all) of all recordings, evenly spread."""
+    """Set up a data module's splits, and read at most ``frames`` frames (0: all) of all recordings, evenly spread."""
     cacheable = data.cacheable and data.copies is None
     found = Survey(
         step=min((abs(offset) for offset in data.offsets), default=1),
@@ -253,7 +253,7 @@ def _set_up(data: DepthDataModule, splits: Sequence[str], found: Survey) -> Iter
 
 
 def _label(drive: Drive, split: str, drives: Mapping[str, Drive]) -> str:
-    """Return a recording's name; with the split behind it if another recording is called so."""
+    """Return a recording's name, followed by the split if another recording has the same name."""
     known = drives.get(drive.name)
     if known is None or not known.indices:
         return drive.name
@@ -289,7 +289,7 @@ def _read_frames(
         if last is not None and last[0] == (name, neighbor):
             before = last[1]
         elif neighbor in existing[name]:
-            with suppress(DataError):  # it is reported when its own turn comes
+            with suppress(DataError):  # reported in its own turn
                 before = shrink(drive.image(neighbor))
         complaints: list[str] = []
         try:
@@ -320,7 +320,7 @@ def _read_frames(
 
 @contextmanager
 def _complaints(found: list[str]) -> Iterator[None]:
-    """Collect what libjpeg says on standard error of data that it makes up for, as OpenCV does not pass it on."""
+    """Collect libjpeg's messages about damaged data from standard error, because OpenCV does not pass them on."""
     kept = os.dup(2)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), 2)
@@ -361,7 +361,7 @@ def _look_at_camera(found: Survey, name: str, drive: Drive, index: int) -> None:
         K = np.asarray(drive.intrinsics(index), dtype=np.float64)
     except DataError as error:
         broken = any(frame.drive == name and frame.problem and not frame.of_camera for frame in found.frames)
-        if isinstance(error, CameraError) or not broken:  # else its size could not be read: the frames say why
+        if isinstance(error, CameraError) or not broken:  # otherwise its size could not be read: the frames say why
             found.camera_problems.append(str(error))
         return
     if sizes:
@@ -372,7 +372,7 @@ def _look_at_camera(found: Survey, name: str, drive: Drive, index: int) -> None:
 
 
 def _estimate_focal(found: Survey, drives: Mapping[str, Drive], frames: int) -> None:
-    """Look at a few seconds of each camera, if many frames may be read; the ones that turn most tell the most."""
+    """Examine a few seconds of each camera if many frames may be read; those with the strongest turns tell the most."""
     groups: dict[bytes, list[int]] = {}
     for place, camera in enumerate(found.cameras):
         groups.setdefault(camera.K.tobytes(), []).append(place)

@@ -1,4 +1,4 @@
-"""The doctor: look at a data set before hours of training; findings, a sheet of pictures and a manifest."""
+"""The doctor: check a data set before hours of training; findings, a sheet of pictures and a manifest."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from saunet.tools.doctor.survey import SPLITS, Survey, survey
 @checked
 @dataclass(frozen=True, kw_only=True)
 class DoctorOptions:
-    """What `doctor` looks at, and where it writes.
+    """Options of `doctor`: what it checks, and where it writes.
 
     Raises:
-        ConfigError: for an unknown split, none, or a negative number of frames.
+        ConfigError: for no or an unknown split, or a negative number of frames.
 
     Examples:
         >>> options = saunet.DoctorOptions(data=saunet.Spec.of("data", "synthetic"), output_dir="look")
@@ -36,13 +36,13 @@ class DoctorOptions:
     """
 
     data: Spec
-    """The data module, with the settings of the training to come."""
+    """The data module, with the settings of the planned training."""
     output_dir: str | Path | None = None
-    """Folder for ``doctor.png`` and ``manifest.json``; None, as in Python, writes none."""
+    """Folder for ``doctor.png`` and ``manifest.json``; None, the default in Python, writes none."""
     splits: Sequence[str] = SPLITS
-    """Which of ``train``, ``val`` and ``test``."""
+    """Splits to check, out of ``train``, ``val`` and ``test``."""
     frames: int = 1000
-    """Frames to read at most, evenly spread; 0 reads all."""
+    """Largest number of frames to read, evenly spread; 0 reads all."""
 
     def __post_init__(self) -> None:
         if not self.splits:
@@ -54,22 +54,22 @@ class DoctorOptions:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What `doctor` found; ``print`` shows the findings and what to do about them, a notebook the pictures too."""
+    """The result of `doctor`; ``print`` shows the findings and what to do about them, a notebook also the pictures."""
 
     survey: Survey
-    """Everything that was measured."""
+    """All measurements."""
     findings: Sequence[Finding]
-    """What is wrong or noteworthy, errors first."""
+    """The findings, errors first."""
     manifest: Manifest
-    """Frames that a training should leave out, as written to ``manifest.json``."""
+    """Frames that a training should leave out, as in ``manifest.json``."""
     picture: UInt8[np.ndarray, "_ _ 3"] = field(repr=False)
     """Frames, charts and findings on one sheet, RGB."""
     sheet: Path | None = None
-    """Its file."""
+    """The file of the sheet."""
 
     @property
     def usable(self) -> bool:
-        """Whether there is no error among the findings."""
+        """Whether the findings have no error."""
         return all(finding.level != "error" for finding in self.findings)
 
     @property
@@ -82,9 +82,9 @@ class Diagnosis:
         lines = [*map(str, self.findings), *([f"pictures: {self.sheet}"] if self.sheet else [])]
         if found.judged and self.sheet:
             left_out = sum(len(frames) for reasons in self.manifest.leave_out.values() for frames in reasons.values())
-            judged = "all" if found.judged == found.known else f"{found.judged} of {found.known}; frames=0 judges all"
+            judged = "all" if found.judged == found.known else f"{found.judged} of {found.known}; frames=0 checks all"
             frames = "1 frame" if left_out == 1 else f"{left_out} frames"
-            lines.append(f"manifest: {path} names {frames} to leave out (judged: {judged})")
+            lines.append(f"manifest: {path} lists {frames} to leave out (checked: {judged})")
             if self.usable and left_out:
                 lines.append(f"train with data.manifest={path}")
         return "\n".join(lines)
@@ -94,14 +94,14 @@ class Diagnosis:
 
 
 def doctor(options: DoctorOptions, *, advance: Callable[[int, int], None] | None = None) -> Diagnosis:
-    """Read frames of a data set, judge them, and write ``doctor.png`` and ``manifest.json``.
+    """Read and check frames of a data set, and write ``doctor.png`` and ``manifest.json``.
 
     Args:
-        options: What to look at, and where to write.
+        options: What to check, and where to write.
         advance: Called with the number of frames read and their total; a progress bar if None.
 
     Returns:
-        The findings; what is broken in the data is a finding, not an exception.
+        The findings; broken data are findings, not exceptions.
 
     Raises:
         ConfigError: if the data module cannot be built.
@@ -131,18 +131,18 @@ def doctor(options: DoctorOptions, *, advance: Callable[[int, int], None] | None
 
 
 def inspect(data: str | Path | Spec, *, frames: int = 200, **settings: Any) -> Diagnosis:
-    """Look at a data set: frames, how much they move, the camera, and what is wrong; nothing is written.
+    """Check a data set: frames, their motion, the camera, and problems; nothing is written.
 
     Args:
         data: A folder of clips or a video, a data module's name (one of ``available("data")``), or its `Spec`.
-        frames: Frames to read at most, evenly spread; 0 reads all.
+        frames: Largest number of frames to read, evenly spread; 0 reads all.
         **settings: Parameters of the data module, such as ``root="/data/kitti"``.
 
     Returns:
         The findings; a notebook shows them with pictures.
 
     Raises:
-        ConfigError: for a path that is not there, or parameters that do not fit the data module.
+        ConfigError: for a path that does not exist, or parameters that do not fit the data module.
 
     Examples:
         >>> found = saunet.inspect("synthetic_tiny", frames=4)

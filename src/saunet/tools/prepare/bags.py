@@ -1,7 +1,7 @@
 """Bags of ROS 1 and 2 and MCAP files as clips: pictures named by their time stamps, the camera, and speeds.
 
-Messages are read once, in order, one at a time. A picture's file appears when it is whole and is not made again, so an
-interrupted import resumes.
+Messages are read once, in order, one at a time. A picture's file appears only when complete and is not made again, so
+an interrupted import resumes.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
     "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
 }
-"""Encoding of a raw image -> bytes a pixel, and OpenCV's conversion to RGB."""
+"""Encoding of a raw image -> bytes per pixel, and OpenCV's conversion to RGB."""
 _NOT_COLOR = ("16UC1", "32FC1", "mono16")
-"""Encodings of depth and the like: such topics are no clips."""
+"""Encodings of depth and the like; such topics are not clips."""
 _NO_CLIP = "not color images"
 
 
@@ -82,7 +82,7 @@ class Bag:
         except ModuleNotFoundError as reason:
             raise ConfigError("bags are read with rosbags; install it: pip install 'saunet[bags]'") from reason
         self.path, self.folder, self.wanted, self.on_error, self.failures = path, folder, topics, on_error, failures
-        store = get_typestore(Stores.ROS2_HUMBLE)  # for bags of that time, which do not define their messages
+        store = get_typestore(Stores.ROS2_HUMBLE)  # for older bags, which do not define their messages
         self._reader: Any = _read(path, lambda: AnyReader([path], default_typestore=store))
 
     def clips(self) -> list[BagClip]:
@@ -164,7 +164,7 @@ class Bag:
             yield each
 
     def _keep(self, clip: BagClip, stamp: int, message: Any) -> None:
-        """Write a picture, unless it is there; before the first, note down which bag the folder is of."""
+        """Write a picture unless it exists; before the first, record which bag the folder belongs to."""
         name = str(stamp) if stamp >= 10**18 else f"{stamp // 10**9}.{stamp % 10**9:09d}"
         if name in clip.names:
             return
@@ -185,7 +185,7 @@ class Bag:
         if not clip.names:
             clip.about.append("no frame that can be read" if clip.failed else _NO_CLIP)
             if not clip.failed:
-                write_json(clip.home / RECORD, {**clip.state, "frames": 0})  # so that it is not read again
+                write_json(clip.home / RECORD, {**clip.state, "frames": 0})  # so it is not read again
             return
         space = clip.topic.removesuffix("/compressed").rpartition("/")[0]
         name = next((each for each in infos if each.rpartition("/")[0] == space), None)
@@ -203,22 +203,22 @@ class Bag:
 
 
 def _read(path: Path, action: Callable[[], Any]) -> Any:
-    """Do what reads a bag; whatever a damaged one raises inside of the library is one sentence."""
+    """Turn any exception from inside the library, raised for a damaged bag, into one sentence."""
     try:
         return action()
     except Exception as reason:
         text = str(reason).splitlines()[0][:150] if str(reason) else type(reason).__name__
-        raise DataError(f"{path} is a bag that cannot be read on ({text}); copy it again, or reindex it") from reason
+        raise DataError(f"reading the bag {path} failed ({text}); copy it again, or reindex it") from reason
 
 
 def _stamp(message: Any, received: int) -> int:
-    """Return when a message's content was measured, in ns; when it was recorded if it does not say."""
+    """Return the time of a message's measurement in ns; if it has none, the time of its recording."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec) or received
 
 
 def _picture(message: Any, name: str) -> tuple[bytes, str]:
-    """Return an image message as a file's bytes and suffix; compressed ones as they are, depth maps as nothing."""
+    """Return an image message as a file's bytes and suffix: compressed ones unchanged, None for depth maps."""
     if hasattr(message, "format"):
         data = bytes(message.data)
         for magic, suffix in ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n\x1a\n", ".png")):
@@ -230,7 +230,7 @@ def _picture(message: Any, name: str) -> tuple[bytes, str]:
 
 
 def rgb_of(message: Any, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Return the RGB picture of a raw image message of ROS 1 or 2; None of a depth map. ``name`` is the topic's."""
+    """Return the RGB picture of a raw image message of ROS 1 or 2; None for a depth map. ``name`` is the topic's."""
     encoding, height, width = message.encoding, int(message.height), int(message.width)
     if encoding in _NOT_COLOR:
         return None
@@ -276,7 +276,7 @@ _SPEEDS: dict[str, tuple[int, str, Callable[[Any], tuple[float, ...]]]] = {
     "nav_msgs/msg/Odometry": (1, "odometry", _odometry),
     "sensor_msgs/msg/NavSatFix": (2, "positions", _fix),
 }
-"""Kind of message -> which goes first, what it is, and its numbers."""
+"""Kind of message -> its priority, its description, and its numbers."""
 
 
 def _speed_of(found: dict[tuple[int, str], Rows]) -> tuple[str, Rows] | None:
@@ -297,14 +297,14 @@ def _speed_of(found: dict[tuple[int, str], Rows]) -> tuple[str, Rows] | None:
 
 
 def _differences(times: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return speeds by differences of places over a second around each time."""
+    """Return speeds from differences of positions over a second around each time."""
     low, high = np.maximum(times - 0.5, times[0]), np.minimum(times + 0.5, times[-1])
     steps = [np.interp(high, times, each) - np.interp(low, times, each) for each in places.T]
     return np.asarray(np.linalg.norm(steps, axis=0) / (high - low))
 
 
 def _local(fixes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return meters north, east and up from latitudes, longitudes (degrees) and heights, by WGS 84's radii there."""
+    """Return meters north, east and up from latitudes, longitudes (degrees) and heights, with WGS 84's local radii."""
     squared, sine = 6.69437999014e-3, np.sin(np.radians(fixes[0, 0]))
     east = 6378137.0 / np.sqrt(1 - squared * sine**2)
     north = east * (1 - squared) / (1 - squared * sine**2)

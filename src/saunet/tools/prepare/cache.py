@@ -1,8 +1,8 @@
-"""Smaller copies of recordings, made once, so that training does not decode full images again and again.
+"""Smaller copies of recordings, made once, so that training need not decode full images again and again.
 
-Whatever happens, the folder is a part of the finished cache: each copy appears when it is whole, a recording's list of
-hashes when all its copies are there. Run again, it checks what is there against the lists and makes the rest, and those
-copies anew whose originals have changed.
+At any time, the folder is a valid part of the finished cache: each copy appears only when complete, and a recording's
+list of hashes when all its copies exist. When run again, it checks existing copies against the lists, makes the missing
+ones, and replaces those whose originals have changed.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ Entry = tuple[int, str, tuple[int, int], list[int] | None]
 
 @dataclass(frozen=True, slots=True)
 class CacheReport:
-    """What `build_cache` did."""
+    """The result of `build_cache`."""
 
     made: int
     """Copies written now."""
     verified: int
-    """Copies that were there and are whole."""
+    """Existing copies that are intact."""
     replaced: int
-    """Of those written now: copies that were there and damaged, or made from an original that has changed."""
+    """Copies written now to replace damaged ones, or ones whose original has changed."""
     failures: tuple[str, ...]
     """One sentence for each frame that was skipped because its original is broken."""
     folder: Path
 
     def __str__(self) -> str:
-        again = f"{self.replaced} in place of damaged or outdated ones"
+        again = f"{self.replaced} to replace damaged or outdated ones"
         return f"{self.made} copies made ({again}), {self.verified} verified: {self.folder}"
 
 
@@ -60,7 +60,7 @@ def encode(image: np.ndarray, settings: CacheSettings) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class _Copy:
-    """Makes the copy of one frame, or keeps the one that is there if it is whole."""
+    """Makes the copy of one frame, or keeps the existing one if it is intact."""
 
     drives: tuple[Drive, ...]
     cache: ImageCache
@@ -85,10 +85,10 @@ class _Copy:
 
 
 def _state(drive: Drive, frame: int) -> list[int] | None:
-    """Return bytes and time of change (ns) of a frame's original file; None where there is none to ask."""
+    """Return the size in bytes and modification time (ns) of a frame's original file; None if it has none."""
     try:
         found = path.stat() if (path := drive.path(frame)) else None
-    except OSError:  # reading it says what is wrong
+    except OSError:  # reading it reports the error
         return None
     return [found.st_size, found.st_mtime_ns] if found else None
 
@@ -128,7 +128,7 @@ def build_cache(
 
 
 def _open(folder: Path, settings: CacheSettings) -> ImageCache:
-    """Claim a folder for a cache of these settings, or take up the one that is there."""
+    """Start a cache with these settings in a folder, or continue an existing one."""
     path = folder / SETTINGS
     remove_partial_files(folder, ".*.partial*")
     if not path.is_file():
@@ -139,20 +139,22 @@ def _open(folder: Path, settings: CacheSettings) -> ImageCache:
     there = cache.settings.plain()
     is_now = ", ".join(f"{key}={there[key]}" for key, value in settings.plain().items() if there[key] != value)
     if is_now:
-        raise DataError(f"the cache at {folder} was made with {is_now}; use the same, or set folder to a new one")
+        raise DataError(
+            f"the cache at {folder} was made with {is_now}; use the same settings, or set folder to a new one"
+        )
     return cache
 
 
 def _finish(home: Path, drive: Drive, known: dict[str, Any], entries: dict[int, Entry]) -> None:
-    """Write the list of a recording's copies; those of other runs stay in it."""
+    """Write the list of a recording's copies, keeping those of other runs."""
     sizes = {size: f"frame {frame}" for frame, (_, _, size, _) in entries.items()}
     if known:
         sizes.setdefault((known["native"][0], known["native"][1]), "those before")
     if len(sizes) > 1:  # of a recording that does not know its size by itself
         examples = " and ".join(f"{h}x{w} ({sizes[h, w]})" for h, w in sorted(sizes))
         raise DataError(
-            f"frames of '{drive.name}' have different sizes: {examples} (height x width); "
-            "a cache needs one size a recording"
+            f"frames of '{drive.name}' have different sizes: {examples} (height x width); a cache needs one size per "
+            "recording"
         )
     frames, originals = dict(known.get("frames", {})), dict(known.get("originals", {}))
     frames |= {f"{frame:010d}": [count, digest] for frame, (count, digest, _, _) in entries.items()}

@@ -1,7 +1,7 @@
-"""Depth for every pixel by colorization: depth spreads where neighbors look alike (Levin et al. 2004).
+"""Depth for every pixel by colorization: depth spreads between similar neighbors (Levin et al. 2004).
 
-The weights are those of the NYU toolbox's ``fill_depth_colorization``. The equations are solved directly, in 32-bit
-numbers, and the rounding is then taken out with residuals in 64 bits.
+The weights are those of the NYU toolbox's ``fill_depth_colorization``. The equations are solved directly in 32-bit
+numbers, and rounding is then removed with 64-bit residuals.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from saunet.errors import DataError
 from saunet.tools.prepare.sparse_solver import NEIGHBORS, StencilSolver, apply_stencil
 
 TOLERANCE = 1e-5
-"""Estimated error, relative to the pixel's own value, at which a solution counts as reached."""
+"""Estimated error, relative to the pixel's own value, at which a solution is accepted."""
 _ROUNDS = 5
 
 

@@ -1,4 +1,4 @@
-"""GoPro videos as clips: speed and position by the camera's satellite receiver, from the data track of the video.
+"""GoPro videos as clips: speed and position from the camera's GPS receiver, stored in the video's data track.
 
 The track's format is GPMF (github.com/gopro/gpmf-parser): elements of key, type, size, count and data, nested. A packet
 holds about a second; its samples are evenly spread over it. Packets are read one at a time.
@@ -22,10 +22,10 @@ from saunet.io.speeds import write_speeds
 from saunet.io.video import VideoReader
 
 RECORD = "import.json"
-"""In each clip: what it was imported from."""
+"""File in each clip that records what it was imported from."""
 _TRACK = "GoPro MET"
 _MOST_DOP = 5.0
-"""Dilution of precision above which a position is not used; GoPro calls those under it good."""
+"""Positions with a larger dilution of precision are not used; GoPro calls smaller ones good."""
 _COLUMNS = ("time", "speed", "latitude", "longitude", "altitude")
 _TYPES = {"b": "b", "B": "B", "s": "h", "S": "H", "l": "i", "L": "I", "f": "f", "d": "d", "j": "q", "J": "Q"}
 """GPMF's types -> those of `struct`."""
@@ -43,7 +43,7 @@ def has_telemetry(video: Path) -> bool:
 
 
 def import_video(video: Path, folder: Path) -> tuple[Path, str]:
-    """Make a clip of a GoPro video below a folder, a link to it and its speeds; return the clip and what it has."""
+    """Make a clip of a GoPro video below a folder: a link and its speeds; return the clip and a description."""
     home = folder / video.stem
     remove_partial_files(home, ".*.partial*")
     facts = video.stat()
@@ -69,7 +69,7 @@ def import_video(video: Path, folder: Path) -> tuple[Path, str]:
 
 
 def _rows(video: Path) -> tuple[list[Row], str]:
-    """Return the rows of the table of speeds, and a word about them."""
+    """Return the rows of the table of speeds, and a note about them."""
     with VideoReader(video) as reader:
         start = reader.origin
     rows, unknown = list[Row](), 0
@@ -86,9 +86,9 @@ def _rows(video: Path) -> tuple[list[Row], str]:
                 else:
                     rows.append((time, *sample))
     if not rows:
-        return [], "no speeds: the camera has no satellite receiver, or it was off or found nothing"
+        return [], "no speeds: the camera has no GPS receiver, it was off, or it had no fix"
     rate = (len(rows) - 1) / max(rows[-1][0] - rows[0][0], 1e-9)
-    return rows, f"{len(rows)} speeds, {rate:.1f} a second" + (f", {unknown} more without a fix" if unknown else "")
+    return rows, f"{len(rows)} speeds, {rate:.1f} per second" + (f", {unknown} more without a fix" if unknown else "")
 
 
 def _packets(container: Any, video: Path) -> Iterator[Any]:
@@ -109,7 +109,7 @@ def _track(container: Any) -> Any:
 def samples(payload: bytes, name: str) -> Iterator[Row | None]:
     """Yield (speed over ground m/s, latitude, longitude in degrees, altitude m) of a packet; None without a fix.
 
-    Of cameras that write both, the newer ``GPS9`` counts, which knows fix and precision of each sample.
+    If a camera writes both, the newer ``GPS9`` is used, which has fix and precision of each sample.
     """
     streams = [
         {key: (kind, data) for key, kind, data in _elements(stream, name)}
@@ -131,7 +131,7 @@ def _positions(key: str, stream: dict[str, tuple[str, bytes]], name: str) -> Ite
     scales = [1.0] if "SCAL" not in stream else [each for row in _numbers(*stream["SCAL"], name) for each in row]
     scales = scales * len(kinds) if len(scales) == 1 else scales
     if len(scales) != len(kinds) or len(kinds) < (9 if key == "GPS9" else 5) or 0 in scales:
-        raise DataError(f"{name}: {key} has {len(kinds)} numbers and {len(scales)} scales; the video is damaged")
+        raise DataError(f"{name}: {key} has {len(kinds)} numbers but {len(scales)} scales; the video is damaged")
     fix = next((row[0] for row in _numbers(*stream["GPSF"], name)), 0) if "GPSF" in stream else 3
     precision = next((row[0] for row in _numbers(*stream["GPSP"], name)), 0) / 100 if "GPSP" in stream else 0
     for row in _numbers(kinds, data, name):
@@ -152,12 +152,12 @@ def _numbers(kinds: str, data: bytes, name: str) -> Iterator[tuple[Any, ...]]:
 
 
 def _elements(data: bytes, name: str) -> Iterator[tuple[str, str, bytes]]:
-    """Yield key, type and data of the elements that stand one after the other; the data of nested ones are elements."""
+    """Yield key, type and data of consecutive elements; the data of nested ones are elements."""
     at = 0
     while at + 8 <= len(data):
         key, kind, size, count = struct.unpack_from(">4scBH", data, at)
         at += 8
         if at + size * count > len(data):
-            raise DataError(f"{name}: an element is longer than what holds it; the video is damaged")
+            raise DataError(f"{name}: an element is longer than its container; the video is damaged")
         yield key.decode("latin-1"), kind.decode("latin-1"), data[at : at + size * count]
         at += size * count + -(size * count) % 4

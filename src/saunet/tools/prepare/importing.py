@@ -1,4 +1,4 @@
-"""Recordings of robots and cameras as clips that ``data=video`` reads: bags of ROS, MCAP, GoPro videos."""
+"""Recordings of robots and cameras as clips for ``data=video``: ROS bags, MCAP, GoPro videos."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ _BAGS = (".bag", ".mcap", ".db3")
 
 @dataclass(frozen=True, slots=True)
 class ImportReport:
-    """What `import_recordings` did."""
+    """The result of `import_recordings`."""
 
     made: int
     """Pictures written now."""
     before: int
-    """Pictures that were there."""
+    """Pictures that existed already."""
     failures: tuple[str, ...]
     """One sentence for each picture or video that cannot be read and was skipped."""
     clips: tuple[str, ...]
-    """What each clip has, a line each."""
+    """The content of each clip, one line per clip."""
 
     def __str__(self) -> str:
-        counts = f"{self.made} frames made, {self.before} were there, {len(self.failures)} skipped"
+        counts = f"{self.made} frames made, {self.before} existed already, {len(self.failures)} skipped"
         return "\n".join([*self.clips, counts])
 
 
@@ -47,7 +47,7 @@ def import_recordings(
     bags, videos = find_recordings(source, failures if on_error == "skip" else None)
     given = read_camera(camera) if camera else None
     if topics and not bags:
-        raise ConfigError(f"topics chooses image topics of bags, and {source} has none; leave it out")
+        raise ConfigError(f"topics chooses image topics of bags, but {source} has none; leave it out")
     from_bags, made = list[BagClip](), list[tuple[Path, str]]()
     for bag in bags:
         from_bags += Bag(bag, folder, topics, on_error, failures).clips()
@@ -81,7 +81,7 @@ def find_recordings(source: Path, failures: list[str] | None = None) -> tuple[li
     if source.is_file() and suffix in VIDEO_SUFFIXES:
         if not has_telemetry(source):
             raise DataError(
-                f"{source} has no data track of a GoPro, so there is nothing to import; data=video reads it"
+                f"{source} has no GoPro data track, so there is nothing to import; data=video reads it directly"
             )
         return [], [source]
     if source.is_file() or (source / "metadata.yaml").is_file():
@@ -92,7 +92,7 @@ def find_recordings(source: Path, failures: list[str] | None = None) -> tuple[li
         return [source], []
     folders = [path.parent for path in source.rglob("metadata.yaml")]
     files = [path for path in source.rglob("*") if path.is_file() and not path.name.startswith(".")]
-    files = [path for path in files if not (path.parent / RECORD).exists()]  # what was imported before
+    files = [path for path in files if not (path.parent / RECORD).exists()]  # imported before
     bags = {*folders, *(path for path in files if path.suffix.lower() in _BAGS and path.parent not in folders)}
     videos = list[Path]()
     for path in sorted(path for path in files if path.suffix.lower() == ".mp4"):

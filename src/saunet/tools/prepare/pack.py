@@ -1,4 +1,4 @@
-"""Packs a data set into a few large files: images, depth maps and what else its recordings say, for all splits."""
+"""Packs a data set into a few large files: images, depth maps and all other information, for all splits."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from saunet.io.atomic import check_folder, write_bytes, write_json
 from saunet.io.images import decode_image, encode_png
 from saunet.io.progress import bar
 
-_TOGETHER = 64  # frames in memory at a time
+_TOGETHER = 64  # frames in memory at once
 
 
 @dataclass(frozen=True, slots=True)
 class PackReport:
-    """What `pack` wrote."""
+    """The result of `pack`."""
 
     frames: int
     maps: int
@@ -79,10 +79,10 @@ class _Shards:
 
 
 def pack(data: DepthDataModule, folder: str | Path, shard_mb: int, workers: int = 0) -> PackReport:
-    """Write all splits of a data module into an empty folder; it counts as packed once the description is there."""
+    """Write all splits of a data module into an empty folder; it is complete once the description exists."""
     target = check_folder(Path(folder).expanduser())
     if (target / DESCRIPTION).exists():
-        raise DataError(f"{target} holds packed data already; delete it, or set folder to a new one")
+        raise DataError(f"{target} already has packed data; delete it, or set folder to a new one")
     strange = [path for path in target.glob("*") if path.suffix not in (".tar", ".npz")]
     if strange:
         raise DataError(f"{target} is not empty ({strange[0].name}); set folder to a new one")
@@ -156,7 +156,7 @@ def _read(data: DepthDataModule, split: str) -> list[tuple[Drive, list[int], Sel
 def _encode(
     data: DepthDataModule, drive: Drive, images: dict[tuple[str, int], Part], frame: int
 ) -> dict[str, tuple[str, bytes]]:
-    """Return the files of a frame by kind; of an image that is packed already, none."""
+    """Return the files of a frame by kind, without an image that is packed already."""
     found: dict[str, tuple[str, bytes]] = {}
     if (drive.name, frame) not in images:
         found["image"] = _image_file(drive, frame)
@@ -167,7 +167,7 @@ def _encode(
 
 
 def _image_file(drive: Drive, frame: int) -> tuple[str, bytes]:
-    """Return the original file if it gives the frame as the recording does, else a lossless one."""
+    """Return the original file if it decodes to the recording's frame, else a lossless one."""
     image, path = drive.image(frame), drive.path(frame)
     if path is not None and path.is_file():
         data = path.read_bytes()

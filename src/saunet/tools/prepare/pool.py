@@ -1,4 +1,4 @@
-"""Many small pieces of work over processes or a cluster, with a progress bar, that ends cleanly however it ends."""
+"""Many small tasks over processes or a cluster, with a progress bar and a clean end in any case."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PATIENCE = 30
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What a preparation of depth maps did."""
+    """The result of preparing depth maps."""
 
     made: int
     """Frames worked on now."""
@@ -44,12 +44,12 @@ class Done:
 
     def __str__(self) -> str:
         scans = "" if self.without is None else f" {self.without} have no scan,"
-        return f"{self.made} frames made, {self.before} were there,{scans} {len(self.failures)} skipped"
+        return f"{self.made} frames made, {self.before} existed already,{scans} {len(self.failures)} skipped"
 
 
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """Who works: so many processes of this machine, or the workers of a Dask cluster. No processes: this one."""
+    """The workers: processes of this machine (0: this process), or a Dask cluster."""
 
     processes: int = 0
     scheduler: str | None = None
@@ -60,7 +60,7 @@ HERE = Workers()
 
 
 class Work(Generic[Item, Result]):
-    """What to do with each item; the function is sent to every process once, so that items can be small.
+    """The function for each item; it is sent to every process once, so items can be small.
 
     With ``on_error="skip"`` an item's `DataError` becomes a sentence in ``failures``.
     """
@@ -74,9 +74,9 @@ class Work(Generic[Item, Result]):
     def run(
         self, items: Sequence[Item], title: str, together: Callable[[Item], Hashable] | None = None
     ) -> Iterator[tuple[Item, Result]]:
-        """Yield each item with its result, in the order in which they are done.
+        """Yield each item with its result, in the order of completion.
 
-        Items with an equal value of ``together`` are done one after the other by one worker.
+        Items with equal ``together`` are processed one after the other by the same worker.
         """
         bundles: dict[Hashable, list[Item]] = {}
         for place, item in enumerate(items):
@@ -110,13 +110,14 @@ class Work(Generic[Item, Result]):
                 yield from zip(waiting.pop(future), future.result(), strict=True)
         except BrokenProcessPool as reason:
             raise DataError(
-                f"one of the {count} processes was killed, most often for want of memory; run again with fewer workers"
+                f"one of the {count} processes was killed, most likely because memory ran out; run again with fewer "
+                "workers"
             ) from reason
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
     def _on_cluster(self, bundles: Sequence[list[Item]], address: str) -> Iterator[tuple[Item, Result | DataError]]:
-        """Let a cluster do it; what a lost worker had is done again by another, up to three times."""
+        """Use a cluster; tasks of a lost worker are repeated by another, up to three times."""
         try:
             import distributed
         except ModuleNotFoundError as reason:
@@ -135,8 +136,8 @@ class Work(Generic[Item, Result]):
                     yield from zip(waiting.pop(future), future.result(), strict=True)
             except distributed.KilledWorker as reason:
                 raise DataError(
-                    "several workers were lost over the same work, most often for want of memory; give each more, "
-                    "or start fewer on a machine"
+                    "several workers were lost on the same task, most likely because memory ran out; give each "
+                    "more, or start fewer per machine"
                 ) from reason
             except (distributed.CancelledError, distributed.comm.CommClosedError) as reason:
                 raise DataError(f"the scheduler at {address} was lost; start it, and run this again") from reason

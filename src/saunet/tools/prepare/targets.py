@@ -1,4 +1,4 @@
-"""Depth maps to train on, made for a KITTI raw tree: dense ones from sparse LiDAR, and another model's."""
+"""Depth maps to train on for a KITTI raw tree: dense ones from sparse LiDAR, or another model's."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _TYPICAL = 16.0
 def interpolate(depth: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
     """Interpolate depth linearly over the Delaunay triangles of the known pixels; 0 outside their hull.
 
-    Where fewer than three pixels are known, or all lie on one line, nothing is added.
+    If fewer than three pixels are known, or all lie on one line, nothing is added.
     """
     rows, columns = np.nonzero(depth)
     try:
@@ -57,7 +57,7 @@ def densify_map(kind: str, image: UInt8[ndarray, "_ _ 3"], depth: Float32[ndarra
 
 @dataclass(frozen=True, slots=True)
 class _Densify:
-    """Makes the maps of one frame that are not there yet."""
+    """Makes the missing maps of one frame."""
 
     drives: tuple[KittiDrive, ...]
     maps: tuple[DepthMaps, ...]
@@ -80,7 +80,7 @@ def densify(
     workers: Workers = HERE,
     on_error: OnError = "raise",
 ) -> Done:
-    """Write the dense maps of recordings (``folder`` None: beside each); what is there already is left alone."""
+    """Write the dense maps of recordings (``folder`` None: beside each); existing ones are kept."""
     maps = tuple(DepthMaps(kind, folder) for kind in kinds)
     items, without, before = [], 0, 0
     for position, (drive, frames) in enumerate(recordings):
@@ -110,16 +110,16 @@ class ModelTeacher:
         self.predictor = predictor
 
     def made_from(self) -> dict[str, Any]:
-        """Return what decides the values, to be written down beside them."""
+        """Return the settings that decide the values, to record beside them."""
         return {"model": self.predictor.fingerprint}
 
     def depth(self, drive: KittiDrive, frame: int) -> Float32[ndarray, "_ _"]:
-        """Return depth, up to scale, 0 where unknown, at whatever size there is."""
+        """Return depth up to scale, 0 where unknown, at its own size."""
         return np.asarray(self.predictor.predict(drive.image(frame), str(drive.path(frame))).depth, dtype=np.float32)
 
 
 class FileTeacher:
-    """Depth from files that any system wrote.
+    """Depth from files of any system.
 
     A frame's file is named after the frame (``2011_09_26-2011_09_26_drive_0001_sync-0000000005-l``, any characters
     between the parts), or lies where the image lies (``.../2011_09_26_drive_0001_sync/image_02/data/0000000005``, with
@@ -212,9 +212,9 @@ def teach(
     workers: Workers = HERE,
     on_error: OnError = "raise",
 ) -> Done:
-    """Write a teacher's depth for recordings (``folder`` None: beside each); what is there already is left alone.
+    """Write a teacher's depth for recordings (``folder`` None: beside each); existing maps are kept.
 
-    One worker does all of a recording.
+    A single worker processes all frames of a recording.
     """
     maps = DepthMaps("teacher", folder)
     items, before = [], 0

@@ -1,4 +1,4 @@
-"""The preparation tool: dense depth from LiDAR, a teacher's depth, or a cache of smaller images, made once."""
+"""The preparation tool: dense depth from LiDAR, a teacher's depth, smaller images, imported clips, or packed data."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ KEYS: dict[str, tuple[str, ...]] = {
 @checked
 @dataclass(frozen=True, kw_only=True)
 class PrepareOptions:
-    """What `prepare` does: one of five jobs, each with options of its own.
+    """Options of `prepare`: one of five jobs, each with its own options.
 
     Raises:
-        ConfigError: for a wrong value, or an option that the job does not have.
+        ConfigError: for an invalid value, or an option that the job does not have.
 
     Examples:
         >>> options = saunet.PrepareOptions(job="densify", root="/data/kitti", kinds=["linear"])
@@ -60,7 +60,7 @@ class PrepareOptions:
     root: str | None = None
     """Root of a KITTI raw tree."""
     folder: str | None = None
-    """Where results go; None puts depth maps beside each recording. A cache needs a folder of its own."""
+    """Folder for results; None puts depth maps beside each recording. A cache needs its own folder."""
     cameras: Sequence[str] = ("left", "right")
     """``left``, ``right`` or both."""
     drives: Sequence[str] = ()
@@ -74,18 +74,18 @@ class PrepareOptions:
     checkpoint: str | None = None
     """``teacher``: the trained model that predicts the depth."""
     foreign: ForeignOptions = NOTHING
-    """``teacher``: what an ONNX or TorchScript model of another system takes and gives."""
+    """``teacher``: input and output of another system's ONNX or TorchScript model."""
     input: str | None = None
     """``teacher``: a folder of depth that another system predicted. ``import``: a bag of ROS 1 or 2, an MCAP file, a
     GoPro video, or a folder of them."""
     topics: Sequence[str] = ()
     """``import``: only these image topics; all if empty."""
     camera: str | None = None
-    """``import``: a camera file for clips of which the recording has no calibration."""
+    """``import``: a camera file for clips without a calibration in the recording."""
     values: Values = "depth"
-    """``teacher``: what those files hold, ``depth`` or ``disparity``."""
+    """``teacher``: content of those files, ``depth`` or ``disparity``."""
     device: str = "auto"
-    """``teacher``: where the model runs; ``auto`` takes a GPU if there is one."""
+    """``teacher``: where the model runs; ``auto`` uses a GPU if there is one."""
     height: int = 202
     """``cache``: of the copies, in pixels."""
     width: int = 672
@@ -93,17 +93,17 @@ class PrepareOptions:
     format: Literal["jpg", "webp"] = "jpg"
     """``cache``: ``jpg`` or ``webp``."""
     quality: int = 95
-    """``cache``: of the compression, 1 to 100."""
+    """``cache``: compression quality, 1 to 100."""
     shard_mb: int = 256
-    """``pack``: most megabytes a file."""
+    """``pack``: largest size of a file in megabytes."""
     workers: int | None = None
-    """Processes; 0 works in this one, None takes one per core."""
+    """Number of processes; 0 works in this one, None uses one per core."""
     executor: Literal["processes", "dask"] = "processes"
-    """Who works: ``processes`` of this machine, or the workers of a ``dask`` cluster, which see the same folders."""
+    """The workers: ``processes`` of this machine, or a ``dask`` cluster that sees the same folders."""
     scheduler: str | None = None
     """``executor=dask``: address of the cluster's scheduler, such as ``tcp://10.0.0.1:8786``."""
     on_error: OnError = "raise"
-    """For a broken file: ``raise`` stops and names it, ``skip`` continues without the frame."""
+    """What to do with a broken file: ``raise`` stops and names it, ``skip`` continues without the frame."""
 
     def __post_init__(self) -> None:
         for key in ("cameras", "drives", "kinds", "topics"):
@@ -119,7 +119,7 @@ class PrepareOptions:
         one_of("on_error", self.on_error, get_args(OnError))
         one_of("executor", self.executor, ("processes", "dask"))
         if (self.executor == "dask") != (self.scheduler is not None):
-            raise ConfigError("executor=dask and scheduler=... (such as tcp://10.0.0.1:8786) go together; set both")
+            raise ConfigError("executor=dask and scheduler=... (such as tcp://10.0.0.1:8786) belong together; set both")
         if self.executor == "dask" and self.workers is not None:
             raise ConfigError("workers counts processes of this machine; with executor=dask, leave it out")
         if self.job == "import":
@@ -144,7 +144,7 @@ class PrepareOptions:
             one_of("kinds", kind, DENSE_KINDS)
         one_of("values", self.values, get_args(Values))
         if self.job == "teacher" and (self.checkpoint is None) == (self.input is None):
-            raise ConfigError("a teacher is either checkpoint=... (a trained model) or input=... (a folder of depth)")
+            raise ConfigError("teacher needs either checkpoint=... (a trained model) or input=... (a folder of depth)")
         if self.job == "cache":
             if self.folder is None:
                 raise ConfigError("a cache needs a folder of its own; set folder=...")
@@ -152,13 +152,13 @@ class PrepareOptions:
 
 
 def prepare(options: PrepareOptions) -> Done | CacheReport | ImportReport | PackReport:
-    """Do one preparation; what exists already is checked and kept, so an interrupted job resumes.
+    """Run one job; existing results are checked and kept, so an interrupted job resumes.
 
     Args:
         options: The job and its options.
 
     Returns:
-        What was made, what existed, and one sentence per frame that was skipped (``failures``); ``print`` shows it.
+        The numbers of new and existing results, and one sentence per skipped frame (``failures``); ``print`` shows it.
 
     Raises:
         DataError: if a recording cannot be read, or the folder holds something else.
@@ -203,8 +203,8 @@ def _teacher(options: PrepareOptions) -> ModelTeacher | FileTeacher:
     predictor = load(str(options.checkpoint), device=device, foreign=options.foreign)
     if isinstance(predictor, ForeignPredictor) and predictor.shifted:
         raise ConfigError(
-            f"{options.checkpoint} gives disparity with an unknown shift, of which no depth up to scale can be made; "
-            "set foreign.factor and foreign.shift, or use a teacher that gives depth"
+            f"{options.checkpoint} gives disparity with an unknown shift, which cannot be turned into depth up to "
+            "scale; set foreign.factor and foreign.shift, or use a teacher that gives depth"
         )
     return ModelTeacher(predictor)
 
@@ -258,7 +258,7 @@ def _frames(split: str) -> set[tuple[str, int, str]] | None:
 
 
 def module_recordings(data: DepthDataModule) -> list[tuple[Drive, Sequence[int]]]:
-    """Return what a data module trains and validates on, with all frames; with ``stereo`` the other cameras too."""
+    """Return a data module's training and validation recordings; with ``stereo`` the other cameras too."""
     if not data.cacheable:
         raise ConfigError(
             f"{type(data).__name__} reads no copies made by saunet prepare; use data=kitti, kitti_odometry or video"
