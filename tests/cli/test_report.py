@@ -67,7 +67,7 @@ def test_a_run_with_a_folder_of_its_own_is_one_run_that_knows_itself(tool: Any, 
     ("given", "words"),
     [
         (("gone",), "there is nothing at gone"),
-        ((), "no run given; name folders of runs"),
+        ((), "no run given; add folders of runs"),
         (("titel=x",), "did you mean 'title'"),
     ],
 )

@@ -226,7 +226,7 @@ def test_a_folder_with_another_export_is_not_mixed(
     shutil.copytree(exported[0], tmp_path / "out")
     with pytest.raises(ConfigError, match=r"holds config\.json already; choose another output folder"):
         exported_files(checkpoint, tmp_path / "out", ["safetensors"])
-    with pytest.raises(ConfigError, match="holds the model itself"):
+    with pytest.raises(ConfigError, match="contains the model itself"):
         exported_files(tmp_path / "out", tmp_path / "out", ["safetensors"], overwrite=True)
     exported_files(exported[0], tmp_path / "out", ["safetensors"], overwrite=True)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
@@ -269,7 +269,7 @@ def test_network_that_fixes_its_batch_size(network: DepthNet, record: ModelRecor
             return (image.view(int(image.shape[0]), 3, 32, 64)[:, :, ::2, ::2],)
 
     network.encoder = FixedBatch()
-    with pytest.raises(ConfigError, match="fixes its batch size when it is exported; export with batch=one"):
+    with pytest.raises(ConfigError, match="fixes its batch size on export; export with batch=one"):
         export_program(network, record, tmp_path / "x.pt2", batch="any")
     for batch in ("one", "auto"):
         export_program(network, record, tmp_path / f"{batch}.pt2", batch=batch)

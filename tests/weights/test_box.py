@@ -168,7 +168,7 @@ def test_refused(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     before = (folder / "model.safetensors").read_bytes()
     with pytest.raises(ConfigError, match=r"holds config\.json already"):
         pack(checkpoint, folder)
-    with pytest.raises(ConfigError, match="holds the model itself"):
+    with pytest.raises(ConfigError, match="contains the model itself"):
         pack(folder, folder, overwrite=True)
     pack(checkpoint, folder, overwrite=True)
     assert (folder / "model.safetensors").read_bytes() == before

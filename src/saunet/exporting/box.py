@@ -1,4 +1,4 @@
-"""A trained model in half precision as a small folder: how the models that come with saunet are made.
+"""A trained model in half precision as a small folder; this makes the models that come with saunet.
 
 ```
 python -m saunet.exporting.box outputs/street/checkpoints/best.ckpt src/saunet/weights/street \
@@ -40,14 +40,14 @@ DEPTH_TOLERANCE = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Rounding:
-    """What half precision changes, over all images it was measured on."""
+    """The changes from half precision, over all measured images."""
 
     images: int
-    """Images, random and real."""
+    """Number of images, random and real."""
     depth_max: float
     """Largest relative change of depth at any pixel."""
     depth_mean: float
-    """Mean relative change of depth of the image that changes most."""
+    """Mean relative change of depth, of the image that changes most."""
     motion: float | None
     """Largest change of a predicted motion, the length of its translation and the angle of its rotation (radians)
     together, as a fraction of that motion; None without a pose network."""
@@ -74,11 +74,11 @@ def pack(
 ) -> Rounding:
     """Write a trained model's networks in half precision, its record and its card into a folder.
 
-    Convolution and projection weights become float16; biases and the statistics of normalization, which are few, stay
-    as they are. The depth network is ``model.safetensors``, the pose network ``pose.safetensors``, and
-    `saunet.load`, ``checkpoint=`` and ``init_from=`` take the folder as they take an exported one. The folder's name
-    becomes the model's name. The rounding is measured on random images and the real ones, and not more than
-    `DEPTH_TOLERANCE`; the command that made the model and the results of evaluations go into the card.
+    Convolution and projection weights become float16; the few biases and normalization statistics stay unchanged. The
+    depth network is ``model.safetensors``, the pose network ``pose.safetensors``, and `saunet.load`, ``checkpoint=``
+    and ``init_from=`` accept the folder like an exported one. The folder's name becomes the model's name. The rounding
+    error is measured on random and real images, and at most `DEPTH_TOLERANCE`; the command that made the model and the
+    results of evaluations go into the card.
     """
     folder, read = Path(folder), read_model(source)
     earlier = check_target(folder, read.path, (CONFIG, WEIGHTS, POSE, CARD), overwrite)
@@ -97,7 +97,8 @@ def pack(
     if not mean <= DEPTH_TOLERANCE:  # NaN too
         raise CheckpointError(
             f"half precision changes the depth of {source} by {100 * mean:.2g} % on average, more than "
-            f"{100 * DEPTH_TOLERANCE:g} %, so nothing is written; export it with formats=[safetensors] instead"
+            f"{100 * DEPTH_TOLERANCE:g} %, so nothing is written; use saunet export with formats=[safetensors] "
+            "instead"
         )
     motion = None if whole[1] is None or halved[1] is None else _motion_change(whole[1], halved[1], record, inputs)
     remove(earlier)
@@ -116,7 +117,7 @@ def pack(
         quality=quality or "Not evaluated when this was packed.",
     )
     write_bytes(folder / CARD, card.encode())
-    write_json(folder / CONFIG, record.to_plain())  # last: with it, the folder is a model
+    write_json(folder / CONFIG, record.to_plain())  # last: it makes the folder a model
     return rounding
 
 
@@ -164,8 +165,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m saunet.exporting.box", description=pack.__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("source", help="a checkpoint, or an exported folder")
-    parser.add_argument("folder", help="where the files go; its name becomes the model's")
-    parser.add_argument("--images", nargs="*", default=[], help="real images to measure the rounding on")
+    parser.add_argument("folder", help="folder for the files; its name becomes the model's")
+    parser.add_argument("--images", nargs="*", default=[], help="real images to measure the rounding error on")
     parser.add_argument(
         "--evaluation", nargs="*", default=[], dest="evaluations", help="folders of saunet evaluate, for the card"
     )

@@ -1,4 +1,4 @@
-"""The card that goes with a model: what it is, was trained on, how good it is, and means. Its text is in templates."""
+"""A model's card: what it is, its training, its accuracy, and how to use its output. The text is in templates."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def model_card(
 
 
 def filled(template: str, record: ModelRecord, **texts: str) -> str:
-    """Return a template beside this file with a model's record and further texts in it."""
+    """Return a template beside this file, filled with a model's record and further texts."""
     parts = {"encoder": record.encoder, "decoder": record.decoder, "pose": record.pose}
     rows = "\n".join(f"| {slot} | {_described(node)} |" for slot, node in parts.items() if node is not None)
     data = json.dumps(record.to_plain()["data"], indent=2)

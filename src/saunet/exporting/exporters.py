@@ -1,4 +1,4 @@
-"""A depth network written as one file, and run from it: ONNX, a torch.export program, an AOTInductor package."""
+"""Writing a depth network as one file, and running it: ONNX, a torch.export program, an AOTInductor package."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from saunet.models.depth import DepthNet
 from saunet.runs.record import ModelRecord
 
 BATCHES: tuple[str, ...] = ("auto", "any", "one")
-"""``any``: any number of images at once. ``one``: exactly one. ``auto``: any where the network allows it, else one."""
+"""``any``: any number of images at once. ``one``: exactly one. ``auto``: any if the network allows it, else one."""
 Batch = Literal["any", "one"]
 OPSETS: tuple[int, ...] = (17, 18, 20)
-"""Of ONNX: 20 by default; 18 and 17 for older runtimes (JetPack before 6.1, TensorRT 8, onnxruntime from 1.14)."""
+"""ONNX opsets: 20 by default; 18 and 17 for older runtimes (JetPack before 6.1, TensorRT 8, onnxruntime from 1.14)."""
 _IR_VERSIONS = {17: 8, 18: 8, 20: 10}
-"""The file format's version that runtimes of an opset's time read."""
+"""The version of the file format that runtimes of an opset's time can read."""
 
 _LARGEST_BATCH = 256
 _TRACING_ERRORS = (RuntimeError, ValueError)
-"""The first holds all of the compiler's own."""
+"""The first one includes all of the compiler's own errors."""
 
 
 class FinestDisparity(nn.Module):
@@ -53,11 +53,11 @@ class FinestDisparity(nn.Module):
 def export_onnx(
     network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto", opset: int = OPSETS[-1]
 ) -> Batch:
-    """Write a depth network as ONNX, with its record inside, so that one file is enough to predict from."""
+    """Write a depth network as ONNX, with its record inside, so that one file is enough for prediction."""
     for package in ("onnx", "onnxscript"):
         if importlib.util.find_spec(package) is None:
             raise ConfigError(f"ONNX export needs the package {package}; run: pip install 'saunet[export]'")
-    # Attention in its plain form: what the fused kernel returns has other strides in the exporter's own run of it.
+    # Attention in its plain form: the fused kernel's result has other strides when the exporter runs it.
     with sdpa_kernel(SDPBackend.MATH):
         program, takes = depth_program(network, record, batch)
     try:
@@ -67,7 +67,9 @@ def export_onnx(
                 program, input_names=[INPUT], output_names=[OUTPUT], opset_version=written, dynamo=True, verbose=False
             )
     except torch.onnx.OnnxExporterError as reason:
-        raise ConfigError(f"{_name(network)} cannot be exported to ONNX; export the format 'program'") from reason
+        raise ConfigError(
+            f"{_name(network)} cannot be exported to ONNX; export the format 'program' instead"
+        ) from reason
     if exported.model.opset_imports[""] != written or (opset == 17 and not _lower_to_17(exported.model)):
         raise ConfigError(
             f"{_name(network)} has operations that opset {opset} does not have; export with opset={OPSETS[-1]}"
@@ -79,10 +81,10 @@ def export_onnx(
 
 
 def _lower_to_17(model: Any) -> bool:
-    """Rewrite a model of opset 18 for opset 17; return whether it uses nothing that only 18 has.
+    """Rewrite a model of opset 18 for opset 17; return whether that is possible.
 
-    Of the operations that changed, Pad, Split and Resize only gained settings. Reductions take their axes as an
-    attribute before. Others have no counterpart.
+    Among the changed operations, Pad, Split and Resize only gained settings. Before 18, reductions have their axes as
+    an attribute. Others have no counterpart.
     """
     import onnx
     import onnx_ir
@@ -116,7 +118,7 @@ def _lower_to_17(model: Any) -> bool:
 def export_program(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> Batch:
     """Write a depth network as a torch.export program: ``torch.export.load(path).module()(image)`` needs no saunet."""
     program, takes = depth_program(network, record, batch)
-    content = io.BytesIO()  # torch's own writer, on a full disk, cannot even be closed and ends the process
+    content = io.BytesIO()  # on a full disk, torch's own writer cannot even be closed and ends the process
     with _quiet():
         torch.export.save(program, content, extra_files={METADATA: json.dumps(record.to_plain())})
     Path(path).write_bytes(content.getbuffer())
@@ -124,19 +126,23 @@ def export_program(network: DepthNet, record: ModelRecord, path: str | Path, bat
 
 
 def export_compiled(network: DepthNet, record: ModelRecord, path: str | Path, batch: str = "auto") -> Batch:
-    """Write a depth network as an AOTInductor package: machine code for this kind of processor, minutes to make.
+    """Write a depth network as an AOTInductor package: machine code for this kind of processor; takes minutes.
 
     ``torch._inductor.aoti_load_package(path)(image)`` runs it, and so does C++ with libtorch, without Python.
     """
     if shutil.which("g++") is None and shutil.which("clang++") is None and shutil.which("cl") is None:
-        raise ConfigError("the format 'compiled' needs a C++ compiler and found none; install g++, or leave it out")
+        raise ConfigError(
+            "the format 'compiled' needs a C++ compiler, but none was found; install g++, or leave the format out"
+        )
     program, takes = depth_program(network, record, batch)
     content = io.BytesIO()
     try:
         with torch.no_grad(), _quiet():
             torch._inductor.aoti_compile_and_package(program, package_path=content)
     except RuntimeError as reason:
-        raise ConfigError(f"compiling failed: {str(reason).strip().splitlines()[0]}; export 'program'") from reason
+        raise ConfigError(
+            f"compiling failed: {str(reason).strip().splitlines()[0]}; export 'program' instead"
+        ) from reason
     Path(path).write_bytes(content.getbuffer())
     return takes
 
@@ -149,7 +155,7 @@ def run_eager(network: DepthNet) -> Run:
 def run_onnx(path: Path) -> Run:
     """Return an ONNX file as a function of arrays, with as many threads as torch uses.
 
-    They do not spin, else they would hold the cores while the network that it is compared with is timed.
+    They do not spin: that would occupy the cores while the other network is timed.
     """
     session = open_session(path, threads=torch.get_num_threads(), spinning=False)
     return lambda image: session.run([OUTPUT], {INPUT: image})[0]
@@ -181,9 +187,7 @@ def depth_program(network: DepthNet, record: ModelRecord, batch: str) -> tuple[t
             return _trace(module, torch.zeros(2, 3, record.height, record.width), dynamic=True), "any"
         except _TRACING_ERRORS as reason:
             if batch == "any":
-                raise ConfigError(
-                    f"{_name(network)} fixes its batch size when it is exported; export with batch=one"
-                ) from reason
+                raise ConfigError(f"{_name(network)} fixes its batch size on export; export with batch=one") from reason
     try:
         return _trace(module, torch.zeros(1, 3, record.height, record.width), dynamic=False), "one"
     except _TRACING_ERRORS as reason:
@@ -204,7 +208,7 @@ def _trace(module: nn.Module, image: Tensor, dynamic: bool) -> torch.export.Expo
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence notes of torch's exporters that no user can act on."""
+    """Silence messages of torch's exporters that users can do nothing about."""
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:

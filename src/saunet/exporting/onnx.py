@@ -1,4 +1,4 @@
-"""Prediction from one exported ONNX file, with onnxruntime alone: no torch, so a program starts quickly."""
+"""Prediction from one exported ONNX file, with onnxruntime alone: without torch, a program starts quickly."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from saunet.runs.record import ModelRecord
 
 INPUT, OUTPUT = "image", "disparity"
 METADATA = "saunet"
-"""Name under which the model record stands in the file's metadata."""
+"""Name of the model record in the file's metadata."""
 
 
 class OnnxPredictor(ImagePredictor):
@@ -27,7 +27,7 @@ class OnnxPredictor(ImagePredictor):
         path: A ``model.onnx`` written by `saunet.exporting.export`.
         device: ``"cpu"`` or ``"cuda"`` (with onnxruntime-gpu).
         threads: Threads to use; 0 lets onnxruntime choose.
-        flip: Average with the prediction of the mirrored image (twice the time, a little less error).
+        flip: Average with the prediction of the mirrored image (twice the time, slightly less error).
 
     Raises:
         CheckpointError: if the file is missing, broken, or not an exported saunet model.
@@ -40,7 +40,7 @@ class OnnxPredictor(ImagePredictor):
         plain = self._session.get_modelmeta().custom_metadata_map.get(METADATA)
         if plain is None:
             raise CheckpointError(
-                f"{path} is an ONNX model, but not one that saunet exported: it has no model record; say what it is "
+                f"{path} is an ONNX model, but not one that saunet exported: it has no model record; describe it "
                 "with foreign.preset=... or foreign.output=... (docs/deploy.md)"
             )
         try:
@@ -104,4 +104,4 @@ def open_session(path: Path, device: str = "cpu", threads: int = 0, spinning: bo
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=[wanted])
     except Exception as reason:  # onnxruntime's errors share no base class but Exception
-        raise CheckpointError(f"{path} is not an ONNX model that onnxruntime can read, or is damaged") from reason
+        raise CheckpointError(f"{path} is damaged, or not an ONNX model that onnxruntime can read") from reason

@@ -1,4 +1,4 @@
-"""A depth network in OpenVINO's format, converted from torch, and run at a precision that is always said."""
+"""A depth network in OpenVINO's format, converted from torch, and run at an explicit precision."""
 
 from __future__ import annotations
 
@@ -22,15 +22,17 @@ def export_openvino(
 ) -> Batch:
     """Write a depth network as OpenVINO's graph (xml) and its weights (bin), in float32.
 
-    It is converted from torch, not from ONNX, where OpenVINO 2026.4 resizes with ``antialias`` as if it were without.
+    It is converted from torch, not from ONNX, because there OpenVINO 2026.4 ignores ``antialias`` when resizing.
 
     Raises:
         ConfigError: if OpenVINO is missing, or the network cannot be exported.
-        CheckpointError: if a weight is not finite, which OpenVINO's ReLU would hide: that of NaN is 0.
+        CheckpointError: if a weight is not finite; OpenVINO's ReLU would hide that, because it turns NaN into 0.
     """
     openvino = _openvino()
     if not all(value.isfinite().all() for value in network.state_dict().values() if value.is_floating_point()):
-        raise CheckpointError("a weight of the network is not finite; it is damaged, or training diverged")
+        raise CheckpointError(
+            "a weight of the network is not finite; the checkpoint is damaged, or the training diverged"
+        )
     with sdpa_kernel(SDPBackend.MATH):
         program, takes = depth_program(network, record, batch)
     model = openvino.convert_model(program)
@@ -47,7 +49,7 @@ def run_openvino(path: Path, weights: Path, precision: str = "f32") -> Run:
     Args:
         path: The graph.
         weights: Its weights.
-        precision: ``f32`` or ``bf16``; where nothing is said, OpenVINO takes bf16 on processors that have it.
+        precision: ``f32`` or ``bf16``; without this setting, OpenVINO uses bf16 on processors that have it.
     """
     core = _openvino().Core()
     settings = {"INFERENCE_PRECISION_HINT": precision, "INFERENCE_NUM_THREADS": torch.get_num_threads()}
@@ -55,7 +57,7 @@ def run_openvino(path: Path, weights: Path, precision: str = "f32") -> Run:
         model = core.read_model(str(path), str(weights))
         compiled = core.compile_model(model, "CPU", {"PERFORMANCE_HINT": "LATENCY", **settings})
     except RuntimeError as reason:
-        raise CheckpointError(f"{path} is not a model that OpenVINO can read, or is damaged") from reason
+        raise CheckpointError(f"{path} is damaged, or not a model that OpenVINO can read") from reason
     return lambda images: np.array(compiled(images)[0])
 
 

@@ -1,4 +1,4 @@
-"""Does an exported file compute what the network computes, and how fast: measured on the same inputs in one run."""
+"""Whether an exported file computes the same as its network, and how fast, measured on the same inputs in one run."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Run = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 @dataclass(frozen=True, slots=True)
 class Parity:
-    """How an exported file compares with the network it came from."""
+    """Comparison of an exported file with its network."""
 
     file: str
     batch: str
-    """How many images the file takes at once: ``any`` or ``one``."""
+    """Number of images the file takes at once: ``any`` or ``one``."""
     difference: float
     """Largest difference in disparity, as a fraction of the network's range of disparity."""
     depth_difference: float
     """Largest relative difference in depth."""
     random: int
-    """Random images compared."""
+    """Number of random images compared."""
     real: int
-    """Real images compared."""
+    """Number of real images compared."""
     megabytes: float = 0.0
     """Size of the file."""
     eager_ms: float = 0.0
@@ -54,7 +54,7 @@ def compare(
     batch: str = "one",
     megabytes: float = 0.0,
 ) -> Parity:
-    """Compare an exported file with the original on single images and, where it takes any number, on all at once."""
+    """Compare an exported file with the original on single images and, if it takes any number, on all at once."""
     inputs = [*random, *real]
     if batch == "any":
         inputs.append(np.concatenate(inputs[-4:]))
@@ -62,7 +62,7 @@ def compare(
     for image in inputs:
         got, wanted = exported(image).astype(np.float64), eager(image).astype(np.float64)
         apart = np.abs(got - wanted)
-        difference = float(np.maximum(difference, apart.max() / span))  # NaN stays NaN: it passes no tolerance
+        difference = float(np.maximum(difference, apart.max() / span))  # NaN stays NaN and fails any tolerance
         relative = float(np.maximum(relative, (apart / np.abs(got)).max()))  # |1/got - 1/wanted| * wanted
     return Parity(file, batch, difference, relative, len(random), len(real), round(megabytes, 3))
 
@@ -70,13 +70,13 @@ def compare(
 def timed(
     reports: Sequence[Parity], eager: Run, exported: Sequence[Run], image: NDArray[np.float32], repeats: int = 11
 ) -> list[Parity]:
-    """Return the comparisons with times: of the original, which is the same in all, and of each file."""
+    """Return the comparisons with times: of the original, the same in all, and of each file."""
     first, *others = milliseconds([eager, *exported], image, repeats)
     return [replace(report, eager_ms=first, exported_ms=own) for report, own in zip(reports, others, strict=True)]
 
 
 def milliseconds(runs: Sequence[Run], image: NDArray[np.float32], repeats: int = 11) -> list[float]:
-    """Return the median milliseconds of calls of each, taken in turn, after two that do not count."""
+    """Return the median milliseconds of calls of each, taken in turn, after two warm-up calls."""
     times = np.zeros((repeats + 2, len(runs)))
     for row in times:
         for index, run in enumerate(runs):

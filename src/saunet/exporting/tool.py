@@ -38,7 +38,7 @@ torch without saunet. ``compiled`` (AOTInductor): machine code, for torch or C++
 saunet and the hub."""
 DEFAULT_FORMATS: tuple[str, ...] = ("onnx", "program", "safetensors")
 TOLERANCE = 1e-4
-"""Largest difference to the original network that passes, as a fraction of the range of disparity."""
+"""Largest accepted difference from the original network, as a fraction of the range of disparity."""
 FILES = {
     "onnx": "model.onnx",
     "openvino": "model.xml",
@@ -48,29 +48,29 @@ FILES = {
 }
 REPORT = "report.json"
 OPENVINO_WEIGHTS = "model.bin"
-"""Goes with ``model.xml``."""
+"""The weights of ``model.xml``."""
 
 _REAL_AT_MOST = 8
 _PLACES = ("root", "cache")
-"""Where the training data lay: nobody's business but the trainer's, and it says nothing about them."""
+"""Paths of the training data: private, and they say nothing about the data."""
 
 
 @checked
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """What `export` writes.
+    """Options of `export`: what it writes, and where.
 
     Args:
         checkpoint: The model: a checkpoint, an exported folder, or a shipped model's name.
         output: The folder for the model's files, ``config.json``, ``report.json`` and ``README.md``.
         formats: ``onnx``, ``openvino``, ``program`` (torch.export), ``compiled`` (AOTInductor), ``safetensors``.
         images: Real images to compare on, besides random ones: a file, a folder or a pattern, in Python also several;
-            at most eight are taken, evenly.
-        batch: How many images the files take at once: ``any``, ``one``, or ``auto``: any where the network allows it.
-        opset: Of ONNX: 20, or 18 or 17 for older runtimes.
-        evaluation: A ``metrics.json`` of an evaluation, or the folder that holds it; goes into the model card.
+            at most eight are used, evenly spread.
+        batch: Number of images the files take at once: ``any``, ``one``, or ``auto``: any if the network allows it.
+        opset: ONNX opset: 20, or 18 or 17 for older runtimes.
+        evaluation: A ``metrics.json`` of an evaluation, or its folder, for the model card.
         push: Upload the folder to this repository of the Hugging Face hub, ``organization/name``; a new one is private.
-        overwrite: Replace what an earlier export left in the folder.
+        overwrite: Replace the files of an earlier export in the folder.
 
     Raises:
         ConfigError: for an unknown format, batch or opset.
@@ -107,13 +107,13 @@ class ExportOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportResult:
-    """What `export` wrote."""
+    """The result of `export`."""
 
     output: Path
     reports: tuple[Parity, ...]
-    """How each file compares with the network, in the order of the formats."""
+    """Comparison of each file with the network, in the order of the formats."""
     address: str | None = None
-    """Where it was uploaded to."""
+    """Address of the upload; None without one."""
 
     def show(self) -> None:
         """Print the comparisons as a table."""
@@ -129,16 +129,15 @@ def export(options: ExportOptions) -> ExportResult:
     """Export a trained model's depth network into a folder, with its config, a parity report and a model card.
 
     Args:
-        options: What to export, and where to.
+        options: What to export, and where.
 
     Returns:
-        How each file compares with the network.
+        The comparison of each file with the network.
 
     Raises:
-        ConfigError: for a package that is missing, a network that cannot be exported this way, or a folder that holds
-            another export.
+        ConfigError: for a missing package, a network that cannot be exported this way, or a folder with another export.
         CheckpointError: if the checkpoint cannot be read, or a file would differ from the original.
-        DataError: if an image or the evaluation cannot be read, or the system refuses to write.
+        DataError: if an image or the evaluation cannot be read, or a file cannot be written.
 
     Examples:
         >>> options = saunet.ExportOptions(checkpoint="last.ckpt", output="exported", formats=["safetensors"])
@@ -179,7 +178,8 @@ def export(options: ExportOptions) -> ExportResult:
                 wrong = f"differs from the network by {found}"
             if not report.difference <= TOLERANCE:
                 raise CheckpointError(
-                    f"the exported {path.name} {wrong}, so it is not written; report encoder and decoder"
+                    f"the exported {path.name} {wrong}, so it is not written; please report this with its encoder "
+                    "and decoder"
                 )
         _say(f"{name}: differs by {report.difference:.1e} of its range; {time.monotonic() - begun:.1f} s")
         reports.append(report)
@@ -198,13 +198,13 @@ def export(options: ExportOptions) -> ExportResult:
 
 
 def _say(what: str) -> None:
-    """Say how far it is, in a pipe too: a format can take minutes."""
+    """Report progress, also to a pipe: a format can take minutes."""
     print(what, file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
 def _weights_beside(folder: Path, name: str) -> Iterator[Path | None]:
-    """Yield where a format's weights go that are a file of their own; None for the others."""
+    """Yield the separate weights file of each format; None if it has none."""
     if name != "openvino":
         yield None
         return
@@ -228,30 +228,32 @@ def read_metrics(path: str | Path) -> Mapping[str, Any]:
 
 
 def _splits(checkpoint: Path) -> Mapping[str, str]:
-    """Return the fingerprints of the frames that a model was trained on, where its run's folder still has them."""
+    """Return the fingerprints of the frames that a model was trained on, if its run's folder still has them."""
     path = checkpoint.parent.parent / "run.json"
     if not path.is_file():
         return {}
     try:
         return dict(read_json(path).get("splits") or {})
     except (OSError, ValueError, AttributeError, TypeError) as reason:
-        raise DataError(f"{path} cannot be read ({reason}); it belongs to the run, or move the checkpoint") from reason
+        raise DataError(
+            f"{path} cannot be read ({reason}); repair this file of the run, or move the checkpoint elsewhere"
+        ) from reason
 
 
 def check_target(folder: Path, model: Path, names: Sequence[str], overwrite: bool) -> list[Path]:
-    """Return an earlier model's files in a folder, having checked that they may go and are not ``model`` itself."""
+    """Return an earlier model's files in a folder, after checking that they may go and are not ``model`` itself."""
     if model.name == WEIGHTS and model.resolve().parent == folder.resolve():
-        raise ConfigError(f"the output folder {folder} holds the model itself; choose another")
+        raise ConfigError(f"the output folder {folder} contains the model itself; choose another")
     present = [folder / name for name in names if (folder / name).exists()]
     if present and not overwrite:
         raise ConfigError(
-            f"{folder} holds {present[0].name} already; choose another output folder, or set overwrite=true"
+            f"{folder} already has {present[0].name}; choose another output folder, or set overwrite=true"
         )
     return present
 
 
 def remove(earlier: Sequence[Path]) -> None:
-    """Remove an earlier model, its config first: what is left of it must not be taken for the new one."""
+    """Remove an earlier model, its config first: leftovers must not be mistaken for the new one."""
     for path in earlier:
         try:
             path.unlink()
@@ -263,7 +265,7 @@ def public_record(record: ModelRecord) -> ModelRecord:
     """Return a model's record without the trainer's folders and recordings."""
     data = {key: value for key, value in record.data.items() if key not in _PLACES}
     found = record.intrinsics
-    if found is not None:  # the names of recordings are the trainer's too
+    if found is not None:  # the names of recordings are private too
         found = Intrinsics(found.mode, {"mean": found.mean})
     record = replace(record, data=data, intrinsics=found)
     try:

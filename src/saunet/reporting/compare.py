@@ -1,4 +1,4 @@
-"""Two or more runs against each other: differing settings, losses, scores side by side, and a paired comparison."""
+"""Two or more runs against each other: differing settings, losses, scores side by side, and paired comparisons."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from saunet.tables import Column, Row, Table, csv_text
 from saunet.weights.locate import is_shipped
 
 _EACH_PAIR = 4
-"""Runs up to which each is compared with each; of more, each with the first."""
+"""Up to this many runs, all pairs are compared; of more, each with the first."""
 _OF_TRAINING = ("height", "width", "offsets", "batch_size", "workers", "crop_margin", "flip_prob", "color_jitter_prob")
-"""Settings of the data that an evaluation takes from the checkpoint, or has no use for."""
+"""Data settings that an evaluation takes from the checkpoint, or ignores."""
 
 
 def settings_table(runs: Mapping[str, Run]) -> Table:
-    """Return the settings in which runs differ, a column a run."""
+    """Return the settings in which runs differ, one column per run."""
     members = list(runs.values())
     keys = differing(members)
     rows = [Row(cells) for cells in zip(keys, *(values(run, keys) for run in members), strict=True)]
@@ -43,7 +43,7 @@ def settings_table(runs: Mapping[str, Run]) -> Table:
 
 
 def scores_table(runs: Mapping[str, Run]) -> Table:
-    """Return the scores of runs side by side, grouped by what they were measured on."""
+    """Return the scores of runs side by side, grouped by comparable measurements."""
     scored = dict.fromkeys((name, score) for name, run in runs.items() for score in run.scores if not score.trivial)
     group = Groups(score for _, score in scored)
     rows = [Row((name, *score.errors), "measured", group(score)) for name, score in scored]
@@ -53,7 +53,7 @@ def scores_table(runs: Mapping[str, Run]) -> Table:
 
 @dataclass(frozen=True)
 class Scored:
-    """What one run reached on each image under one protocol, in one evaluation."""
+    """One run's scores for each image under one protocol, in one evaluation."""
 
     rows: tuple[ImageRow | ViewRow, ...]
     of: Evaluation
@@ -63,15 +63,15 @@ class Scored:
         return frozenset(row.name for row in self.rows)
 
     def pairs(self, other: Scored) -> bool:
-        """Return whether both are of the same images, predicted with the same settings, where these are known."""
+        """Return whether both have the same images, predicted with the same settings if known."""
         return self.images == other.images and (self.of.how == other.of.how or self.of.foreign or other.of.foreign)
 
 
 def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str], dict[str, dict[str, Scored]]]:
-    """Compare runs in pairs, image by image, wherever both were evaluated alike; also return what was paired.
+    """Compare runs in pairs, image by image, if both were evaluated alike; also return the pairs.
 
-    Up to four runs, each is compared with each; of more, each with the first. Among all evaluations of two runs under a
-    protocol, those of the same images and settings are paired.
+    Up to four runs, all pairs are compared; of more, each with the first. Evaluations of two runs under the same
+    protocol are paired if they have the same images and settings.
     """
     names = list(runs)
     found = {name: _scored(run) for name, run in runs.items()}
@@ -85,7 +85,7 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str], dict[s
             without = [name for name in (first, other) if not found[name]]
             if without and first != names[0]:
                 continue  # said with the first one already
-            why = f"{' and '.join(without)} not evaluated" if without else "not evaluated under one protocol"
+            why = f"{' and '.join(without)} not evaluated" if without else "not evaluated under the same protocol"
             said = f"the scores of {first} and {other} are not compared ({why}); "
             left_out.append(said + _remedy(runs[first], runs[other]))
         for protocol in both:
@@ -122,7 +122,7 @@ def images_csv(paired: Mapping[str, Mapping[str, Scored]]) -> str:
 
 
 def _scored(run: Run) -> dict[str, list[Scored]]:
-    """Return a run's evaluations by protocol; of several with the same images and settings, the last."""
+    """Return a run's evaluations by protocol, and the last of several with the same images and settings."""
     found: dict[str, dict[tuple[frozenset[str], str, str], Scored]] = {}
     for folder in run.evaluations:
         if not (folder / "per_image.csv").is_file():
@@ -139,7 +139,7 @@ def _scored(run: Run) -> dict[str, list[Scored]]:
 
 
 def _told(one: Evaluation, two: Evaluation, *names: str) -> str:
-    """Say what two paired evaluations are of: the settings once where they are equal."""
+    """Describe two paired evaluations, with equal settings only once."""
     if one.how == two.how:
         return ", ".join(filter(None, (one.data, one.how, one.motion if one.motion == two.motion else "")))
     first, second = (each.how or ("as predicted elsewhere" if each.foreign else "plain") for each in (one, two))
@@ -147,26 +147,26 @@ def _told(one: Evaluation, two: Evaluation, *names: str) -> str:
 
 
 def _motions(one: Evaluation, two: Evaluation, *names: str) -> list[str]:
-    """Say that the camera's motion was found in different ways, which photometric errors depend on too."""
+    """Return a note if the camera's motion was found in different ways: photometric errors depend on it."""
     if one.motion == two.motion:
         return []
     ways = [each.motion or "the pose network's motion" for each in (one, two)]
-    return [f"{names[0]} with {ways[0]}, {names[1]} with {ways[1]}; motion=tracked for both compares depth alone"]
+    return [f"{names[0]} with {ways[0]}, {names[1]} with {ways[1]}; use motion=tracked for both to compare depth alone"]
 
 
 def _sizes(first: Run, other: Run, scored: Scored) -> list[str]:
-    """Say that two runs see images of different sizes, which photometric errors depend on."""
+    """Return a note if two runs use images of different sizes: photometric errors depend on them."""
     data = [run.config.get("data") or {} for run in (first, other)]
     sizes = [f"{each['height']}x{each['width']}" for each in data if each.get("height") and each.get("width")]
     if len(set(sizes)) < 2 or not isinstance(scored.rows[0], ViewRow):
         return []
     return [
-        f"the runs see images of different sizes, {sizes[0]} and {sizes[1]}, so these errors are not of the same pixels"
+        f"the runs use images of different sizes, {sizes[0]} and {sizes[1]}, so these errors are about different pixels"
     ]
 
 
 def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
-    """Say why no evaluation of one run pairs with any of the other."""
+    """Return why no evaluation of one run can be paired with one of the other."""
     for one, two in itertools.product(ours, theirs):
         if one.images == two.images:
             first, second = (each.of.how or "no flip or scale" for each in (one, two))
@@ -176,19 +176,19 @@ def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
 
 
 def _remedy(first: Run, other: Run) -> str:
-    """Say what to run so that two runs compare: both on the data of the first training, with results where we look."""
+    """Return the commands that make two runs comparable: both on the first training's data, into our folders."""
     trained = [run for run in (first, other) if not is_shipped(run.path)]
     leading = next(iter(trained), first)
     data, choice = leading.config.get("data") or {}, leading.choices.get("data")
     if not choice or not all(run.path.is_dir() and run.checkpoint for run in (first, other)):
-        return "run saunet evaluate on both with the same data and settings, and name the results too"
+        return "run saunet evaluate on both with the same data and settings, and add the results to this command"
     given = {f"data.{key}": str(data[key]) for key in ("root",) if data.get(key)}
     given |= {key: value for key, value in leading.overrides.items() if key.startswith(("data.", "plugins"))}
     words = [f"{key}={value}" for key, value in given.items() if key.removeprefix("data.") not in _OF_TRAINING]
     if any((run.config.get("data") or {}).get("track_motion") for run in (first, other)):
-        words.append("motion=tracked")  # which the training had: a young pose network would hide the depth
+        words.append("motion=tracked")  # as in training: an untrained pose network would hide the depth
     commands = []
-    for run in (first, other):  # what a shipped model scored is kept with the training that it is compared with
+    for run in (first, other):  # a shipped model's scores are kept with the other training
         known = is_shipped(run.path)
         place = run.name if known else _typed(run.path)
         folder = f"{_typed(leading.path)}/compared_{run.name}" if known else f"{place}/compared"
@@ -203,7 +203,7 @@ def _typed(path: Path) -> str:
 
 
 def compared(inputs: Inputs, wanted: Sequence[str]) -> tuple[list[Table], list[str], str]:
-    """Return all that can be said about how runs differ: tables, sentences about what is left out, images as CSV."""
+    """Return the differences between runs: tables, sentences about what is left out, and images as CSV."""
     members = inputs.all_runs
     if len(members) == 1 and len(members[0].evaluations) > 1:
         raise DataError(

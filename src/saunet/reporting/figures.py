@@ -20,7 +20,7 @@ from saunet.tables.drawing import COLORS, Point, colors, new_figure, stacked_fig
 
 
 def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, ordered: bool = False) -> bytes | None:
-    """Draw columns of the runs' logs against epochs, or steps of a first epoch; one panel a column, one line a run."""
+    """Draw columns of the runs' logs over epochs, or steps of a first epoch; a panel per column, a line per run."""
     drawn = logged(runs, panels)
     if not drawn:
         return None
@@ -32,7 +32,7 @@ def draw_curves(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]], *, o
 
 
 def draw_results(run: Run, groups: Sequence[Sequence[tuple[str, str]]], picture: Path | None) -> Any:
-    """Draw each group of columns of a run's log as a row of curves, above a picture; None if nothing was logged."""
+    """Draw each group of columns of a run's log as a row of curves, above a picture; None if nothing is logged."""
     named = {run.called: run}
     drawn = [found for group in groups if (found := logged(named, group))]
     if not drawn:
@@ -50,7 +50,7 @@ def draw_results(run: Run, groups: Sequence[Sequence[tuple[str, str]]], picture:
 
 
 def logged(runs: Mapping[str, Run], panels: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Return the panels whose column any of the runs has logged."""
+    """Return the panels with a column that any run has logged."""
     return [(key, title) for key, title in panels if any(curve(run.history, key)[0] for run in runs.values())]
 
 
@@ -75,7 +75,7 @@ def plot_curves(
 
 
 def draw_ratio(runs: Mapping[str, Run]) -> bytes | None:
-    """Draw Abs Rel and accuracy against the ratio alpha/beta of eq. (14); None if fewer than two runs compare."""
+    """Draw Abs Rel and accuracy against the ratio alpha/beta of eq. (14); None with fewer than two comparable runs."""
     points = sorted(
         (value, score.errors[0], score.errors[4])
         for name, score in comparable(runs).items()
@@ -111,7 +111,7 @@ def curve(
 ) -> tuple[list[float], list[float]]:
     """Return one column of a log against epochs, or steps; long ones as means of neighbors.
 
-    What is logged during an epoch lies between its whole numbers, what is logged after it on the next one: epoch 1 is
+    Values logged during an epoch lie between whole numbers, those logged after it on the next whole number: epoch 1 is
     the end of the first.
     """
     rows = [row for row in history if key in row and "step" in row and "epoch" in row]
@@ -127,7 +127,7 @@ def curve(
 
 
 def _steps_per_epoch(history: Sequence[Mapping[str, float]]) -> float:
-    """Return the length of an epoch: exact once something was logged at the end of one, else what the log has of it."""
+    """Return the length of an epoch: exact once something was logged at an epoch's end, else the logged part."""
     return max((row["step"] + 1) / (row["epoch"] + 1) for row in history if "step" in row and "epoch" in row)
 
 
@@ -143,11 +143,11 @@ def read_benchmark(folder: Path) -> list[dict[str, object]]:
 def speed(
     benchmarks: Sequence[Path], runs: Mapping[str, Run], seen: Mapping[str, Seen]
 ) -> tuple[list[Point], Table | None, list[Missing]]:
-    """Bring measured times and accuracies together.
+    """Combine measured times and accuracies.
 
-    A measurement belongs to the runs whose depth network has exactly its number of parameters (only that one is timed)
-    and its size: the accuracy was reached there and nowhere else. The figure has one point for each such run, device,
-    precision and mode, of one image at a time; of times measured twice, the one in the benchmark that is named last.
+    A measurement belongs to the runs whose depth network (only that is timed) has exactly its number of parameters and
+    its size, because the accuracy applies only there. The figure has one point for each such run, device, precision and
+    mode, for single images; if measured twice, the benchmark named last counts.
     """
     scores = chosen(runs)
     group, shared = Groups(scores.values()), comparable(runs)
@@ -164,9 +164,9 @@ def speed(
         seconds = float(str(row["median"])) / batch
         owners = [name for name in scores if networks.get(name) == (row["depth_parameters"], size.lower())]
         if not owners:
-            why = f"no scored run has a depth network of exactly this many parameters that runs at {size}"
+            why = f"no scored run has a depth network with exactly this many parameters at {size}"
             missing.append(Missing(f"Accuracy of {row['model']} ({size}, {how})", why))
-            alone.append(Row((str(row["model"]), how, size, None, seconds * 1e3), "measured", "Measured: times alone"))
+            alone.append(Row((str(row["model"]), how, size, None, seconds * 1e3), "measured", "Measured: times only"))
         for name in owners:
             accuracy = scores[name].errors[4]
             cells = (name, how, size, accuracy, seconds * 1e3)
@@ -174,11 +174,11 @@ def speed(
             if batch == 1 and name in shared:
                 points[name, kind] = Point(name, accuracy, seconds, kind)
             else:
-                why = "its time is of several images at once" if batch > 1 else "its accuracy is of other images"
+                why = "its time is for several images at once" if batch > 1 else "its accuracy is from other images"
                 missing.append(Missing(f"Accuracy against time of {name} ({how})", why))
     if not measured:
         missing.append(
-            Missing("Accuracy against time", "no benchmark given; name the folder that saunet benchmark wrote")
+            Missing("Accuracy against time", "no benchmark given; add the folder written by saunet benchmark")
         )
         return [], None, missing
     headings = columns("Method", "Device", "Size", "δ < 1.25 ↑|.3f", "ms per image|.1f")

@@ -1,4 +1,4 @@
-"""What a user names on the command line: runs, sweeps, checkpoints, evaluations, benchmarks, or folders of them."""
+"""Inputs from the command line: runs, sweeps, checkpoints, evaluations, benchmarks, or folders of them."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from saunet.runs.sweep import read_plan
 from saunet.weights.locate import is_shipped, locate, shipped
 
 _KEPT = {"lr": "initial_lr", "weight_decay": "weight_decay"}
-"""Settings of a recipe that live on in an optimizer's state, and what they are called there."""
+"""Settings of a recipe that are stored in an optimizer's state -> their names there."""
 
 
 DETAILS: Mapping[Literal["buckets", "shapes"], tuple[str, ...]] = {
     "buckets": ("bucket", "pixels", "abs_rel", "rmse", "a1"),
     "shapes": ("edge_accuracy", "edge_completeness", "f_score", "precision", "recall"),
 }
-"""What a report shows of the details of an evaluation."""
+"""Details of an evaluation that a report shows."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """The jobs of one multirun folder, in order, those included that left nothing behind."""
+    """The jobs of one multirun folder, in order, including those that left nothing behind."""
 
     name: str
     runs: tuple[Run, ...]
@@ -38,7 +38,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Everything that a report is made from."""
+    """All inputs of a report."""
 
     runs: tuple[Run, ...]
     """Single runs; those of sweeps are in ``sweeps``."""
@@ -52,9 +52,9 @@ class Inputs:
 
 
 def collect(paths: Sequence[str | Path], checkpoint: str = "best", *, strangers: bool = True) -> Inputs:
-    """Read everything that the paths name."""
+    """Read everything at the given paths."""
     if not paths:
-        raise DataError("no run given; name folders of runs or sweeps, or checkpoints: saunet report outputs/train/...")
+        raise DataError("no run given; add folders of runs or sweeps, or checkpoints: saunet report outputs/train/...")
     runs: dict[Path, Run] = {}
     sweeps: dict[Path, Sweep] = {}
     evaluations: dict[Path, Evaluation] = {}
@@ -77,7 +77,7 @@ def collect(paths: Sequence[str | Path], checkpoint: str = "best", *, strangers:
             evaluations.setdefault(file.parent, read_evaluation(file.parent))
     take, named = strangers or len(known) < 2, {Path(path).resolve() for path in paths}
     for evaluation in evaluations.values():
-        # Foreign predictions are of no run at all, so they were named for their own sake.
+        # Foreign predictions belong to no run, so they were named explicitly.
         alone = take or evaluation.foreign or evaluation.folder.resolve() in named
         if alone and not any(belongs(evaluation, run) for run in known):
             orphan, origin = Run(evaluation.folder, name=evaluation.name), evaluation.checkpoint
@@ -105,13 +105,13 @@ def collect(paths: Sequence[str | Path], checkpoint: str = "best", *, strangers:
 
 
 def _as_trained(run: Run) -> Run:
-    """Return a resumed run with the learning rate and the like that its optimizer kept from the resumed checkpoint."""
+    """Return a resumed run with the settings, such as the learning rate, kept by its checkpoint's optimizer."""
     optim = run.config.get("optim")
     if not run.record.get("resumed") or run.checkpoint is None or not isinstance(optim, Mapping):
         return run
     try:
         groups = read_torch(run.checkpoint, "a checkpoint")["optimizer_states"][0]["param_groups"]
-    except (CheckpointError, KeyError, IndexError, TypeError):  # without it, what was asked for is all that is known
+    except (CheckpointError, KeyError, IndexError, TypeError):  # without it, only the requested settings are known
         return run
     kept = {key: groups[0].get(name) for key, name in _KEPT.items()}
     kept["encoder_lr"] = groups[1].get("initial_lr") if len(groups) > 1 else None
@@ -122,7 +122,7 @@ def _as_trained(run: Run) -> Run:
 
 
 def _find(path: Path, depth: int = 3) -> list[tuple[str, Path]]:
-    """Return (kind, place) of everything at or below a path, sorted by name; a shipped model is a checkpoint."""
+    """Return (kind, path) of everything at or below a path, sorted by name; a shipped model counts as a checkpoint."""
     if not path.exists() and str(path) in shipped():
         return [("checkpoint", locate(str(path)))]
     if path.is_file():
@@ -130,7 +130,7 @@ def _find(path: Path, depth: int = 3) -> list[tuple[str, Path]]:
         kind = kinds.get(path.suffix, "")
         return [(kind, path.parent if path.suffix == ".json" else path)] if kind else []
     if not path.is_dir():
-        raise DataError(f"there is nothing at {path}; check the path, or name a shipped model: {', '.join(shipped())}")
+        raise DataError(f"there is nothing at {path}; check the path, or use a shipped model: {', '.join(shipped())}")
     if (path / "multirun.yaml").is_file():
         return [("sweep", path)]
     if began(path):
@@ -169,7 +169,7 @@ def _read_sweep(folder: Path, checkpoint: str) -> Sweep:
 
 
 def _read_checkpoint(file: Path) -> Run:
-    """Return the run that a checkpoint belongs to, with this checkpoint; the checkpoint alone where there is none."""
+    """Return the run that a checkpoint belongs to, with this checkpoint; the checkpoint alone if there is none."""
     folder = file.parents[1] if len(file.parents) > 1 else file.parent
     if file.parent.name == "checkpoints" and any((folder / name).exists() for name in (".hydra", "run.json")):
         run = read_run(folder, file.stem)
@@ -184,13 +184,13 @@ class Evaluation:
     folder: Path
     checkpoint: Path | None
     predictions: str | None
-    """Where the predictions of another system came from, made nobody knows how; None for a checkpoint."""
+    """Path of another system's predictions, of unknown origin; None for a checkpoint."""
     data: str
-    """What was scored, such as ``kitti, test split``."""
+    """The scored data, such as ``kitti, test split``."""
     how: str
-    """Settings that change the numbers, as the command line says them; empty for none."""
+    """Settings that change the numbers, as on the command line; empty for none."""
     motion: str
-    """``motion=tracked`` where the camera's motion came from tracked points; empty elsewhere."""
+    """``motion=tracked`` if the camera's motion came from tracked points, else empty."""
     scores: tuple[Score, ...]
     explained: tuple[Explained, ...]
     details: tuple[Detail, ...]
@@ -201,21 +201,21 @@ class Evaluation:
 
     @property
     def shipped(self) -> bool:
-        """Whether it is of a model that comes with saunet, wherever its results are."""
+        """Whether it belongs to a model that comes with saunet, wherever its results are."""
         return self.checkpoint is not None and is_shipped(self.checkpoint)
 
     @property
     def name(self) -> str:
-        """What it goes by without a run: its folder, or the predictions where Hydra named the folder by the time."""
+        """Its name without a run: its folder, or the predictions if the folder's name is just Hydra's time stamp."""
         dated = re.match(r"\d{4}-\d\d-\d\d_", self.folder.name)
         return self.predictions if dated and self.predictions else self.folder.name
 
 
 def read_evaluation(folder: Path) -> Evaluation:
-    """Read the scores of an evaluation and find out which checkpoint they belong to."""
+    """Read the scores of an evaluation, and find the checkpoint that they belong to."""
     content, (config, hydra) = read_mapping(folder / "metrics.json"), read_hydra(folder)
     runtime = hydra.get("runtime") or {}
-    # The settings are all there is where `output_dir` led the results out of the run's folder.
+    # Only the settings help if `output_dir` put the results outside the run's folder.
     settings = _mapping(content.get("settings"))
     predictions = config.get("predictions") or settings.get("predictions")
     given = config.get("checkpoint") or settings.get("checkpoint")
@@ -263,7 +263,7 @@ def _mapping(value: Any) -> Mapping[str, Any]:
 
 
 def belongs(evaluation: Evaluation, run: Run) -> bool:
-    """Return whether an evaluation is one of a run: of its checkpoint, or in its folder and not of another system."""
+    """Return whether an evaluation belongs to a run: its checkpoint, or its folder unless it is another system's."""
     if run.path == evaluation.folder:
         return True
     if evaluation.foreign or (evaluation.shipped and evaluation.checkpoint != run.checkpoint):
@@ -275,7 +275,7 @@ def belongs(evaluation: Evaluation, run: Run) -> bool:
 
 
 def _how(settings: Mapping[str, Any]) -> str:
-    """Say what else than the images and the protocol decides the numbers, as the evaluation recorded it."""
+    """Describe what besides images and protocol decides the numbers, as recorded by the evaluation."""
     scale = _mapping(settings.get("scale"))
     method = "stored" if scale.get("method") == "auto" else scale.get("method")
     flip = ["flip=true"] if settings.get("post_processing") else []

@@ -1,4 +1,4 @@
-"""What a report consists of, and how it is written: one HTML page that fetches nothing, Markdown, CSV, pictures."""
+"""The parts of a report, and writing them: one self-contained HTML page, Markdown, CSV, pictures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from saunet.tables.templates import rendered
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """An encoded image; its name is that of its file."""
+    """An encoded image, named like its file."""
 
     name: str
     data: bytes = field(repr=False)
@@ -56,12 +56,12 @@ class Gallery:
     scenes: tuple[Scene, ...]
     caption: str
     numbers: tuple[str, ...] = ()
-    """Of the paper's figures that it stands for."""
+    """Numbers of the paper's figures that it corresponds to."""
 
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """Something that was not made, and why."""
+    """A part that was not made, and why."""
 
     what: str
     why: str
@@ -82,7 +82,7 @@ class Section:
 class Document:
     title: str
     facts: tuple[str, ...]
-    """What stands below the title: when, from how many runs, by which version."""
+    """The line below the title: time, number of runs, version."""
     sections: tuple[Section, ...]
     missing: tuple[Missing, ...]
 
@@ -101,7 +101,7 @@ class Document:
 
 
 def as_html(document: Document, live: float | None = None) -> str:
-    """Return the page as HTML; with ``live`` it fetches itself again every so many seconds."""
+    """Return the page as HTML; with ``live`` it reloads itself every this many seconds."""
     return rendered("reporting/page.html", page=document, live=live)
 
 

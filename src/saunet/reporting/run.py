@@ -1,4 +1,4 @@
-"""One run, or a sweep, to look at: its table, its curves, and all of it on one page, while it runs and after."""
+"""Views of a run or a sweep: its table, its curves, and one page with everything, during the run and after."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ _HEALTH = {
 
 @checked
 class Run(FolderRun):
-    """A training's folder, read as it is now: while it runs, or after; a notebook shows its table and curves.
+    """A training's folder in its current state, during or after the run; a notebook shows its table and curves.
 
-    What it lacks is empty. `history` has the rows of its log, `checkpoint` its best checkpoint, `config` its settings.
+    Missing parts are empty. `history` has the rows of its log, `checkpoint` its best checkpoint, `config` its settings.
 
     Args:
-        path: The folder, the one with ``run.json``.
+        path: The folder with ``run.json``.
 
     Raises:
-        DataError: if no training is there.
+        DataError: if there is no training.
 
     Examples:
         >>> run = saunet.Run("outputs/train/2026-01-31_12-00-00")  # doctest: +SKIP
@@ -68,18 +68,18 @@ class Run(FolderRun):
 
     @property
     def table(self) -> Table:
-        """How far it is, and what it reached."""
+        """Its progress and scores."""
         return runs_table("run", f"{self.name}: {self.path}", {self.name: self}, swept=False)
 
     def plot(self) -> Drawing:
-        """Draw the curves of its losses and errors.
+        """Draw the curves of losses and errors.
 
         Returns:
-            What a notebook shows and `Drawing.save` writes.
+            The drawing; a notebook shows it, and `Drawing.save` writes it.
 
         Raises:
             ConfigError: if matplotlib is missing.
-            DataError: if nothing was logged yet.
+            DataError: if nothing has been logged yet.
         """
         require_matplotlib("a plot needs", "nothing, and use .table")
         drawn = draw_curves({self.name: self}, _CURVES)
@@ -88,11 +88,11 @@ class Run(FolderRun):
         return Drawing(drawn)
 
     def page(self) -> Document:
-        """Return all that there is to see of it as one page, the one of ``saunet watch``."""
+        """Return one page with everything about it, as in ``saunet watch``."""
         return page_of(self.path)
 
     def show(self) -> None:
-        """Show table and curves in the notebook; elsewhere open the page in the browser."""
+        """Show table and curves in the notebook; outside a notebook open the page in the browser."""
         display(self, lambda: as_html(self.page()))
 
     def __repr__(self) -> str:
@@ -110,7 +110,7 @@ def write_results(folder: Path) -> Path | None:
 
     Raises:
         ConfigError: if matplotlib is missing.
-        DataError: if the system refuses to write.
+        DataError: if the file cannot be written.
     """
     require_matplotlib("results.png needs", "nothing, and look with saunet watch")
     run = Run(folder)
@@ -122,7 +122,7 @@ def write_results(folder: Path) -> Path | None:
 
 
 def page_of(path: str | Path) -> Document:
-    """Return the page of what a path names: a run, a sweep, or a folder with several of them."""
+    """Return the page of a run, a sweep, or a folder with several of them."""
     inputs = collect([path])
     draw, missing, sections = find_spec("matplotlib") is not None, list[Missing](), list[Section]()
     if not draw:
@@ -149,7 +149,7 @@ def _named(runs: tuple[FolderRun, ...]) -> dict[str, FolderRun]:
 
 
 def _overview(name: str, title: str, runs: Mapping[str, FolderRun], *, swept: bool, draw: bool) -> Section:
-    """Return how runs stand, and their curves."""
+    """Return the progress of runs, and their curves."""
     ended = sum(run.status not in ("running", "unfinished") for run in runs.values())
     heading = f"{ended} of {len(runs)} jobs have ended" if swept else "Current state"
     blocks: list[Table | Figure] = [runs_table(name, heading, runs, swept=swept)]
@@ -170,18 +170,20 @@ def _health_panels() -> list[tuple[str, str]]:
 
 
 def _pictures(run: FolderRun) -> Section:
-    """Return the last picture of the validation; what its tiles are is written above each."""
+    """Return the last picture of the validation, with a description above each tile."""
     file, blocks = _last_picture(run), []
     if file is not None:
         epoch = int("".join(filter(str.isdigit, file.stem)) or 0) + 1
         alt = "validation images with disparity, warped neighbor, photometric error and mask"
-        caption = "Input, disparity, the neighbor warped into it, where the two differ (bright), what the mask keeps."
+        caption = (
+            "Input, disparity, the neighbor warped into it, their difference (bright), the pixels that the mask keeps."
+        )
         blocks.append(Figure(f"Epoch {epoch}", Picture(file.name, file.read_bytes(), alt), caption))
     return Section("Last pictures", tuple(blocks), "" if blocks else "they are drawn after each validation")
 
 
 def _health(run: FolderRun, draw: bool) -> Section:
-    """Return the figures that show a training that goes wrong, and what was said about them."""
+    """Return the health figures of a training, and the warnings about them."""
     said: Mapping[str, Any] = run.record.get("health") or {}
     latest = {key: value for row in run.history for key, value in row.items() if key.startswith("health/")}
     rows = [
@@ -196,12 +198,12 @@ def _health(run: FolderRun, draw: bool) -> Section:
     blocks: list[Table | Figure] = [Table("health", verdict, columns("Measure", "Latest value|.4g"), tuple(rows))]
     if draw and (drawn := draw_curves({run.name: run}, _health_panels())):
         picture = Picture("health.svg", drawn, "health measures")
-        blocks.append(Figure("Health measures", picture, "They move early where a training goes wrong."))
+        blocks.append(Figure("Health measures", picture, "They change early if a training goes wrong."))
     return Section("Health", tuple(blocks))
 
 
 def _data(run: FolderRun) -> Section:
-    """Return which frames are used, and what `saunet doctor` found where its manifest is used."""
+    """Return which frames are used, and the findings of `saunet doctor` if its manifest is used."""
     blocks = []
     if used := run.record.get("samples"):
         rows = tuple(Row((split, line.strip())) for split, text in used.items() for line in str(text).splitlines())

@@ -1,4 +1,4 @@
-"""What a report asks of the runs' networks: how large they are, and what they see in the same scenes, side by side."""
+"""The runs' networks in a report: their sizes, and their predictions for the same scenes, side by side."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from saunet.weights.files import read_model
 MARKS = ((226, 52, 58), (0, 190, 220), (120, 200, 60))
 """Colors of the boxes, RGB."""
 _WIDTH = 880
-"""Pixels of a picture on the page at most: twice what it is shown at."""
+"""Largest width in pixels of a picture on the page: twice its displayed width."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One image to show, where it comes from, and under which condition it was taken."""
+    """One image to show, with its source and the condition in which it was taken."""
 
     path: Path
     image: UInt8[np.ndarray, "h w 3"]
@@ -62,14 +62,14 @@ def read_views(scenes: Mapping[str, str | Sequence[str]], limit: int) -> list[Vi
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A run's networks, looked at once and let go."""
+    """A run's networks, used once and released."""
 
     parameters: tuple[int, int]
-    """Of the depth and the pose network."""
+    """Number of parameters of the depth and the pose network."""
     size: tuple[int, int]
     """Height and width of its input in pixels."""
     disparities: tuple[Float32[np.ndarray, "_ _"], ...]
-    """One for each view, at the image's size."""
+    """One prediction per view, at the image's size."""
 
 
 def look(run: Run, views: Sequence[View], device: str = "cpu", flip: bool = False) -> Seen | str:
@@ -91,9 +91,9 @@ def look(run: Run, views: Sequence[View], device: str = "cpu", flip: bool = Fals
 def edge_boxes(
     disparities: Sequence[Float[np.ndarray, "h w"]], image: UInt8[np.ndarray, "h w 3"], count: int
 ) -> list[Box]:
-    """Choose the parts of a scene where the models see most depth edges on edges of the image; they do not overlap.
+    """Choose parts of a scene, without overlap, where the models see most depth edges on edges of the image.
 
-    All models get the same boxes. A part is a sixth of the width, and two thirds as high as wide.
+    All models get the same parts. A part is a sixth of the width, and two thirds as high as wide.
     """
     height, width = image.shape[:2]
     size = max(8, width // 6)
@@ -114,9 +114,9 @@ def edge_boxes(
 
 
 def scene(view: View, disparities: Mapping[str, Float32[np.ndarray, "h w"]], name: str, boxes: int) -> Scene:
-    """Return a scene as input and as each model sees it, with the same parts enlarged.
+    """Return a scene as input and as predicted by each model, with the same parts enlarged.
 
-    Each model's disparity is painted over its own range: its scale means nothing.
+    Each model's disparity is colored over its own range, because its scale is arbitrary.
     """
     found = edge_boxes(list(disparities.values()), view.image, boxes)
     pictures = {"input": view.image, **{model: colorize(one) for model, one in disparities.items()}}
@@ -132,7 +132,7 @@ def scene(view: View, disparities: Mapping[str, Float32[np.ndarray, "h w"]], nam
 
 
 def _gradient(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Return how much a map changes at each pixel, over the largest such change that is not an outlier."""
+    """Return how much a map changes at each pixel, relative to the largest change that is not an outlier."""
     across, down = (cv2.Sobel(values, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))
     change = cv2.magnitude(across, down)
     top = float(np.percentile(change, 99))

@@ -1,4 +1,4 @@
-"""Which numbers compare, Tables 1 to 3 of the paper with our rows beside the printed ones, and the table of runs."""
+"""Comparable numbers, Tables 1 to 3 of the paper with our rows beside the printed ones, and the table of runs."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from saunet.tables import Cell, Column, Row, Table, columns
 from saunet.weights.locate import is_shipped
 
 _SHOWN = (ABS_REL, RMSE, A1)
-"""The errors that a table of runs shows."""
+"""Errors in the table of runs."""
 PRINTED = "Published: KITTI Eigen test split (697 images), 0–80 m, median-scaled"
 _DIGITS = 8
-"""Digits of a fingerprint that a heading shows."""
+"""Digits of a fingerprint in a heading."""
 
 
 class Groups:
-    """Headings, alike for numbers that compare and unlike for all others.
+    """Headings that are equal exactly for comparable numbers.
 
-    The fingerprint of the images is part of a heading only where it alone tells two groups apart.
+    The fingerprint of the images is part of a heading only if nothing else distinguishes two groups.
     """
 
     def __init__(self, measured: Iterable[Score | Explained | Detail]) -> None:
@@ -35,14 +35,14 @@ class Groups:
 
     def __call__(self, one: Score | Explained | Detail) -> str:
         words = _words(one)
-        which = f"sha256 {one.fingerprint[:_DIGITS]}" if one.fingerprint else "which, it does not say"
+        which = f"sha256 {one.fingerprint[:_DIGITS]}" if one.fingerprint else "the file does not say which"
         return f"{words} ({which})" if words in self._ambiguous else words
 
 
 def chosen(runs: Mapping[str, Run]) -> dict[str, Score]:
-    """Return one score of each run that has any, so that as many as possible compare.
+    """Return one score of each run that has any, chosen so that as many as possible are comparable.
 
-    Runs whose scores compare stand together, most of them first; at a draw, evaluations go before validations.
+    Runs with comparable scores are grouped, the largest group first; in a tie, evaluations come before validations.
     """
     left = {name: [score for score in run.scores if not score.trivial] for name, run in runs.items()}
     found: dict[str, Score] = {}
@@ -56,7 +56,7 @@ def chosen(runs: Mapping[str, Run]) -> dict[str, Score]:
 
 
 def comparable(runs: Mapping[str, Run]) -> dict[str, Score]:
-    """Return the scores of the largest group of runs that compare: what one drawing may hold."""
+    """Return the scores of the largest group of comparable runs, which may share a drawing."""
     scores = chosen(runs)
     first = next((_key(score) for score in scores.values()), None)
     return {name: score for name, score in scores.items() if _key(score) == first}
@@ -75,7 +75,7 @@ def _words(one: Score | Explained | Detail) -> str:
 
 
 def table1(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
-    """Return every score of the runs, with the paper's Table 1 where it compares, and which runs have none."""
+    """Return every score of the runs, with the paper's Table 1 if comparable, and the runs without a score."""
     rows, ours = list[Row](), _scored(runs)
     group = Groups(score for _, score in ours)
     for name, score in ours:
@@ -87,15 +87,15 @@ def table1(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
         if not (run.scores or run.explained)
     ]
     notes = [
-        "Numbers of different groups cannot be compared: the images, the ground truth or the training differ. "
-        "Bold is the best of its group.",
+        "Numbers of different groups cannot be compared: the images, the ground truth or the training differ. The "
+        "best of each group is bold.",
         "Pattern: D = depth as supervision, M = monocular video, S = stereo pairs.",
     ]
     if _compares(score for _, score in ours):
         rows += [Row((row.method, row.pattern, *row.errors), "published", PRINTED) for row in published().table1]
-        notes.append("Eigen's last two numbers are equal in the paper; Klodt's RMSE log is a dash there.")
+        notes.append("In the paper, Eigen's last two numbers are equal, and Klodt's RMSE log is a dash.")
     elif ours:
-        why = "they are of KITTI's Eigen split, and no run was scored on it"
+        why = "they are for KITTI's Eigen split, and no run was scored on it"
         missing.append(Missing("Published errors to compare with", why))
     headings = (*columns("Method", "Pattern"), *ERROR_COLUMNS)
     table = Table("table1", "Errors and accuracy (the paper’s Table 1)", headings, tuple(rows), tuple(notes))
@@ -103,7 +103,7 @@ def table1(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
 
 
 def _compares(scores: Iterable[Score]) -> bool:
-    """Return whether any score is under a protocol of KITTI's Eigen split, as the paper's are."""
+    """Return whether any score uses a protocol of KITTI's Eigen split, as the paper does."""
     return any(score.protocol.startswith("eigen") for score in scores)
 
 
@@ -127,16 +127,16 @@ def explained_table(runs: Mapping[str, Run]) -> Table | None:
 
 
 def health_tables(runs: Mapping[str, Run]) -> list[Table]:
-    """Return what looked sick while runs were trained, in the words of their records; nothing if nothing did."""
+    """Return the health warnings recorded in training, if any."""
     marks = {name: run.record.get("health") for name, run in runs.items()}
     rows = [
         Row((name, str(said))) for name, found in marks.items() if isinstance(found, Mapping) for said in found.values()
     ]
-    return [Table("health", "What looked sick in training", columns("Run", "Finding"), tuple(rows))] if rows else []
+    return [Table("health", "Health warnings in training", columns("Run", "Finding"), tuple(rows))] if rows else []
 
 
 def detail_tables(runs: Mapping[str, Run]) -> list[Table]:
-    """Return where the errors of runs are, and their scores of edges and point clouds, as far as they were measured."""
+    """Return the errors of runs by place, and their scores of edges and point clouds, as far as measured."""
     kinds = {
         "buckets": ("Errors by place", columns("Where", "Pixels", "Abs Rel ↓|.3f", "RMSE ↓|.3f", "δ1 ↑|.3f")),
         "shapes": (
@@ -159,7 +159,7 @@ def detail_tables(runs: Mapping[str, Run]) -> list[Table]:
 
 
 def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table | None, list[Missing]]:
-    """Return the parameters of our networks, with the paper's Table 2; None without any."""
+    """Return the parameters of our networks, with the paper's Table 2; None without networks."""
     if not sizes:
         return None, [Missing("Parameters of the networks", "no run has a checkpoint")]
     rows = [
@@ -173,7 +173,7 @@ def table2(sizes: Mapping[str, tuple[int, int]]) -> tuple[Table | None, list[Mis
 
 
 def table3(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
-    """Return our runs of different encoders and decoders, with the paper's Table 3 where it compares; None without."""
+    """Return our runs of different encoders and decoders, with the paper's Table 3 if comparable; None without any."""
     ours = _scored({name: run for name, run in runs.items() if run.component("model/encoder")})
     models = [(runs[name], score) for name, score in ours if not score.trivial]
     group = Groups(score for _, score in models)
@@ -183,9 +183,9 @@ def table3(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
     rows = [Row((networks(run), *_ticks(run), *score.errors), "measured", group(score)) for run, score in models]
     rest, notes = [key for key in differing([run for run, _ in models]) if not key.startswith("model.")], []
     if rest:
-        notes.append(f"Our rows also differ in {', '.join(rest)}; the table of runs says how.")
+        notes.append(f"Our rows also differ in {', '.join(rest)}; see the table of runs.")
     if _compares(score for _, score in models):
-        notes.append("The paper's first two rows are digit for digit Mono R18 and Mono R50 of its Table 1.")
+        notes.append("The paper's first two rows equal Mono R18 and Mono R50 of its Table 1 digit for digit.")
         rows += [
             Row((row.method, _tick(row.stratified), _tick(row.attention), *row.errors), "published", PRINTED)
             for row in published().table3
@@ -195,7 +195,7 @@ def table3(runs: Mapping[str, Run]) -> tuple[Table | None, list[Missing]]:
 
 
 def runs_table(name: str, title: str, runs: Mapping[str, Run], *, swept: bool) -> Table:
-    """Return runs with what sets them apart as columns, how they ended, and what they reached."""
+    """Return runs with their differing settings, how they ended, and their scores."""
     members = list(runs.values())
     keys = differing(members, by_overrides=swept)
     ratios = [ratio(run) for run in members]
@@ -240,7 +240,7 @@ def status(run: Run) -> str:
 
 
 def with_pose(run: Run) -> str:
-    """Return a run's networks in words, with the pose network where it is not the whole model's own."""
+    """Return a run's networks in words, with the pose network if it is not the whole model's own."""
     pose, system = run.component("model/pose"), _system(run)
     own = _own_parts(system).get("pose") if system else None
     return networks(run) + (f", pose {pose}" if pose and pose != own else "")
@@ -248,12 +248,12 @@ def with_pose(run: Run) -> str:
 
 @functools.cache
 def _own_parts(system: str) -> Spec:
-    """Return the parts of a whole model by kind; asked for by each row of each table."""
+    """Return the parts of a whole model by kind; cached, because each row of each table needs them."""
     return Spec.of("model", system)
 
 
 def _system(run: Run) -> str:
-    """Return the name of the whole model that was chosen, where its encoder and decoder were left as they are."""
+    """Return the name of the chosen whole model, if its encoder and decoder are unchanged."""
     name = run.choices.get("model", "")
     if name not in models.names():
         return ""
@@ -270,13 +270,13 @@ def last_mean(run: Run, key: str) -> float | None:
 
 
 def _progress(run: Run) -> tuple[Cell, Cell]:
-    """Return how many epochs a run went and its last mean training loss."""
+    """Return a run's number of epochs and its last mean training loss."""
     epochs = [row["epoch"] for row in run.history if "epoch" in row]
     return (int(max(epochs)) + 1 if epochs else None), last_mean(run, "train/loss")
 
 
 def losses_table(runs: Mapping[str, Run]) -> Table | None:
-    """Return the losses that runs have logged, and the fraction of pixels that they are of; None if none has."""
+    """Return the losses that runs have logged, and the fraction of pixels used; None if no run has any."""
     rows = []
     for name, run in runs.items():
         validated = [row["val/loss"] for row in run.history if "val/loss" in row]
@@ -288,14 +288,14 @@ def losses_table(runs: Mapping[str, Run]) -> Table | None:
         "says little if these are few."
     ]
     if any(key.split(".")[0] in ("objective", "loss") for key in differing(list(runs.values()))):
-        notes.append("The objectives differ, so these losses do not compare.")
+        notes.append("The objectives differ, so these losses cannot be compared.")
     headings = columns("run", "epochs", "loss|.4f", "lowest val/loss|.4f", "pixels used|.3f")
     logged = any(cell is not None for row in rows for cell in row.cells[2:])
     return Table("losses", "Losses", headings, tuple(rows), tuple(notes)) if logged else None
 
 
 def _scored(runs: Mapping[str, Run]) -> list[tuple[str, Score]]:
-    """Return every score once, group by group; validation counts where nothing else is."""
+    """Return every score once, group by group; validation scores only if there are no others."""
     pairs = []
     for name, run in runs.items():
         evaluated = [score for score in run.scores if not score.validation]

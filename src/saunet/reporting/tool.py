@@ -37,24 +37,26 @@ Scenes = str | Sequence[str] | Mapping[str, str | Sequence[str]] | None
 @checked
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions:
-    """What a report is made from, and how.
+    """Options of `report`: its inputs, and how to present them.
 
     Args:
         runs: Folders of runs, sweeps, evaluations and benchmarks, folders that hold such folders, and checkpoints.
-        compare: Write no page, but say how the runs differ, with ``images.csv``, the errors of every image in each run.
-        checkpoint: Which checkpoint of a run is meant, ``best`` or ``last``.
+        compare: Report how the runs differ instead of making a page; ``images.csv`` has each run's errors for every
+            image.
+        checkpoint: Which checkpoint of a run to use, ``best`` or ``last``.
         title: Heading of the page.
-        labels: Names of the single runs, in order; by default made from what sets them apart.
+        labels: Names of the single runs, in order; by default made from their differing settings.
         scenes: Images to show: folders or patterns, or a mapping of such by condition.
-        scenes_limit: Images of each condition at most.
-        zooms: Enlarged parts of each scene.
+        scenes_limit: Largest number of images per condition.
+        zooms: Number of enlarged parts per scene.
         figures: Draw curves, if matplotlib is installed.
-        device: Where scenes are predicted; ``auto`` takes a GPU if there is one.
+        device: Where to predict scenes; ``auto`` uses a GPU if there is one.
         flip: Average with the prediction of the mirrored image.
-        output_dir: Folder for the page, its Markdown, its tables and its pictures; None, as in Python, writes none.
+        output_dir: Folder for the page, its Markdown, its tables and its pictures; None, the default in Python, writes
+            none.
 
     Raises:
-        ConfigError: if an option cannot work.
+        ConfigError: if an option is invalid.
 
     Examples:
         >>> saunet.ReportOptions(runs=("outputs/train",)).zooms
@@ -88,17 +90,17 @@ class ReportResult:
     document: Document | None = None
     """The page; None for a comparison."""
     tables: tuple[Table, ...] = ()
-    """Of a page or a comparison."""
+    """Tables of the page or the comparison."""
     left_out: tuple[str, ...] = ()
-    """One sentence for each thing that has no data."""
+    """One sentence for each part without data."""
     folder: Path | None = None
-    """Where the files were written."""
+    """Folder of the files."""
 
     def _repr_html_(self) -> str:
         return notebook_html(self.tables)
 
     def show(self) -> None:
-        """Print a comparison, or where the page is and what it lacks."""
+        """Print a comparison, or the path of the page and what it lacks."""
         if self.document is None:
             show(self.tables)
         for sentence in self.left_out:
@@ -109,10 +111,10 @@ class ReportResult:
 
 
 def report(options: ReportOptions) -> ReportResult:
-    """Make one page of tables, curves and pictures from finished runs, or say how runs differ.
+    """Make one page of tables, curves and pictures from finished runs, or report how runs differ.
 
     Args:
-        options: What from, and how.
+        options: The inputs, and how to present them.
 
     Raises:
         ConfigError: if the labels do not fit the runs.
@@ -141,7 +143,7 @@ def report(options: ReportOptions) -> ReportResult:
 
 
 def _by_condition(scenes: Scenes) -> dict[str, str | Sequence[str]]:
-    """Return the images to show by condition; a list or a single path has no condition of its own."""
+    """Return the images to show by condition; a list or a single path has no condition."""
     if isinstance(scenes, Mapping):
         return {str(key): value for key, value in scenes.items()}
     return {"scenes": scenes} if scenes else {}
@@ -160,7 +162,7 @@ class _Group:
 def build(
     inputs: Inputs, options: ReportOptions | None = None, progress: Callable[[str], None] = lambda text: None
 ) -> Document:
-    """Make a report of what was read."""
+    """Make a report from inputs that are read already."""
     options = options or ReportOptions()
     device, draw = str(usable_device(options.device)), options.figures and find_spec("matplotlib") is not None
     views = read_views(_by_condition(options.scenes), options.scenes_limit)
@@ -205,14 +207,15 @@ def build(
     missing += [*_no_pictures(views, galleries), *no_rows, *no_sizes, *no_ablation, *no_speed]
     missing.append(Missing("Published curves and pictures", "the paper prints them as images only"))
     if any(name not in shown and not run.explained for name, run in everyone.items()):
-        why = "they are in the tables of their sweeps; evaluate their checkpoints to have them here too"
+        why = "they are in the tables of their sweeps; evaluate their checkpoints to include them here"
         missing.append(Missing("Errors and accuracy of the jobs of sweeps", why))
     return Document(options.title, _facts(everyone), tuple(sections), tuple(missing))
 
 
 _READING = (
-    "Disparity, bright where it is near; each picture has its own range of colors, since the scale of a model is "
-    "arbitrary. Boxes mark where the models see depth jump at edges of the image; they are the same for all models."
+    "Disparity; bright is near. Each picture has its own range of colors, because the scale of a model is "
+    "arbitrary. Boxes mark parts where the models see depth jump at edges of the image; they are the same for all "
+    "models."
 )
 
 
@@ -224,7 +227,7 @@ def _groups(inputs: Inputs, wanted: Sequence[str]) -> list[_Group]:
     if wanted:
         names[0] = list(wanted)
     if len({name for row in names for name in row}) < sum(map(len, names)):
-        raise ConfigError(f"labels {list(wanted)} name two runs alike; give each its own name")
+        raise ConfigError(f"labels {list(wanted)} have the same name twice; give each run its own")
     named = [dict(zip(row, runs, strict=True)) for row, runs in zip(names, members, strict=True)]
     groups = [_Group("runs", "runs", named.pop(0), swept=False)] if inputs.runs else []
     counts = Counter(sweep.name for sweep in inputs.sweeps)
@@ -235,7 +238,7 @@ def _groups(inputs: Inputs, wanted: Sequence[str]) -> list[_Group]:
 
 
 def _varied(group: _Group) -> Named:
-    """Return the runs of a group whose runs have different networks; nothing of one that varies something else."""
+    """Return the runs of a group with different networks; nothing for a group that varies something else."""
     kinds = {tables.networks(run) for run in group.runs.values() if run.component("model/encoder")}
     return group.runs if len(kinds) > 1 or not group.swept else {}
 
@@ -244,13 +247,13 @@ def _runs(groups: Sequence[_Group], draw: bool, missing: list[Missing]) -> list[
     blocks: list[Table | Figure] = []
     for group in groups:
         jobs = f"{group.title[0].upper()}{group.title[1:]}: {len(group.runs)} jobs"
-        heading = jobs if group.swept else "What sets them apart, and what they reached"
+        heading = jobs if group.swept else "Their differing settings and scores"
         blocks.append(tables.runs_table(group.name, heading, group.runs, swept=group.swept))
         if not draw or not sweeps_ratio(list(group.runs.values())):
             continue
         drawing = figures.draw_ratio(group.runs)
         if drawing is None:
-            why = "fewer than two jobs have scores that compare"
+            why = "fewer than two jobs have comparable scores"
             missing.append(Missing(f"Errors against α/β of {group.title}", why))
             continue
         shared = list(comparable(group.runs).values())
@@ -266,7 +269,7 @@ def _curves(group: _Group, missing: list[Missing]) -> list[Figure]:
     ordered = sweeps_ratio(list(group.runs.values()))
     wanted = (
         ("Fig. 4", "loss", (("train/loss", "training loss, total"), ("train/photometric", "photometric term")),
-         "Totals with different weights cannot be compared; the photometric term, eqs. (8) to (12), can be."),
+         "Totals with different weights cannot be compared; the photometric term, eqs. (8) to (12), can."),
         ("Fig. 5", "accuracy", (("val/a1", "accuracy, δ < 1.25"), ("val/abs_rel", "Abs Rel")),
          "On validation frames."),
     )  # fmt: skip
@@ -298,7 +301,7 @@ def _galleries(group: _Group, views: Sequence[View], seen: Mapping[str, Seen], z
         campus = condition.lower().startswith("campus")
         numbers: tuple[str, ...] = ("7",) if losses else ("9",) if campus else ("8", "11") if several else ("8",)
         title = f"{what.capitalize()} side by side: {condition.replace('_', ' ')}"
-        if what == "settings":  # which is no figure of the paper
+        if what == "settings":  # not a figure of the paper
             numbers = ()
         else:
             title = f"{title} (the paper’s Fig{'s' * (len(numbers) > 1)}. {' and '.join(numbers)})"
@@ -314,14 +317,14 @@ def _galleries(group: _Group, views: Sequence[View], seen: Mapping[str, Seen], z
 def _no_pictures(views: Sequence[View], galleries: Sequence[Gallery]) -> list[Missing]:
     what = "Depth side by side"
     if not views:
-        why = "no scenes given; name images, such as 'scenes={kitti: FOLDER, campus_sunny: FOLDER}'"
+        why = "no scenes given; set scenes, such as 'scenes={kitti: FOLDER, campus_sunny: FOLDER}'"
         return [Missing(what, why)]
     if not galleries:
         return [Missing(what, "no run has a checkpoint that can be used")]
     found = {number for gallery in galleries for number in gallery.numbers}
     reasons = {
-        "7": ("Loss functions", "no group of runs differs in its loss alone"),
-        "8": ("Models", "no scenes but those of the campus, or runs that differ in their loss alone"),
+        "7": ("Loss functions", "no group of runs differs only in its loss"),
+        "8": ("Models", "no scenes other than those of the campus, or no runs that differ only in their loss"),
         "9": ("Models on the campus", "no scenes named campus_CONDITION"),
         "11": ("Different networks", "no runs of different networks"),
     }
@@ -339,15 +342,15 @@ def _speed(points: Sequence[Point]) -> list[Figure]:
     ]
     drawing = svg(draw_speed([*points, *printed], "accuracy, δ < 1.25"))
     caption = (
-        "Times of single images. One belongs to the runs whose network has the benchmark's parameters and size. "
-        "Hollow: the only time that the paper gives in numbers, from another device and data set."
+        "Times of single images, for runs whose network has the benchmark's parameters and size. Hollow: the only "
+        "time that the paper gives in numbers, from another device and data set."
     )
     picture = Picture("figure10.svg", drawing, "seconds per image against accuracy")
     return [Figure("Accuracy against time (the paper’s Fig. 10)", picture, caption)]
 
 
 def _by_networks(runs: Named, sizes: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
-    """Return sizes by networks in words, so that a sweep's jobs are one row; by run where the words do not tell."""
+    """Return sizes by networks in words, so that a sweep's jobs share a row; by run if the words are ambiguous."""
     words = {name: _words(runs[name]) for name in sizes}
     counts = Counter(word for word, _ in {(words[name], size) for name, size in sizes.items()})
     return {(words[name] if counts[words[name]] == 1 else name): size for name, size in sizes.items()}

@@ -1,4 +1,4 @@
-"""`watch`: the page of a run or a sweep, served on this machine and brought up to date while it is open."""
+"""`watch`: the page of a run or a sweep, served on this machine and updated while it is open."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from saunet.reporting.page import Document, as_html
 from saunet.reporting.run import page_of
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
-"""Where a server answers this machine only."""
+"""Addresses of a server for this machine only."""
 _FRESH = 60.0
-"""Seconds after which a page is made again though no file has changed: a killed run writes nothing."""
+"""Seconds after which a page is made again even if no file has changed: a killed run writes nothing."""
 
 
 @checked
 @dataclass(frozen=True, kw_only=True)
 class WatchOptions:
-    """What `watch` shows, and where.
+    """Options of `watch`: the run to show, and the address.
 
     Args:
-        run: The folder of a run or a sweep, or one that holds several.
+        run: The folder of a run or a sweep, or a folder with several.
         host: Address to listen on; ``0.0.0.0`` lets other machines see the page too.
-        port: Port to listen on; 0 takes any that is free.
-        every: Seconds between two looks at the folder.
+        port: Port to listen on; 0 uses any free one.
+        every: Seconds between checks of the folder.
 
     Raises:
-        ConfigError: for a port or a time that cannot be.
+        ConfigError: if the port or the time is out of range.
 
     Examples:
         >>> saunet.WatchOptions(run="outputs/train").host
@@ -51,14 +51,14 @@ class WatchOptions:
 
 
 def watch(options: WatchOptions) -> None:
-    """Serve the page of a run or a sweep until Ctrl-C: curves, last pictures, health and data, always as they are now.
+    """Serve the page of a run or a sweep until Ctrl-C: current curves, pictures, health and data.
 
     Args:
-        options: What to show, and where.
+        options: The run to show, and the address.
 
     Raises:
         ConfigError: if the port is taken.
-        DataError: if no run is there.
+        DataError: if there is no run.
 
     Examples:
         >>> saunet.watch(saunet.WatchOptions(run="outputs/train"))  # doctest: +SKIP
@@ -76,13 +76,13 @@ def watch(options: WatchOptions) -> None:
 def serving(options: WatchOptions) -> Iterator[str]:
     """Serve the page while the block runs; yields its address."""
     pages = _Pages(options)
-    pages.current()  # what cannot be read is said now
+    pages.current()  # report what cannot be read now
     local = options.host in LOCAL
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             name = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
-            if local and name.strip("[]") not in LOCAL:  # another site's page, whose name was made to point here
+            if local and name.strip("[]") not in LOCAL:  # the page of another site whose host name points here
                 self.send_error(403)
             elif self.path != "/":
                 self.send_error(404)
@@ -102,7 +102,7 @@ def serving(options: WatchOptions) -> Iterator[str]:
                 self.wfile.write(text)
 
         def log_message(self, format: str, *args: object) -> None:
-            """Say nothing: requests come every few seconds."""
+            """Log nothing: requests come every few seconds."""
 
     try:
         server = ThreadingHTTPServer((options.host, options.port), Handler)
@@ -121,7 +121,7 @@ def serving(options: WatchOptions) -> Iterator[str]:
 
 
 class _Pages:
-    """The page as it is now, made again only when a file has changed or some time has passed."""
+    """The current page, made again only when a file has changed or some time has passed."""
 
     def __init__(self, options: WatchOptions) -> None:
         self._path, self._every, self._lock = Path(options.run), float(options.every), threading.Lock()
@@ -143,13 +143,13 @@ class _Pages:
 
 
 def _state(path: Path) -> str:
-    """Return a text that changes whenever a file of a run that the page shows does."""
+    """Return a text that changes whenever a file of a displayed run does."""
     found = hashlib.sha256()
     for pattern in ("**/run.json", "**/metrics.csv", "**/metrics.json", "**/pictures/*.png", "**/sweep.json"):
         for file in sorted(path.glob(pattern)):
             try:
                 stat = file.stat()
-            except OSError:  # replaced this moment
+            except OSError:  # just replaced
                 continue
             found.update(f"{file}{stat.st_mtime_ns}{stat.st_size}".encode())
     return found.hexdigest()
