@@ -331,7 +331,9 @@ def test_a_bare_stream_has_the_rate_of_the_camera_file(tmp_path):
     write_video(tmp_path / "r" / "video.hevc", 12, codec="libx265", form="hevc", options=silent)
     camera = "image_size: [128, 96]\nK: [110, 110, 63.5, 47.5]\n"
     (tmp_path / "r" / "camera.yaml").write_text(camera)
-    with pytest.warns(UserWarning, match=r"frame rate of .*video\.hevc is unknown.*all are taken.*fps in camera\.yaml"):
+    with pytest.warns(
+        UserWarning, match=r"frame rate of .*video\.hevc is unknown.*all frames are used.*fps in camera\.yaml"
+    ):
         (drive,) = module(tmp_path / "r", static="keep", fps=10.0).drives()
     assert (len(drive.indices), drive.fps, drive.timestamps) == (12, None, None)
     (tmp_path / "r" / "camera.yaml").write_text(camera + "fps: 20\n")
@@ -377,7 +379,7 @@ def test_an_unknown_camera_is_estimated_once_from_all_its_clips(tmp_path, monkey
     assert asked == [(2, (128 / 288, 100 / 288))]  # a window a clip; the second time it is known
     assert "known to within 0.40% from 5 windows" in caplog.text
     (kept,) = (tmp_path / "cache").glob("camera-*.yaml")  # for prediction, which takes no unknown camera
-    assert f"{kept}, which saunet predict takes as undistort=" in caplog.text
+    assert f"{kept}; give it to saunet predict as undistort=" in caplog.text
     lens = Undistorter(read_camera(kept)).lens(200, 320)
     np.testing.assert_allclose(lens.K, drive.intrinsics(0), rtol=1e-6)
     np.testing.assert_array_equal(lens(frames(14)[3]), drive.image(3))

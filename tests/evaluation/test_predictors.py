@@ -215,7 +215,9 @@ def test_scaled_by_the_median_at_native_size_and_only_where_there_is_truth(tmp_p
     exporting = ExportingPredictor(disparity_of, tmp_path, rules)
     first = score_all({"m": exporting}, [export_batch()], [rules], ground_truth="improved", progress=False)
     assert exporting.written == 2
-    assert str(exporting).startswith("export: 2 images as 'eigen_improved' scales them, 1 left out that have no ground")
+    assert str(exporting).startswith(
+        "export: 2 images, scaled as in 'eigen_improved', 1 left out because they have no ground"
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["day_a_0_l.png", "day_b_1_l.png"]
     assert read_depth(tmp_path / "day_b_1_l.png").shape == (20, 36)
     for place in range(2):

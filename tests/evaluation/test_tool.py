@@ -251,7 +251,7 @@ def test_statistics_and_the_earlier_run(options, tmp_path):
         ({"predictions": None}, "neither is set"),
         ({"flip": True}, "leave it out with predictions"),
         ({"protocols": ("eigen_lidar",)}, "did you mean 'eigen_lidar_x'"),
-        ({"protocols": ("synthetic",)}, "'exact' ground truth, and these data give camera_z or lidar_x"),
+        ({"protocols": ("synthetic",)}, "'exact' ground truth, but these data give camera_z or lidar_x"),
         ({"intervals": 95.0}, "intervals is 95"),
         ({"split": "train"}, "split is 'train'"),
         ({"match": "nam"}, "match is 'nam'"),

@@ -176,7 +176,7 @@ def test_weight_zero_leaves_a_term_out(make_inputs: Make) -> None:
         ),
         (
             lambda: SaunetObjective(extra={"x": {"term": Constant(), "weight": 1.0, "value": 3}}),
-            "extra term 'x' is built already, so value cannot be set",
+            "extra term 'x' is already built, so value cannot be set",
         ),
     ],
 )

@@ -89,7 +89,7 @@ def test_objectives_say_whether_they_need_source_depth() -> None:
 @pytest.mark.parametrize(
     ("term", "key", "message"),
     [
-        (Velocity(), "distance", "the velocity term needs 'distance' in the batch, which the data does not give; set"),
+        (Velocity(), "distance", "the velocity term needs 'distance' in the batch, which the data do not provide; set"),
         (TrackedMotion(), "T_tracked", "the tracked_motion term needs 'T_tracked' in the batch.*track_motion"),
         (Consistency(), "source_depth", "the consistency term needs 'source_depth' in the batch"),
     ],

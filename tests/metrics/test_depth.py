@@ -143,5 +143,5 @@ def test_mismatched_batches():
     disparity, depth, size = samples()
     with pytest.raises(DataError, match="does not fit into its padded map 40x62"):
         DepthMetrics().update(disparity, depth, size.flip(-1))
-    with pytest.raises(DataError, match="3 predictions came with 7 ground truths"):
+    with pytest.raises(DataError, match="got 3 predictions, 7 ground truths"):
         native_depths(depth, size, images=3)

@@ -46,7 +46,7 @@ def test_decoder_refuses_strides(name):
 
 
 def test_too_few_channels():
-    with pytest.raises(ConfigError, match="stride of 32 needs 5 levels"):
+    with pytest.raises(ConfigError, match="stride of 32 needs 5 numbers"):
         decoders.build("unet", features=_resnet18(), channels=(16, 32))
 
 

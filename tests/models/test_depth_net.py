@@ -126,12 +126,12 @@ def test_smallest_image(decoder):
 
 @pytest.mark.parametrize("limits", [(0.0, 80.0), (5.0, 5.0), (-1.0, 80.0)])
 def test_depth_limits(limits):
-    with pytest.raises(ConfigError, match="needed: 0 < min_depth < max_depth"):
+    with pytest.raises(ConfigError, match="they must satisfy 0 < min_depth < max_depth"):
         _small(min_depth=limits[0], max_depth=limits[1])
 
 
 def test_an_encoder_of_several_frames_is_refused():
-    with pytest.raises(ConfigError, match="encoder has frames 2; depth comes from one image: frames=1"):
+    with pytest.raises(ConfigError, match="encoder has frames=2; depth comes from one image: set frames=1"):
         DepthNet(encoders.build("resnet18", blocks=(1, 1, 1, 1), frames=2), decoders.partial("unet"))
 
 

@@ -89,7 +89,7 @@ def test_starts_as_strided_convolutions():
 
 @pytest.mark.parametrize("kwargs", [{"dims": (8, 8)}, {"depths": (4, 4, 1)}])
 def test_wrong_stages(kwargs):
-    with pytest.raises(ConfigError, match="Lite-Mono has three stages of at least two blocks"):
+    with pytest.raises(ConfigError, match="Lite-Mono has three stages with at least two blocks"):
         encoders.build("lite_mono", **kwargs)
 
 

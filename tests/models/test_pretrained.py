@@ -237,7 +237,7 @@ class TestPartialFiles:
 
     def test_bias_tables_under_unknown_names(self, tmp_path: Path) -> None:
         path = save(tmp_path / "w.pth", {"stage.attn.relative_position_bias_table": torch.zeros(25, 1)})
-        with pytest.raises(CheckpointError, match="holds no weights of this SwinTransformer"):
+        with pytest.raises(CheckpointError, match="has no weights of this SwinTransformer"):
             load_pretrained(swin(), path)
 
     def test_are_taken_where_allowed(self, tmp_path: Path) -> None:
@@ -248,7 +248,9 @@ class TestPartialFiles:
 
     def test_of_something_else_are_refused_even_so(self, tmp_path: Path) -> None:
         path = save(tmp_path / "w.pth", {"a.b": torch.zeros(2)})
-        with pytest.raises(CheckpointError, match=r"holds no weights of this SwinTransformer; its first are a\.b"):
+        with pytest.raises(
+            CheckpointError, match=r"has no weights of this SwinTransformer; its first entries are a\.b"
+        ):
             load_pretrained(swin(), path, allow_partial=True)
 
 
@@ -312,7 +314,7 @@ class TestFiles:
     @pytest.mark.parametrize("content", [{"epoch": 3}, [1, 2], {0: torch.zeros(2)}])
     def test_file_without_weights_is_refused(self, content: object, tmp_path: Path) -> None:
         torch.save(content, tmp_path / "w.pth")
-        with pytest.raises(CheckpointError, match="holds no weights"):
+        with pytest.raises(CheckpointError, match="has no weights"):
             load_pretrained(swin(), str(tmp_path / "w.pth"))
 
     @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def test_frames_share_first_layer():
 
 @pytest.mark.parametrize("blocks", [(2, 2, 2), (2, 0, 2, 2)])
 def test_wrong_blocks(blocks):
-    with pytest.raises(ConfigError, match="four stages of at least one block"):
+    with pytest.raises(ConfigError, match="four stages with at least one block"):
         ResNet(blocks)
 
 

@@ -68,5 +68,5 @@ class TestWithTimm:
         with pytest.raises(CheckpointError, match="not a file of timm's 'resnet18': it lacks"):
             saunet.build("encoder", "timm", model="resnet18", weights=str(tmp_path / "w.pth"))
         encoder = saunet.build("encoder", "timm", model="vit_tiny_patch16_224", image_size=(64, 96))
-        with pytest.raises(ConfigError, match="64x128 and the encoder was built for 64x96"):
+        with pytest.raises(ConfigError, match="64x128 but the encoder was built for 64x96"):
             encoder(torch.rand(1, 3, 64, 128))

@@ -623,7 +623,7 @@ class TestMonodepth2:
             ("encoder", {"mhca_stages.0.x": torch.zeros(1)}, "not an encoder.*MPViT of MonoViT"),
             ("encoder", {"reduce_conv.0.weight": torch.zeros(1)}, "ManyDepth's network for several frames"),
             ("encoder", {"x": torch.zeros(1)}, "its first entry is 'x'"),
-            ("encoder", {}, "holds no weights"),
+            ("encoder", {}, "has no weights"),
             ("depth", {"convs.f4.conv_se.weight": torch.zeros(1)}, "not a decoder.*nested decoder"),
         ],
     )

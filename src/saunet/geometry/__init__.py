@@ -16,7 +16,7 @@ R = TypeVar("R")
 def full_precision(function: Callable[P, R]) -> Callable[P, R]:
     """Decorate a function of tensors: autocast is off inside it and half-precision arguments arrive as float32.
 
-    Half precision has eleven bits: on a 640 pixel wide image that is a coordinate rounded to half a pixel. float32 and
+    Half precision has eleven bits: on a 640 pixel wide image, that rounds a coordinate to half a pixel. float32 and
     float64 arguments pass unchanged, so gradients can be checked in float64.
     """
 

@@ -1,6 +1,6 @@
-"""Pinhole intrinsics that follow what happens to an image: resize, crop, flip.
+"""Pinhole intrinsics that follow an image through resize, crop and flip.
 
-All functions take K as ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in pixels; integer coordinates are pixel centers.
+All functions expect K as ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in pixels; integer coordinates are pixel centers.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from saunet.geometry import full_precision
 
 Number = float | int | Float[Tensor, "*b"]
 GUESS = 0.5 / math.tan(math.radians(60) / 2)
-"""Focal length of a camera that nobody knows, in picture widths: 60 degrees of view."""
+"""Focal length assumed for an unknown camera, in picture widths: a 60 degree field of view."""
 
 
 @full_precision
@@ -66,7 +66,7 @@ def crop_intrinsics(K: Float[Tensor, "*b 3 3"], left: Number, top: Number) -> Fl
 def flip_intrinsics(K: Float[Tensor, "*b 3 3"], width: Number) -> Float[Tensor, "*b 3 3"]:
     """Intrinsics of a horizontally mirrored image: ``cx -> width - 1 - cx``.
 
-    The mirrored image is one of the mirrored world: a point (x, y, z) is seen as (-x, y, z).
+    The mirrored image shows the mirrored world: a point (x, y, z) appears at (-x, y, z).
 
     Args:
         K: Intrinsics in pixels of the original image.

@@ -14,7 +14,7 @@ from saunet.geometry import full_precision
 def sigmoid_to_disparity(sigmoid: Float[Tensor, "*b"], min_depth: float, max_depth: float) -> Float[Tensor, "*b"]:
     """Map a sigmoid in [0, 1] linearly onto disparities between ``1 / max_depth`` and ``1 / min_depth``.
 
-    Monodepth2 (Godard et al., 2019) has it so.
+    As in Monodepth2 (Godard et al., 2019).
 
     Args:
         sigmoid: The network's output.

@@ -2,7 +2,7 @@
 
 A plane ``n . p = h`` (n the unit normal that points down, h the camera's height above it) means ``g . p = 1`` with
 ``g = n / h``, and on the ray through a pixel ``g . ray = 1 / z``: inverse depth is linear in the rays. The relative
-error ``z (g . ray) - 1`` is therefore the same whatever unit the depth has, and one tolerance fits every network.
+error ``z (g . ray) - 1`` therefore does not depend on the unit of depth, and one tolerance fits every network.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from saunet.geometry import full_precision
 from saunet.geometry.warp import backproject
 
 _MOST_POINTS = 2000
-"""Of more pixels, hypotheses are scored on so many, evenly spread; the final fit uses all of them."""
+"""Largest number of pixels to score hypotheses on, evenly spread; the final fit uses all pixels."""
 _ROUNDS = 5
-"""Of reweighting; the fit does not move any more after three or four."""
+"""Reweighting iterations; the fit converges after three or four."""
 
 
 class GroundPlane(NamedTuple):
@@ -30,13 +30,13 @@ class GroundPlane(NamedTuple):
     normal: Float[Tensor, "b 3"]
     """Unit normal in the camera's frame (x right, y down, z forward), from the camera down to the plane."""
     height: Float[Tensor, " b"]
-    """Distance from the camera to the plane, in the unit of the depth; NaN where there is no plane."""
+    """Distance from the camera to the plane, in the unit of the depth; NaN if there is no plane."""
     support: Float[Tensor, " b"]
-    """Fraction of the pixels looked at that lie on the plane."""
+    """Fraction of the examined pixels that lie on the plane."""
 
 
 def road_region(height: int, width: int, device: torch.device | None = None) -> Bool[Tensor, "{height} {width}"]:
-    """Where a camera that looks ahead expects road: a trapezium in the lower two fifths of the image."""
+    """Where a forward camera expects road: a trapezoid in the lower two fifths of the image."""
     v = (torch.arange(height, device=device)[:, None] + 0.5) / height
     u = (torch.arange(width, device=device) + 0.5) / width
     depth_in_image = (v - 0.6) / 0.4
@@ -53,16 +53,16 @@ def fit_ground(
     max_tilt: float = 25.0,
     hypotheses: int = 256,
 ) -> GroundPlane:
-    """Fit the ground plane to each depth map: the plane most pixels agree with, then reweighted least squares.
+    """Fit the ground plane to each depth map: the plane that most pixels agree with, then reweighted least squares.
 
-    Planes through three pixels each are drawn, always the same ones, so equal depth gives an equal plane. Cars, kerbs
-    and noise are left out as long as the road is the largest plane of the region that lies below the camera.
+    Planes through three pixels each are drawn, always the same ones, so equal depth gives an equal plane. Cars, curbs
+    and noise are ignored as long as the road is the largest plane below the camera in the region.
 
     Args:
         depth: Depth in any unit; 0, NaN or infinite where unknown.
         K: Intrinsics, pixels.
         region: Where to look; `road_region` if None.
-        tolerance: Relative depth error up to which a pixel belongs to the plane.
+        tolerance: Largest relative depth error for a pixel to belong to the plane.
         max_tilt: Largest angle between the plane's normal and the camera's y axis, degrees.
         hypotheses: Number of planes tried.
     """
@@ -103,7 +103,7 @@ def _fit(
         return nothing
     g = solved[best]
     for _ in range(_ROUNDS):
-        expected = rays @ g  # inverse depth on the plane; it, not the noisy measurement, weights the pixels
+        expected = rays @ g  # inverse depth on the plane, used as weight instead of the noisy measurement
         error = 1 / (expected * z) - 1
         weight = torch.where(expected > 0, (1 - (error / tolerance).square()).clamp(min=0).square(), 0.0)
         A, b = rays / expected[:, None], 1 / (z * expected)
@@ -117,7 +117,7 @@ def _fit(
 
 
 def _is_ground(g: Float[Tensor, "*n 3"], upright: float) -> Bool[Tensor, "*n"]:
-    """Whether planes g . p = 1 lie below the camera and are about level."""
+    """Whether planes g . p = 1 lie below the camera and are roughly level."""
     length = torch.linalg.vector_norm(g, dim=-1)
     below: Tensor = (g[..., 1] > upright * length) & g.isfinite().all(-1) & (length > 0)
     return below

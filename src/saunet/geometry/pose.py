@@ -1,4 +1,4 @@
-"""Rigid motions, without matrix products: on a GPU these may run in TF32 (ten bits), which visibly moves a pixel."""
+"""Rigid motions, without matrix products: on a GPU these may run in TF32 (ten bits), which moves pixels visibly."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from saunet.geometry import full_precision
 
 _SMALL_ANGLE_SQUARED = 1e-2
 _FAR_OFF = 1.0
-"""Logarithm of a ratio of depths from which on a point does not count."""
+"""Points with a larger logarithm of the depth ratio do not count."""
 
 
 @full_precision
 def axisangle_to_matrix(axisangle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotations of axis-angle vectors, exact also around the angle 0, where the textbook formula is 0 / 0."""
+    """Rotations of axis-angle vectors, also exact near angle 0, where the textbook formula is 0 / 0."""
     squared = axisangle.square().sum(-1)
     small = squared < _SMALL_ANGLE_SQUARED
-    # The branch that is not taken must stay finite too: its gradient is multiplied by zero, and 0 * inf is NaN.
+    # The branch not taken must be finite too: its gradient is multiplied by zero, and 0 * inf is NaN.
     angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
     series = torch.where(small, squared, torch.zeros_like(squared))
     sin_over_angle = torch.where(
@@ -86,20 +86,20 @@ def invert_pose(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
 def scaled_motion(
     T: Float[Tensor, "b s 4 4"], points: Float[Tensor, "b s n 3"], depth: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b s 4 4"]:
-    """Make translations of length 1 so long that points move as a depth map says.
+    """Scale translations of length 1 so that points move as a depth map says.
 
-    The length is the one whose parallax, length / depth, fits that of the points, 1 / z, best: near points count most,
-    as they do in images. Points whose ratio is far from the median do not count (Tukey's weights). The length is
-    differentiable in depth, so that a depth map times a factor explains images as well as before: a motion without
-    gradient would let depth chase it, ever smaller.
+    The length is the one whose parallax, length / depth, best fits that of the points, 1 / z: near points count most,
+    as in images. Points with a ratio far from the median do not count (Tukey's weights). The length is differentiable
+    in depth, so a depth map times a factor explains images equally well: otherwise depth would chase the motion and
+    keep shrinking.
 
     Args:
         T: Motions T_src_tgt, NaN where unknown.
-        points: Pixel column and row in the target, and depth in lengths of the translation; NaN where there is none.
-        depth: Depth of the target, which gives the unit.
+        points: Pixel column and row in the target, and depth in lengths of the translation; NaN if missing.
+        depth: Depth of the target, which defines the unit.
 
     Returns:
-        Motions in the unit of ``depth``; NaN where T is, and where no point with a depth lies in the picture.
+        Motions in the unit of ``depth``; NaN where T is NaN, or no point with a depth lies in the picture.
     """
     height, width = depth.shape[-2:]
     column, row, z = points.unbind(-1)
@@ -114,7 +114,7 @@ def scaled_motion(
     told = parallax > 0
     length = (weight / (found * z)).sum(-1) / parallax.where(told, 1.0)
     still, known = (T[..., :3, 3] == 0).all(-1), T.isfinite().flatten(-2).all(-1)
-    # NaN must not be a factor of anything learned: a gradient of 0 times NaN is NaN.
+    # NaN must not multiply anything learned: a gradient of 0 times NaN is NaN.
     T = torch.where(known[..., None, None], T, 0.0)
     scaled = _assemble(T[..., :3, :3], T[..., :3, 3] * length.where(told & ~still, 0.0)[..., None])
     return torch.where((known & (told | still))[..., None, None], scaled, torch.nan)

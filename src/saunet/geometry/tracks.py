@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 
 _FEWEST = 30
-"""Points that a motion needs."""
+"""Fewest points for a motion."""
 _STILL, _PARALLAX = 0.0006, 0.0015
-"""Shifts in picture widths: the median below which the camera stands still, and the least that tells a distance."""
+"""Shifts in picture widths: the camera stands still below this median; the smallest shift that gives a distance."""
 _NOTHING = (np.zeros((0, 2)), np.zeros(0))
 _OFF = 0.0008
-"""Distance, in picture widths, from which a point does not belong to the motion."""
+"""Points off by more than this, in picture widths, do not belong to the motion."""
 
 
 class TrackedMotion(NamedTuple):
-    """A motion without its length, and the points that would tell it."""
+    """A motion up to its length, and the points that determine the length."""
 
     T_src_tgt: Float[F64, "4 4"]
-    """The translation is a direction of length 1, or 0 where the camera only turned or stood still."""
+    """The translation is a direction of length 1, or 0 if the camera only turned or stood still."""
     points: Float[F64, "n 2"]
-    """Where in the target the points lie whose distance is known, pixels."""
+    """Pixels in the target of the points with a known distance."""
     depth: Float[F64, " n"]
     """Their depth, camera z, in lengths of the translation."""
 
@@ -37,11 +37,11 @@ def tracked_motion(
     source: UInt8[NDArray[np.uint8], "h w 3"],
     K: Float[F64, "3 3"],
 ) -> TrackedMotion | None:
-    """Return how the camera moved from the target to the source, up to the length of the way.
+    """Return the camera's motion from the target to the source, up to its length.
 
-    Corners are followed by Lucas and Kanade's method, back and forth. The five-point method (Nister 2004) with MAGSAC
-    (Barath et al. 2019), both OpenCV's, gives rotation and direction without any depth: they are right from the first
-    step of a training on, and a turn is never taken for a sideways motion.
+    Corners are tracked back and forth with Lucas and Kanade's method. The five-point method (Nister 2004) with MAGSAC
+    (Barath et al. 2019), both from OpenCV, gives rotation and direction without any depth. So they are right from the
+    first training step on, and a turn is never mistaken for a sideways motion.
 
     Args:
         target: RGB.
@@ -49,7 +49,7 @@ def tracked_motion(
         K: Intrinsics of both, pixels.
 
     Returns:
-        None where too few points can be followed.
+        None if too few points can be tracked.
     """
     width = target.shape[1]
     points = _follow(_gray(target), _gray(source))
@@ -64,7 +64,7 @@ def tracked_motion(
     T[:3, :3] = _turn(rays, seen)
     off = _shift(rays, seen, T[:3, :3]) * K[0, 0]
     if np.median(off) < _OFF * width:
-        # There are as many epipolar geometries as directions then, and which one comes out is chance.
+        # Every direction then gives an epipolar geometry, and the result would be random.
         return TrackedMotion(T, *_NOTHING)
     essential, mask = cv2.findEssentialMat(start, end, K, method=cv2.USAC_MAGSAC, prob=0.999, threshold=_OFF * width)
     if essential is None or essential.shape[0] < 3:
@@ -83,7 +83,7 @@ def tracked_motion(
 
 
 def _shift(rays: F64, seen: F64, R: F64) -> F64:
-    """Return by how much points are off where they would be without a translation, on the plane z = 1."""
+    """Return the distance of points from their positions without a translation, on the plane z = 1."""
     turned = rays @ R.T
     off: F64 = np.linalg.norm(seen[:, :2] / seen[:, 2:] - turned[:, :2] / turned[:, 2:], axis=1)
     return off
@@ -126,10 +126,10 @@ def follow(
     tolerance: float,
     margin: int = 0,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Follow points (n 1 2) by Lucas and Kanade's method from one gray picture to another, and back.
+    """Track points (n 1 2) with Lucas and Kanade's method from one gray picture to another, and back.
 
     Returns:
-        Where they are, and which can be relied on: they come back to within ``tolerance`` pixels, and are inside the
+        Their positions, and which are reliable: those that return to within ``tolerance`` pixels and are inside the
         picture by more than ``margin``.
     """
     flow: Any = functools.partial(cv2.calcOpticalFlowPyrLK, nextPts=None, winSize=(15, 15), maxLevel=4)

@@ -15,13 +15,13 @@ from saunet.geometry import full_precision
 from saunet.types import View
 
 MIN_Z = 1e-3
-"""Meters in front of a camera from where a point counts as visible; nearer, 1/z and its gradient explode."""
+"""Smallest distance in front of a camera, in meters, for a visible point; nearer, 1/z and its gradient explode."""
 FAR = 1e6
-"""Meters that stand for infinity: no parallax is left, and 0 * infinity does not occur."""
+"""Distance in meters used for infinity: there is no parallax left, and 0 * infinity does not occur."""
 BORDER = 1e-2
-"""Pixels beyond the outermost pixel centers still inside: more than float32 rounding, too little to see."""
+"""Pixels beyond the outermost pixel centers that still count as inside: more than float32 rounding, but invisible."""
 BEHIND = -2.0
-"""Pixel, in both axes, of a point that no source sees: outside every image."""
+"""Coordinate, on both axes, of a point that no source sees: outside every image."""
 
 
 @full_precision
@@ -56,16 +56,16 @@ def backproject(depth: Float[Tensor, "b 1 h w"], K: Float[Tensor, "b 3 3"]) -> F
 def project(
     points: Float[Tensor, "b 3 h w"], K: Float[Tensor, "b 3 3"], T: Float[Tensor, "b 4 4"]
 ) -> tuple[Float[Tensor, "b h w 2"], Float[Tensor, "b h w"]]:
-    """Pixels where points are seen by another camera: K T p, the outer part of SAU-Net eq. (7).
+    """Pixels where another camera sees points: K T p, the outer part of SAU-Net eq. (7).
 
     Args:
         points: Points in the target camera's frame, meters.
         K: Intrinsics of the source camera, pixels.
-        T: ``T_src_tgt``: a target point times it is a source point.
+        T: ``T_src_tgt``, which maps target points to source points.
 
     Returns:
-        Pixels (u, v) in the source image, and depth z in the source camera. A point less than `MIN_Z` in front of the
-        camera, or that is NaN, gets a pixel outside every image, and no gradient.
+        Pixels (u, v) in the source image, and depth z in the source camera. A point that is NaN, or less than `MIN_Z`
+        in front of the camera, gets a pixel outside every image and no gradient.
 
     Examples:
         >>> K = torch.tensor([[[2.0, 0.0, 1.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]])
@@ -84,7 +84,7 @@ def project(
 def project_each(
     points: Float[Tensor, "b 3 h w"], K: Float[Tensor, "b 3 3"], T_src_tgt: Float[Tensor, "b s 4 4"]
 ) -> tuple[Float[Tensor, "b s h w 2"], Float[Tensor, "b s h w"]]:
-    """Do what `project` does, for several source cameras with the same intrinsics."""
+    """Same as `project`, for several source cameras with the same intrinsics."""
     x, y, z = points[:, None, None].unbind(3)
     columns = T_src_tgt[:, :, :3, :, None, None].unbind(3)
     moved = columns[0] * x + columns[1] * y + columns[2] * z + columns[3]
@@ -125,13 +125,13 @@ def synthesize(
 ) -> View:
     """Resample the sources into the target camera: H_{t'->t} of SAU-Net eq. (7).
 
-    Bilinear, with the border color outside the picture. Infinite depth is a point that only rotation moves.
+    Bilinear, with the border color outside the picture. A point at infinite depth only moves by rotation.
 
     Args:
         sources: Source images.
         depth: Depth of the target, meters.
         K: Intrinsics of target and sources, pixels.
-        T_src_tgt: Motion: a target point times it is a source point.
+        T_src_tgt: Motion, which maps target points to source points.
 
     Returns:
         The warped images, and where a point lies in front of the source camera and inside its image.

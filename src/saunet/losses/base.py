@@ -1,4 +1,4 @@
-"""What a loss term is, and how objectives add terms up."""
+"""Loss terms, and objectives as their weighted sums."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ class TermResult:
 
     value: Float[Tensor, ""]
     maps: Mapping[str, Tensor] = field(default_factory=dict)
-    """Detached pictures for the log at full resolution (b 1 h w)."""
+    """Detached full-resolution pictures for the log (b 1 h w)."""
 
 
 class Term(nn.Module):
     """A part of the objective: register a subclass with ``@terms.register("name")`` and name it in the config.
 
     The parameters of ``__init__`` are its config keys. `forward` averages over scales itself, never waits for the
-    device, and returns 0 with a graph where nothing can be compared.
+    device, and returns 0 with a graph if nothing can be compared.
     """
 
     needs_source_depth: bool = False
-    """Whether the batch must hold ``source_depth``, the depth network's answer for the sources."""
+    """Whether the batch must have ``source_depth``, the depth network's prediction for the sources."""
     can_be_empty: bool = True
-    """Whether nothing may be left to compare (all masked, nothing measured), which is worth 0; False for a prior on the
-    prediction alone."""
+    """Whether there may be nothing to compare (all masked, nothing measured), with a value of 0; False for a prior on
+    the prediction alone."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class Term(nn.Module):
         """Return the term's value for one batch.
 
         Args:
-            batch: Images and intrinsics; ``loss_target`` and ``loss_sources`` are what to compare.
+            batch: Images and intrinsics; ``loss_target`` and ``loss_sources`` are compared.
             pyramid: The predicted depth of the target, one map per scale.
             poses: The predicted motion T_src_tgt.
             views: The sources resampled into the target camera, one view per scale, all at full resolution.
@@ -97,9 +97,9 @@ class Objective(nn.Module):
 
 
 def require(batch: TrainBatch, key: str, term: str, fix: str) -> Float[Tensor, "..."]:
-    """Return ``batch[key]``, or say which term misses it and what to do."""
+    """Return ``batch[key]``, or raise an error with the term that needs it and what to do."""
     if key not in batch:
-        raise ConfigError(f"{term} needs '{key}' in the batch, which the data does not give; {fix}")
+        raise ConfigError(f"{term} needs '{key}' in the batch, which the data do not provide; {fix}")
     value: Tensor = batch[key]  # type: ignore[literal-required]
     return value
 
@@ -118,6 +118,6 @@ def _extra_term(name: str, settings: Any) -> tuple[Term, float]:
         return registered_terms.build(str(term), **options), float(weight)
     if options:
         raise ConfigError(
-            f"extra term '{name}' is built already, so {', '.join(options)} cannot be set; allowed: weight"
+            f"extra term '{name}' is already built, so {', '.join(options)} cannot be set; allowed: weight"
         )
     return term, float(weight)  # type: ignore[return-value]

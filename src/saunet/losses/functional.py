@@ -19,14 +19,11 @@ _C1, _C2 = 0.01**2, 0.03**2
 def ssim_loss(prediction: Float[Tensor, "*b c h w"], target: Float[Tensor, "*#b c h w"]) -> Float[Tensor, "*b c h w"]:
     """Structural dissimilarity (1 - SSIM) / 2 in [0, 1], the first part of SAU-Net eq. (8), per channel.
 
-    A 3x3 box window with reflection padding, as the field uses it; a Gaussian window is another function.
+    A 3x3 box window with reflection padding, as usual in this field; a Gaussian window gives other values.
 
     Args:
         prediction: Images in [0, 1].
-        target: What they should look like; broadcast over the leading dimensions.
-
-    Returns:
-        One map a channel.
+        target: The expected images; broadcast over the leading dimensions. Returns: One map per channel.
 
     Examples:
         >>> image = torch.rand(1, 3, 8, 8)
@@ -51,11 +48,11 @@ def photometric_error(
 
     Args:
         prediction: Images in [0, 1].
-        target: What they should look like; broadcast over the leading dimensions.
+        target: The expected images; broadcast over the leading dimensions.
         ssim_weight: w, the weight of the structural part; 0 leaves it out.
 
     Returns:
-        One map an image.
+        One map per image.
 
     Examples:
         >>> black, white = torch.zeros(1, 3, 4, 4), torch.ones(1, 3, 4, 4)
@@ -73,18 +70,18 @@ def photometric_error(
 def combine_sources(
     errors: Float[Tensor, "b s 1 h w"], valid: Bool[Tensor, "b s 1 h w"] | None = None, sources: str = "minimum"
 ) -> tuple[Float[Tensor, "b 1 h w"], Bool[Tensor, "b 1 h w"]]:
-    """One error a pixel from one a source: the minimum of SAU-Net eq. (10), or the mean.
+    """One error per pixel from one per source: the minimum of SAU-Net eq. (10), or the mean.
 
     Args:
         errors: Photometric error of each source.
-        valid: Where a source counts; everywhere if None. A source that does not count never wins the minimum.
+        valid: Where a source counts; None for everywhere. A source that does not count never wins the minimum.
         sources: ``minimum`` or ``mean``.
 
     Returns:
         The error, 0 where no source counts, and where at least one does.
 
     Raises:
-        ConfigError: for another word.
+        ConfigError: for any other ``sources``.
 
     Examples:
         >>> errors = torch.tensor([0.3, 0.1]).view(1, 2, 1, 1, 1)  # two sources, one pixel
@@ -110,11 +107,11 @@ def automask(
 ) -> Bool[Tensor, "b 1 h w"]:
     """Pixels that the loss uses: warping explains them better than no motion, SAU-Net eq. (11) with its sign corrected.
 
-    The paper prints the comparison reversed, which would keep static pixels; this is Monodepth2's.
+    The paper prints the comparison reversed, which would keep static pixels; this one is Monodepth2's.
 
     Args:
         error: Error of the warped sources.
-        identity: Error of the sources as they are.
+        identity: Error of the unwarped sources.
         noise: Standard deviation of the noise that decides ties; with 0 a tie is masked.
 
     Returns:
@@ -136,7 +133,7 @@ def masked_mean(
 ) -> Float[Tensor, ""]:
     """Mean over the images of each image's ``sum(values * mask) / max(sum(mask), 1)``; 0 with a graph for empty masks.
 
-    An image counts as one whatever its mask keeps, so that the loss does not depend on how a batch is split over
+    Each image has the same weight whatever its mask keeps, so the loss does not depend on how a batch is split over
     processes or passes. Values may be anything, even NaN, where the mask is 0.
     """
     mask = mask.expand_as(values).flatten(1)
@@ -151,7 +148,7 @@ def smoothness_loss(disparity: Float[Tensor, "b 1 h w"], image: Float[Tensor, "b
 
     Args:
         disparity: Disparity at any scale of the values.
-        image: The image at the same size; where it has an edge, so may the disparity.
+        image: The image at the same size; the disparity may have edges where it has.
 
     Returns:
         Mean over horizontal plus mean over vertical neighbor pairs.
@@ -197,11 +194,11 @@ def gradient_loss(
     """Difference of two maps' gradients, SAU-Net eq. (13): mean over horizontal plus mean over vertical gradients.
 
     Args:
-        prediction: The map to teach.
+        prediction: The predicted map.
         target: The map g* to follow.
-        known: Where the target has a value; everywhere if None. A gradient counts only if all its pixels are known.
+        known: Where the target has a value; None for everywhere. A gradient counts only if all its pixels are known.
         operator: ``forward`` differences as printed, or ``sobel`` (LapDepth's).
-        padding: Of ``sobel``: ``replicate`` or ``zero``.
+        padding: Padding of ``sobel``: ``replicate`` or ``zero``.
 
     Returns:
         The loss.

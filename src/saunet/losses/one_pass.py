@@ -1,13 +1,13 @@
 """View synthesis and photometric loss in one pass on a CPU: value and gradient together, one image and scale at a time.
 
-`saunet.geometry.warp` and `saunet.losses.functional` say the same as separate operations, whose maps of all sources and
-scales are kept for the gradient. Here the few maps at work stay in the processor's cache:
+`saunet.geometry.warp` and `saunet.losses.functional` compute the same with separate operations, which keep the maps of
+all sources and scales for the gradient. Here the few maps in use stay in the processor's cache:
 
 - A pixel (u, v) of disparity D is seen at (M (u, v, 1) + D m) / w, where w is the third row, M = A R K^-1, m = A t, and
-  A is K followed by the scaling to [-1, 1]. Depth is never formed, and only D, M and m get gradients; from these on to
-  poses and intrinsics it is autograd's matter.
-- Box sums stand for box means: C1 and C2 of SSIM are multiplied by 81.
-- A mask is a number, 1.0 or 0.0: on a CPU, choosing by truth values costs ten times a multiplication.
+  A is K followed by the scaling to [-1, 1]. Depth is never computed, and only D, M and m get gradients; autograd
+  continues from these to poses and intrinsics.
+- Box sums replace box means, so C1 and C2 of SSIM are multiplied by 81.
+- Masks are numbers, 1.0 or 0.0: on a CPU, selecting by booleans costs ten times as much as a multiplication.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from saunet.types import TrainBatch
 
 _C1, _C2 = 81 * 0.01**2, 81 * 0.03**2
 _CENTER = 0.5
-"""Taken from the images before they are squared: the small variances of bright, flat areas (sky) keep their digits."""
+"""Subtracted from images before squaring: small variances of bright, flat areas (sky) keep their precision."""
 _UNSEEN = 1e6
 """Added to the error of a source that does not count: more than any error."""
 
@@ -46,10 +46,10 @@ class Choices:
 
 
 def takes(batch: TrainBatch) -> bool:
-    """Return whether a batch can be compared in one pass: on a CPU, where no image learns."""
+    """Return whether a batch can be compared in one pass: on a CPU, without gradients for images."""
     given = batch["loss_target"], batch["loss_sources"]
     large = min(given[0].shape[-2:]) >= 4
-    plain = "target_mask" not in batch  # pixels left out are the separate operations' matter
+    plain = "target_mask" not in batch  # left-out pixels need the separate operations
     return plain and large and given[0].device.type == "cpu" and not any(each.requires_grad for each in given)
 
 
@@ -65,7 +65,7 @@ def photometric(
 ) -> tuple[Float[Tensor, " scales"], Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
     """Return each scale's photometric loss; and of the first scale the error, and 1.0 where it counts.
 
-    Disparities, poses and K get gradients, and these none of their own. ``noise`` decides ties of the auto-mask.
+    Disparities, poses and K get gradients, but no second-order ones. ``noise`` decides ties of the auto-mask.
     """
     images = target.contiguous(), sources.contiguous()
     result: tuple[Tensor, Tensor, Tensor] = _OnePass.apply(  # type: ignore[no-untyped-call]
@@ -150,7 +150,7 @@ class _OnePass(torch.autograd.Function):
 def _combine(
     errors: Sequence[Tensor], seen: Sequence[Tensor] | None, minimum: bool
 ) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Return the error of a pixel over its sources, where any counts, and the part that each has in its gradient."""
+    """Return each pixel's error over its sources, where any counts, and each source's part in its gradient."""
     known = torch.ones_like(errors[0])
     if not minimum:
         parts = [torch.ones_like(each) for each in errors] if seen is None else [each.clone() for each in seen]
@@ -163,7 +163,7 @@ def _combine(
         known = functools.reduce(torch.maximum, seen)
     best = functools.reduce(torch.minimum, errors)
     left, parts = known.clone(), []
-    for each in errors:  # of equal ones, the first
+    for each in errors:  # the first of equal ones
         parts.append(torch.eq(each, best, out=torch.empty_like(best)).mul_(left))
         left -= parts[-1]
     return best, known, parts
@@ -184,7 +184,7 @@ class _Cameras:
 
 
 class _Warp:
-    """Where the pixels of one image are seen by its sources, as `grid_sample` takes it: s h w (x y)."""
+    """Where the sources see the pixels of one image, in `grid_sample`'s form: s h w (x y)."""
 
     def __init__(self, disparity: Tensor, cameras: _Cameras, image: int) -> None:
         self.disparity, self.cameras, self.image = disparity, cameras, image
@@ -231,7 +231,7 @@ class _Warp:
 
 
 class _Comparison:
-    """SSIM and absolute difference to one image, with the slopes for every source; its maps are made once.
+    """SSIM and absolute difference to one image, with the slopes for every source; the image's maps are computed once.
 
     With x and y about `_CENTER`, X and Y the box sums of these, and A and B those of the images themselves:
     n1 = 2 A B + C1, d1 = A^2 + B^2 + C1, n2 = 18 sum(x y) - 2 X Y + C2, d2 = 9 sum(x^2 + y^2) - X^2 - Y^2 + C2.
@@ -240,7 +240,7 @@ class _Comparison:
     def __init__(self, like: Tensor, count: int, ssim_weight: float, learns: bool) -> None:
         shape = like.shape[1:]
         self.weight = ssim_weight
-        self.kept = like.new_empty(count if learns else 1, 4, *shape)  # what remains of each source for its slope
+        self.kept = like.new_empty(count if learns else 1, 4, *shape)  # kept from each source for its slope
         self.stats, self.work = like.new_empty(7, *shape), like.new_empty(7, *shape)
         self.gradient = like.new_empty(count if learns else 0, *shape)
         self.C2 = like.new_full(shape[-1:], _C2 / 9)

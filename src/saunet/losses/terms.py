@@ -1,4 +1,4 @@
-"""Registered loss terms: what can be added up to an objective."""
+"""Registered loss terms, which objectives add up."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ _TARGETS = {
 class Photometric(Term):
     """Minimum reprojection error times auto-mask, SAU-Net eqs. (8)-(12), averaged over scales.
 
-    A pixel that no source sees, or that shows the own vehicle (the batch's ``target_mask``), has no error: it is left
-    out of the mean (with ``reduction: all`` and the auto-mask, it counts with its unwarped error, like every pixel that
-    does not teach). If no pixel is left, the loss is 0.
-    Its maps are ``photometric_error``, and ``automask`` or, without one, ``visible``.
+    A pixel that no source sees, or that shows the recording vehicle (the batch's ``target_mask``), has no error and is
+    left out of the mean. With ``reduction: all`` and the auto-mask, it counts with its unwarped error, like every
+    masked pixel. If no pixel is left, the loss is 0. Its maps are ``photometric_error``, and ``automask`` or, without
+    one, ``visible``.
 
     Args:
         sources: ``minimum`` over the sources, eq. (10), or their ``mean``, eq. (6).
@@ -49,8 +49,8 @@ class Photometric(Term):
         automask: Drop pixels that the unwarped sources explain better, eq. (11).
         reduction: Mean over the used pixels (``masked``), or over all with the smaller of the warped and unwarped
             error (``all``, Monodepth2's code).
-        use_validity: Ignore a source where the point leaves its image or lies behind its camera. Without it such pixels
-            compare with the border color, as Monodepth2 does.
+        use_validity: Ignore a source if the point leaves its image or lies behind its camera. Otherwise such pixels are
+            compared with the border color, as in Monodepth2.
         noise: Standard deviation of the noise that decides ties of the auto-mask while training.
     """
 
@@ -93,7 +93,7 @@ class Photometric(Term):
         return TermResult(value=torch.stack(values).mean(), maps=maps)
 
     def _in_one_pass(self, batch: TrainBatch, pyramid: DepthPyramid, poses: Float[Tensor, "b s 4 4"]) -> TermResult:
-        """Do what `forward` does, without the views."""
+        """Compute `forward` without the views."""
         target, noise = batch["loss_target"], None
         if self.automask and self.training and self.noise > 0:
             noise = torch.stack([self.noise * torch.randn_like(target[:, 0]) for _ in pyramid.disparity])
@@ -109,7 +109,7 @@ class Photometric(Term):
 
     @torch.no_grad()
     def _identity(self, sources: Tensor, target: Tensor) -> Tensor:
-        """Return the error of the unwarped sources: the same for every scale, and nothing learns from it."""
+        """Return the error of the unwarped sources, which is the same for every scale and has no gradient."""
         return combine_sources(photometric_error(sources, target, self.ssim_weight), None, self.sources)[0]
 
     def _reduce(
@@ -144,8 +144,8 @@ class Monodepth2Photometric(Photometric):
 class Smoothness(Term):
     """Edge-aware smoothness of the mean-normalized disparity (Monodepth2 eq. (3)), averaged over scales.
 
-    Each scale is compared at its own size with the image reduced to it, and weighted by 1/2**scale. As in Monodepth2 it
-    takes the network's relative disparity (its sigmoid).
+    Each scale is compared at its own size with the reduced image, and weighted by 1/2**scale. As in Monodepth2, it uses
+    the network's relative disparity (its sigmoid).
     """
 
     can_be_empty = False
@@ -170,7 +170,7 @@ def _multiscale_smoothness(
 
 @terms.register("gradient")
 class Gradient(Term):
-    """Gradient loss, SAU-Net eq. (13), against a target g* that can be swapped, averaged over scales.
+    """Gradient loss, SAU-Net eq. (13), against a selectable target g*, averaged over scales.
 
     Every scale is compared at its own size (a target pixel is the mean of the known pixels it covers) and weighted by
     1/2**scale, which makes a difference between neighbors one per pixel of the image. Only gradients between known
@@ -180,12 +180,12 @@ class Gradient(Term):
         target: ``image``: no ground truth, edge-aware smoothness of the mean-normalized disparity (of the other
             parameters only ``scales`` applies); ``lidar``: depth measured by a scanner, meters; ``teacher``: depth
             predicted by another model.
-        domain: What is compared: ``depth`` as printed (metric, so it sets the scale of the network); ``log_depth`` and
-            ``aligned`` (prediction times the median ratio, which does not learn), which leave the scale free;
+        domain: The compared quantity: ``depth`` as printed (metric, so it sets the scale of the network); ``log_depth``
+            and ``aligned`` (prediction times the median ratio, without its gradient), which leave the scale free;
             ``disparity``.
         operator: ``forward`` differences as printed, or ``sobel`` (LapDepth's, un-normalized).
-        padding: Of ``sobel``: ``replicate``, or ``zero`` (LapDepth's), which supervises values at the border.
-        scales: Which scales to compare; all if None. LapDepth's is ``[0]``.
+        padding: Padding of ``sobel``: ``replicate``, or ``zero`` (LapDepth's), which supervises values at the border.
+        scales: Scales to compare; None for all. LapDepth's is ``[0]``.
     """
 
     def __init__(
@@ -229,7 +229,7 @@ class Gradient(Term):
     def compare(self, depth: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
         """Return eq. (13) for one scale."""
         known = (target > 0) & depth.isfinite()
-        target = torch.where(known, target, 1.0)  # a harmless value: it never counts, but its logarithm must exist
+        target = torch.where(known, target, 1.0)  # a harmless value that never counts, but whose logarithm must exist
         if self.domain == "log_depth":
             depth, target = depth.log(), target.log()
         elif self.domain == "disparity":
@@ -243,8 +243,8 @@ class Gradient(Term):
 class Consistency(Term):
     """Geometry consistency of SC-Depth: a target point's depth in a source camera against the depth predicted there.
 
-    The mean relative difference at full resolution over all points visible in a source. It needs the depth network's
-    answer for the sources, one more forward pass each.
+    The mean relative difference at full resolution over all points visible in a source. It needs predicted depth of the
+    sources, one more forward pass each.
     """
 
     needs_source_depth = True
@@ -266,7 +266,7 @@ class Consistency(Term):
 class Velocity(Term):
     """Difference between predicted and true distance traveled, | ||t|| - speed * dt |, in meters (PackNet).
 
-    The distance comes from ``batch["distance"]`` (NaN where unknown) or, where that is missing, from the true motion
+    The distance comes from ``batch["distance"]`` (NaN where unknown) or, if that is missing, from the true motion
     ``batch["T_src_tgt"]``. It makes depth metric; PackNet's weight is 0.1. A stereo view, whose motion is known,
     does not count.
     """
@@ -277,13 +277,13 @@ class Velocity(Term):
         predictions = poses.shape[1] - ("T_stereo_tgt" in batch)
         if predictions == 0:
             raise ConfigError(
-                "the velocity term compares predicted motion and the stereo view is the only source; "
-                "drop the term, or set data.offsets=[-1,1]"
+                "the velocity term compares predicted motion, but the stereo view is the only source; drop the "
+                "term, or set data.offsets=[-1,1]"
             )
         if "distance" not in batch and "T_src_tgt" in batch:
             distance = torch.linalg.vector_norm(batch["T_src_tgt"][..., :3, 3], dim=-1)
         else:
-            fix = "set data.with_speed=true where the data set has speeds or poses, or drop the term"
+            fix = "set data.with_speed=true if the data set has speeds or poses, or drop the term"
             distance = require(batch, "distance", "the velocity term", fix)
         # The norm's gradient at zero motion is 0, not NaN.
         predicted = torch.linalg.vector_norm(poses[:, :predictions, :3, 3], dim=-1)
@@ -294,11 +294,11 @@ class Velocity(Term):
 
 @terms.register("tracked_motion")
 class TrackedMotion(Term):
-    """How far the pose network's motion is from that of tracked points.
+    """Difference between the pose network's motion and that of tracked points.
 
-    With ``data.track_motion`` the points' motion takes the place of the predicted one, so nothing else teaches the
-    network. Per motion: the angle between the rotations in radians times ``angle``, plus the distance between the
-    translations in lengths of the tracked one, where there is one.
+    With ``data.track_motion`` the points' motion replaces the predicted one, so the network learns only from this term.
+    Per motion: the angle between the rotations in radians times ``angle``, plus the distance between the translations
+    relative to the tracked length, if there is one.
 
     Args:
         angle: Weight of one radian.

@@ -1,4 +1,4 @@
-"""Predictors that look at no image: a network that does not beat them has not learned anything useful."""
+"""Predictors that use no image: a network that does not beat them has not learned anything useful."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from saunet.errors import DataError, positive
 
 
 class ConstantDepth(nn.Module):
-    """The same depth in meters everywhere; under median scaling, the best that no information gives."""
+    """The same depth in meters everywhere; under median scaling, the best possible without information."""
 
     def __init__(self, depth: float = 10.0) -> None:
         super().__init__()
@@ -22,10 +22,10 @@ class ConstantDepth(nn.Module):
 
 
 class MeanDepthMap(nn.Module):
-    """The mean depth of the training ground truth at each place of the image: "the road is below, the sky above".
+    """The mean depth of the training ground truth at each position in the image: "the road is below, the sky above".
 
-    Ground truths of any size are collected on one grid that covers the image, a coarse one since they may be sparse.
-    Cells that no measurement ever hit take the mean of their row, rows without any take the nearest row that has one.
+    Ground truths of any size are collected on one grid over the image, which is coarse because they may be sparse.
+    Cells without measurements get the mean of their row, and rows without any get the nearest row with some.
     Measurements at or beyond ``max_depth`` meters are left out, as the protocols do.
     """
 
@@ -48,7 +48,7 @@ class MeanDepthMap(nn.Module):
             truth = padded[:rows, :columns]
             known = (truth > 0) & (truth < self.max_depth)
             row, column = known.nonzero(as_tuple=True)
-            # The cell whose area holds the pixel's center, (u + 0.5) * s.
+            # The cell that contains the pixel's center, (u + 0.5) * s.
             cell = ((2 * row + 1) * height // (2 * rows), (2 * column + 1) * width // (2 * columns))
             values = truth[known]
             self.depth_sum.index_put_(cell, values, accumulate=True)
@@ -60,7 +60,7 @@ class MeanDepthMap(nn.Module):
         cells = seen.sum(1)
         known_rows = cells.nonzero()[:, 0]
         if len(known_rows) == 0:
-            raise DataError("the mean depth map has seen no ground truth; give it data that have some")
+            raise DataError("the mean depth map has seen no ground truth; give it data with ground truth")
         mean = self.depth_sum / self.count.clamp(min=1)
         row_mean = mean.sum(1) / cells.clamp(min=1)
         distance = (torch.arange(len(cells), device=cells.device)[:, None] - known_rows[None]).abs()

@@ -1,4 +1,4 @@
-"""The depth errors as one torchmetrics metric of plain sums, so that any split over processes is exact."""
+"""The depth errors as one torchmetrics metric of plain sums, so results are exact for any split over processes."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from saunet.metrics.protocols import protocol as named_protocol
 class DepthMetrics(Metric):
     """Mean over images of the seven depth errors (Eigen et al., 2014) under a protocol.
 
-    An image whose ground truth has no pixel to compare is counted (``images_without_truth``) and leaves the means
-    alone.
+    An image without ground-truth pixels to compare is counted (``images_without_truth``) but does not affect the means.
 
     Examples:
         >>> metrics = saunet.DepthMetrics("synthetic")
@@ -62,7 +61,8 @@ class DepthMetrics(Metric):
             depth_size: Native (height, width) of each ground truth inside the padding; (0, 0) for an image without any.
 
         Raises:
-            DataError: if the ground truth belongs to another number of images, or a native size exceeds the padded one.
+            DataError: if the number of ground truths differs from that of images, or a native size exceeds the padded
+                one.
         """
         for prediction, truth in zip(disparity, native_depths(depth, depth_size, len(disparity)), strict=True):
             image = evaluate_image(prediction[0], truth, self.protocol)
@@ -76,11 +76,11 @@ class DepthMetrics(Metric):
             self.ratio_square_sum = self.ratio_square_sum + image.ratio.square()
 
     def compute(self) -> dict[str, Float[Tensor, ""]]:
-        """Return the mean of each error, float64, and what else was seen.
+        """Return the mean of each error, float64, and further statistics.
 
         Keys are `ERROR_NAMES`, then ``scale`` and ``scale_std`` (mean and standard deviation over images of the factor
-        on the depth, under no alignment of median(truth)/median(prediction)), ``images`` and
-        ``images_without_truth``. Means over no image are NaN.
+        on the depth; without alignment, of median(truth)/median(prediction)), ``images`` and ``images_without_truth``.
+        Means over no images are NaN.
         """
         count = self.images.double()
         errors = self.error_sum / count
@@ -101,8 +101,8 @@ def native_depths(
     """Cut each ground truth of a batch out of its padding (bottom and right)."""
     if len(depth) != images or len(depth_size) != images:
         raise DataError(
-            f"{images} predictions came with {len(depth)} ground truths and {len(depth_size)} sizes; "
-            "give one of each for every image"
+            f"got {images} predictions, {len(depth)} ground truths and {len(depth_size)} sizes; give one of each for "
+            "every image"
         )
     cut = []
     for padded, (height, width) in zip(depth[:, 0], depth_size.tolist(), strict=True):

@@ -1,4 +1,4 @@
-"""Numbers of one depth map against one ground truth: errors, the median, crops, flip post-processing."""
+"""Scores of one depth map against one ground truth: errors, the median, crops, flip post-processing."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torch import Tensor
 from saunet.errors import one_of
 
 ABS_REL, SQ_REL, RMSE, RMSE_LOG, A1, A2, A3 = range(7)
-"""Positions in vectors of errors."""
+"""Indices in vectors of errors."""
 ERROR_NAMES: tuple[str, ...] = ("abs_rel", "sq_rel", "rmse", "rmse_log", "a1", "a2", "a3")
 """The seven depth errors in the field's column order."""
 ERROR_HEADINGS: tuple[str, ...] = ("Abs Rel ↓", "Sq Rel ↓", "RMSE ↓", "RMSE log ↓", "δ1 ↑", "δ2 ↑", "δ3 ↑")
 RISING: tuple[str, ...] = ERROR_NAMES[A1:]
-"""The errors that grow with quality."""
+"""The scores for which larger is better."""
 
 Crop: TypeAlias = Literal["garg", "cityscapes", "nyu", "none"]
 CROPS: dict[str, tuple[float | Fraction, float | Fraction, float | Fraction, float | Fraction]] = {
@@ -26,16 +26,16 @@ CROPS: dict[str, tuple[float | Fraction, float | Fraction, float | Fraction, flo
     "nyu": (Fraction(45, 480), Fraction(471, 480), Fraction(41, 640), Fraction(601, 640)),
     "none": (0, 1, 0, 1),
 }
-"""Top, bottom, left and right end of what is evaluated, as fractions of the height and width of the ground truth.
-
-Garg et al., 2016, for KITTI; ManyDepth (Watson et al., 2021) for Cityscapes without the bottom quarter, which shows the
-car; and the part of NYU's frames that Eigen et al., 2014, evaluate."""
+"""Top, bottom, left and right end of the evaluated part, as fractions of the height and width of the ground truth. Garg
+et al., 2016, for KITTI; ManyDepth (Watson et al., 2021) for Cityscapes without the bottom quarter, which shows the car;
+and the part of NYU's frames that Eigen et al., 2014, evaluate."""
 
 
 def error_terms(prediction: Float[Tensor, " *shape"], target: Float[Tensor, " *shape"]) -> Float[Tensor, "k=7 *shape"]:
-    """Compute what each pixel's depth in meters adds to the seven Eigen errors, SAU-Net eqs. (15)-(19), float64.
+    """Compute each pixel's part in the seven Eigen errors, SAU-Net eqs. (15)-(19), float64, from depth in meters.
 
-    The standard definitions, for the equations are misprinted: with ``d`` the prediction and ``D*`` the truth, mean
+    These are the standard definitions, because the printed equations have errors: with ``d`` the prediction and ``D*``
+    the truth, mean
     |d-D*|/D*; mean (d-D*)²/D*; root of mean (d-D*)²; root of mean (ln d - ln D*)²; and the fraction of pixels with
     max(d/D*, D*/d) below 1.25, 1.25², 1.25³. RMSE and RMSE log are still squared here (see `root_terms`).
     """
@@ -55,7 +55,7 @@ def root_terms(mean_terms: Float[Tensor, "*shape 7"]) -> Float[Tensor, "*shape 7
 
 
 def median(values: Float[Tensor, " n"]) -> Float[Tensor, ""]:
-    """Return the true median (the mean of the two middle values for an even count), NaN for no values.
+    """Return the true median (the mean of the two middle values for an even count); NaN without values.
 
     `torch.median` returns the lower of the two, which moves the published numbers.
     """
@@ -85,8 +85,8 @@ def flip_blend(
 ) -> Float[Tensor, "b 1 h w"]:
     """Blend the disparity of an image with that of its mirror image, still mirrored (Monodepth's post-processing).
 
-    The left 5 % takes the mirrored prediction alone and the right 5 % the direct one (where each saw more context), the
-    middle their average, with linear ramps between.
+    The left 5 % uses only the mirrored prediction and the right 5 % only the direct one (each saw more context there);
+    the middle is their average, with linear ramps between.
     """
     width = disparity.shape[-1]
     other = disparity_of_flipped.flip(-1)

@@ -41,9 +41,9 @@ class SegmentErrors(NamedTuple):
     """KITTI's relative errors, means over all segments of all lengths; NaN if no segment fits."""
 
     t_rel: float
-    """Percent of the distance driven."""
+    """Translation error in percent of the distance driven."""
     r_rel: float
-    """Degrees per 100 meters."""
+    """Rotation error in degrees per 100 meters."""
     segments: int
 
 
@@ -61,12 +61,12 @@ def chain_motions(T_next_cam: Float[ndarray, "m 4 4"]) -> Float64[ndarray, "m+1 
 def snippet_ate(
     predicted: Float[ndarray, "p 4 4"], true: Float[ndarray, "m 4 4"], length: int = 5
 ) -> Float64[ndarray, " m"]:
-    """Compute the error in meters of each snippet, whose mean and deviation Zhou et al. and Monodepth2 publish.
+    """Compute the error in meters of each snippet; Zhou et al. and Monodepth2 publish their mean and deviation.
 
     A snippet starts at every frame but the last, so the last ones are shorter. Its matrices ``T_next_cam`` are chained
-    directly from the identity (not their inverses), first positions coincide, one scale a snippet comes from least
-    squares, and the error is the root of the SUM of squared distances divided by the number of positions: not a usual
-    ATE, but what published numbers are.
+    directly from the identity (not their inverses), first positions coincide, each snippet's scale comes from least
+    squares, and the error is the root of the SUM of squared distances divided by the number of positions. That is not
+    the usual ATE, but published numbers are computed this way.
     """
     _same_length(predicted, true, "motions", at_least=1)
     errors = []
@@ -74,7 +74,7 @@ def snippet_ate(
         pieces = (motions[start : start + length - 1] for motions in (predicted, true))
         ours, theirs = (_chained(piece.astype(np.float64))[:, :3, 3] for piece in pieces)
         energy = float((ours**2).sum())
-        # A camera predicted not to move has no scale; every scale leaves it at the origin.
+        # A camera predicted to stand still has no scale; every scale leaves it at the origin.
         scale = float((theirs * ours).sum()) / energy if energy > 0 else 0.0
         errors.append(np.sqrt(((scale * ours - theirs) ** 2).sum()) / len(theirs))
     return np.array(errors, dtype=np.float64)

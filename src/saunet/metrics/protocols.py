@@ -1,4 +1,4 @@
-"""Evaluation protocols as named objects, and the errors of one image under one of them."""
+"""Named evaluation protocols, and the errors of one image under a protocol."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from saunet.errors import ConfigError, one_of, positive
 from saunet.metrics.functional import CROPS, Crop, crop_window, error_terms, median, root_terms
 
 GROUND_TRUTHS: tuple[str, ...] = ("lidar_x", "camera_z", "improved", "exact", "none")
-"""The LiDAR's own forward coordinate; the camera's z of the same points; KITTI's accumulated maps; a renderer's; none,
-where predictions are scored by how well they explain the neighboring frames."""
+"""The LiDAR's own forward coordinate; the camera's z of the same points; KITTI's accumulated maps; a renderer's depth;
+none, if predictions are scored by how well they explain the neighboring frames."""
 Alignment: TypeAlias = Literal["median", "least_squares", "least_squares_disparity", "none"]
 ALIGNMENTS: tuple[str, ...] = get_args(Alignment)
 """Depth times median(truth)/median(prediction); depth times the factor of least squared error; disparity times a factor
-plus a shift of least squared error (Ranftl et al., 2022: where the shift of a prediction is arbitrary too); meters as
+plus a shift of least squared error (Ranftl et al., 2022, if the shift of a prediction is arbitrary too); meters as
 predicted."""
 _FARTHEST = 1e-9
 """Far below any real disparity in 1/m (a million kilometers): it keeps medians and products finite."""
@@ -37,13 +37,13 @@ class Protocol:
     """Limits of the prediction in meters, applied after scaling."""
     max_depth: float = 80.0
     capped: bool = True
-    """Only ground truth strictly between the limits counts; otherwise all of it above zero."""
+    """Whether only ground truth strictly between the limits counts; otherwise everything above zero does."""
     crop: Crop = "garg"
     """Part of the ground truth that counts; see `saunet.metrics.functional.CROPS`."""
     alignment: Alignment = "median"
-    """How each image's prediction is brought to the truth; see `ALIGNMENTS`."""
+    """How each image's prediction is aligned with the truth; see `ALIGNMENTS`."""
     factor: float = 1.0
-    """On the predicted depth, before any alignment (5.4 for stereo-trained Monodepth2)."""
+    """Factor on the predicted depth, before any alignment (5.4 for stereo-trained Monodepth2)."""
 
     def __post_init__(self) -> None:
         one_of("ground_truth", self.ground_truth, GROUND_TRUTHS)
@@ -100,15 +100,15 @@ PROTOCOLS: dict[str, Protocol] = {protocol.name: protocol for protocol in _NAMED
 
 
 def protocol(name: str) -> Protocol:
-    """Return a named protocol, with another alignment where one follows: ``ddad/none``.
+    """Return a named protocol, with another alignment if one follows: ``ddad/none``.
 
     Raises:
-        ConfigError: if there is no such protocol or alignment, or none to align with.
+        ConfigError: if there is no such protocol or alignment, or the protocol has no ground truth to align with.
     """
     base, slash, alignment = name.partition("/")
     found = PROTOCOLS[one_of("protocol", base, PROTOCOLS)]
     if slash and found.ground_truth == "none":
-        raise ConfigError(f"protocol '{name}' aligns with ground truth, which '{base}' does without; ask for '{base}'")
+        raise ConfigError(f"protocol '{name}' aligns with ground truth, which '{base}' does not use; choose '{base}'")
     chosen = cast(Alignment, one_of("alignment", alignment, ALIGNMENTS)) if slash else found.alignment
     return replace(found, name=name, alignment=chosen) if slash else found
 
@@ -122,16 +122,16 @@ class Sample:
     target: Float[Tensor, " n"]
     """Meters, float64."""
     mask: Bool[Tensor, "h w"]
-    """Where they lie in the ground truth, row by row: ``some_map[mask]`` follows the same order."""
+    """Their positions in the ground truth, row by row: ``some_map[mask]`` has the same order."""
     ratio: Float[Tensor, ""]
     """Factor on the depth: that of the alignment, and median(truth)/median(prediction) without one. NaN: no pixels."""
     shift: Float[Tensor, ""]
-    """Added to the disparity after that, 1/m; 0 but for ``least_squares_disparity``."""
+    """Added to the disparity after that, 1/m; 0 except for ``least_squares_disparity``."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageErrors:
-    """What a protocol says about one image; NaN with no pixels."""
+    """A protocol's result for one image; NaN without pixels."""
 
     errors: Float[Tensor, "7"]
     """As in `saunet.metrics.functional.ERROR_NAMES`, float64."""
@@ -141,10 +141,10 @@ class ImageErrors:
 
 
 def sample_image(disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "hg wg"], protocol: Protocol) -> Sample:
-    """Bring a prediction to the pixels that a protocol compares.
+    """Align a prediction with the pixels that a protocol compares.
 
-    Disparity of any size is resized to the native size of the ground truth, and becomes depth then; 0 and below is far
-    away. Ground truth is depth in meters, 0 where unknown; 0 x 0 for an image without any.
+    Disparity of any size is resized to the native size of the ground truth and then converted to depth; 0 and below is
+    far away. Ground truth is depth in meters, 0 where unknown; 0 x 0 for an image without any.
     """
     mask = protocol.mask(ground_truth)
     target = ground_truth[mask].double()

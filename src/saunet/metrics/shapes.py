@@ -1,4 +1,4 @@
-"""How well a prediction keeps the shape of things: where depth breaks off, and the points in space that pixels are."""
+"""How well a prediction preserves shapes: depth edges, and the points in space."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, sobel
 from scipy.spatial import cKDTree
 
 FARTHEST_EDGE = 10.0
-"""Pixels from the truth's edges up to which predicted edges count, and the error where none does."""
+"""Largest distance in pixels between a predicted and a true edge; also the error if there is none."""
 DENSE = 0.5
-"""Fraction of known pixels from which on a ground truth is dense enough to have depth edges between neighbors."""
+"""Smallest fraction of known pixels for a ground truth dense enough to have depth edges between neighbors."""
 _LOW, _HIGH, _FIXED_POINT = 0.1, 0.2, 800
 
 
 def boundaries(depth: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Find the edges of a dense depth map in meters: Canny's method on log depth, as SYNS-Patches is evaluated.
+    """Find the edges of a dense depth map in meters: Canny's method on log depth, as in the evaluation of SYNS-Patches.
 
     Gaussian blur with sigma 1, Sobel gradients, hysteresis between 0.1 and 0.2 (Spencer et al., Deconstructing
     self-supervised monocular reconstruction, 2022). Steps of more than about 6 % of the depth are edges.
@@ -40,9 +40,9 @@ def boundary_scores(
         counted: The pixels of the truth that a protocol compares.
 
     Returns:
-        Accuracy, the mean distance in pixels from predicted edges to the nearest true one, of those nearer than
-        `FARTHEST_EDGE`, which is also the result if there are none; and completeness, the mean distance from true edges
-        to the nearest predicted one. NaN for a sparse truth, or one without edges.
+        Accuracy, the mean distance in pixels from predicted edges to the nearest true one, over those nearer than
+        `FARTHEST_EDGE`, which is the result if there are none; and completeness, the mean distance from true edges to
+        the nearest predicted one. NaN for a truth that is sparse or without edges.
     """
     known = truth > 0
     if known.mean() < DENSE:
@@ -59,7 +59,7 @@ def boundary_scores(
 
 
 def points(depth: Float[ndarray, " n"], mask: Bool[ndarray, "h w"], K: Float[ndarray, "3 3"]) -> Float[ndarray, "n 3"]:
-    """Return the points in the camera's frame that the pixels of a mask are, row by row, at their depths."""
+    """Return the points in the camera's frame of a mask's pixels at their depths, row by row."""
     row, column = np.nonzero(mask)
     rays = np.stack([column, row, np.ones_like(row)], 1) @ np.linalg.inv(K.astype(np.float64)).T
     found: ndarray = rays * depth[:, None]

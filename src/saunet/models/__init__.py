@@ -1,1 +1,1 @@
-"""Networks: encoders, decoders, pose networks, and the depth network that joins the first two."""
+"""Networks: encoders, decoders, pose networks, and the depth network that combines the first two."""

@@ -1,4 +1,4 @@
-"""Registered channel attentions: each scales a map's channels (and CBAM its pixels) by weights that the map decides."""
+"""Registered channel attentions: each scales a map's channels (CBAM also pixels) by weights computed from the map."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from saunet.registry import attentions
 
 @attentions.register("none")
 class NoAttention(nn.Module):
-    """The identity: 0 parameters. What remains of AU-Net's bottleneck without attention (SAU-Net Table 3).
+    """The identity, with 0 parameters: AU-Net's bottleneck without attention (SAU-Net Table 3).
 
     Args:
         channels: Channels of the map.
@@ -33,7 +33,8 @@ class NoAttention(nn.Module):
 class SE(nn.Module):
     """Squeeze-and-excitation (Hu et al., CVPR 2018, eqs. (2)–(4)): 2·C·⌊C/r⌋ parameters (at least one hidden unit).
 
-    s = σ(W2 relu(W1 z)) with z each channel's mean over the map; no biases, as in the paper's parameter count, eq. (5).
+    s = σ(W2 relu(W1 z)), where z is each channel's mean over the map; no biases, as in the paper's parameter count, eq.
+    (5).
 
     Args:
         channels: Channels C of the map.
@@ -84,8 +85,8 @@ class CBAM(SE):
 class ECA(nn.Module):
     """Efficient channel attention (Wang et al., "ECA-Net", CVPR 2020, eqs. (5)–(7) and (11)): k parameters.
 
-    Each channel's mean over the map passes a 1-D convolution of k weights along the channels and a sigmoid, and scales
-    the channel. k is the odd number next to log2(C)/γ + b/γ; no channel reduction, no bias.
+    Each channel's mean over the map goes through a 1-D convolution with k weights along the channels and a sigmoid, and
+    then scales the channel. k is the nearest odd number to log2(C)/γ + b/γ; no channel reduction, no bias.
 
     Args:
         channels: Channels C of the map.

@@ -14,15 +14,15 @@ from saunet.geometry.depth import disparity_to_depth, sigmoid_to_disparity
 from saunet.models.layers.conv import lay_out
 from saunet.types import DepthPyramid, FeatureSpec
 
-torch.export.register_dataclass(DepthPyramid)  # so that a depth network can be exported with its result as it is
+torch.export.register_dataclass(DepthPyramid)  # so that a depth network can be exported with its result type
 
 
 @checked
 class DepthNet(nn.Module):
     """One image to depth at several scales (SAU-Net section III-A: Z_t from H_t).
 
-    Weights and the image are kept in channels-last memory order, in which convolutions run fastest on CPU and GPU and
-    a transformer's tokens become a feature map without a copy.
+    Weights and the image are kept in channels-last memory order: convolutions run fastest in it on CPU and GPU, and a
+    transformer's tokens become a feature map without a copy.
 
     Args:
         encoder: A network with ``features`` and ``size_divisor``, returning feature maps finest first.
@@ -53,10 +53,14 @@ class DepthNet(nn.Module):
     ) -> None:
         super().__init__()
         if not 0 < min_depth < max_depth:
-            raise ConfigError(f"min_depth is {min_depth} and max_depth {max_depth}; needed: 0 < min_depth < max_depth")
+            raise ConfigError(
+                f"min_depth is {min_depth} and max_depth {max_depth}; they must satisfy 0 < min_depth < max_depth"
+            )
         frames = getattr(encoder, "frames", 1)  # a pose network's encoder may see several
         if frames != 1:
-            raise ConfigError(f"the depth network's encoder has frames {frames}; depth comes from one image: frames=1")
+            raise ConfigError(
+                f"the depth network's encoder has frames={frames}; depth comes from one image: set frames=1"
+            )
         for needed in ("features", "size_divisor"):
             if not hasattr(encoder, needed):
                 raise ConfigError(
@@ -83,13 +87,13 @@ class DepthNet(nn.Module):
             image: RGB in [0, 1].
 
         Raises:
-            ConfigError: if the image is not of this shape or not of floating point, height or width is not a multiple
-                of the encoder's stride, or the encoder's maps are not what its ``features`` say.
+            ConfigError: if the image has another shape or is not floating-point, its height or width is not a multiple
+                of the encoder's stride, or the encoder's maps differ from its ``features``.
         """
         if image.ndim != 4 or image.shape[1] != 3 or not image.dtype.is_floating_point:
             raise ConfigError(
                 f"the image is {image.dtype} of shape {tuple(image.shape)}; a depth network takes floating-point RGB "
-                "in [0, 1] of shape batch x 3 x height x width; saunet.load(...).predict takes any picture"
+                "in [0, 1] of shape batch x 3 x height x width; saunet.load(...).predict accepts any picture"
             )
         divisible(image.shape[-2], image.shape[-1], self.size_divisor)
         features = self.encoder(image.contiguous(memory_format=self.memory_format))
@@ -100,13 +104,13 @@ class DepthNet(nn.Module):
         return DepthPyramid(sigmoid, disparity, tuple(disparity_to_depth(x) for x in disparity))
 
     def _check(self, maps: Sequence[Tensor], height: int, width: int) -> None:
-        """Check that the encoder's maps are what it announced, on which the decoder was built."""
+        """Check that the encoder's maps are as announced, because the decoder was built for those."""
         got = [tuple(each.shape[1:]) for each in maps]
         announced = [(each.channels, height // each.stride, width // each.stride) for each in self.features]
         if got != announced:
             raise ConfigError(
                 f"the encoder {type(self.encoder).__name__} returns maps of {_sizes(got)} for an image of "
-                f"{height}x{width}, and its 'features' announce {_sizes(announced)}; set channels and stride of each "
+                f"{height}x{width}, but its 'features' announce {_sizes(announced)}; set channels and stride of each "
                 "map there, finest first (docs/add_encoder.md)"
             )
 

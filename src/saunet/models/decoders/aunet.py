@@ -24,10 +24,10 @@ class AUNetDecoder(Decoder):
     - *Bottleneck* (`AttentionBottleneck`), at the deepest level only: "the size of the feature map is reduced to half,
       crucial features are captured through the attention mechanism, and a 2× upsampling restores the size".
     - *Sum*, eq. (5): x_s = Σ_{k≤s} (f_k)↑, kept as a running sum, bilinearly doubled from level to level.
-    - *Mapping* (`Mapping`), at every level: added to its input, so that the plain sum of eq. (5) stays in what goes up.
+    - *Mapping* (`Mapping`), at every level: added to its input, so that the plain sum of eq. (5) is passed up.
     - *Heads*: 3×3 convolution and sigmoid at 1/1, 1/2, 1/4, 1/8.
 
-    Full resolution has three times the pixels of all other levels together and no feature of its own, so it is narrower
+    Full resolution has three times the pixels of all other levels together but no feature of its own, so it is narrower
     (``fine``).
 
     Args:
@@ -76,7 +76,7 @@ class AUNetDecoder(Decoder):
 
 
 class AttentionBottleneck(nn.Module):
-    """Halve the map, attend, restore the size, join with the input (SAU-Net section III-C, its first layer)."""
+    """Halve the map, attend, restore the size, and join with the input (SAU-Net section III-C, its first layer)."""
 
     def __init__(self, channels: int, attention: str) -> None:
         super().__init__()
@@ -91,8 +91,8 @@ class AttentionBottleneck(nn.Module):
 class Mapping(nn.Module):
     """3×3 convolution, ReLU and 1×1 convolution, added to the input (SAU-Net's feature mapping module).
 
-    Padded with zeros, not by reflection: a window encoder has no notion of where in the image it looks, and the border
-    is what tells the decoder; on a road the height in the image says much about depth.
+    Padded with zeros, not by reflection: a window encoder does not know its position in the image, and the zero border
+    tells the decoder; on a road, the height in the image says much about depth.
     """
 
     def __init__(self, channels: int) -> None:

@@ -1,4 +1,4 @@
-"""What every decoder asks of the encoder before it and of the scales after it."""
+"""What every decoder requires of its encoder and its scales."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Decoder(nn.Module):
     Args:
         features: The encoder's features, finest first: strides are powers of two.
         scales: Scales to predict disparity at, finest first, without gaps.
-        finest: Level whose map is used for scale 0; level l has stride 2**l.
+        finest: The level used for scale 0; level l has stride 2**l.
 
     Attributes:
         skips: Level -> channels of the encoder's feature there.
@@ -59,7 +59,7 @@ class SkipDecoder(Decoder):
         return upsample(x)
 
     def level(self, place: int, x: Tensor, skip: Tensor | None) -> Tensor:
-        """Return the map of the next finer level; training may compute it again for the gradient."""
+        """Return the map of the next finer level; training may recompute it for the gradient."""
         x = self.enlarge(self.before[place](x))
         joined: Tensor = self.after[place](x if skip is None else torch.cat([x, skip], 1))
         return joined

@@ -16,9 +16,9 @@ from saunet.types import FeatureSpec
 class LiteMonoDecoder(SkipDecoder):
     """Convolve, upsample, join with the skip, convolve, at half of the encoder's channels (Lite-Mono section 3.3).
 
-    The finest features are at half size; a head's logits are enlarged by two before the sigmoid. So there is one scale
-    less than in other decoders: three for Lite-Mono's own encoder, as published. Weights start as in the published code
-    (truncated normal, 0.02; zero biases), but for the heads' biases: see `DisparityHead`.
+    The finest features are at half size, and a head's logits are enlarged by two before the sigmoid. So there is one
+    scale fewer than in other decoders: three for Lite-Mono's own encoder, as published. Weights start as in the
+    published code (truncated normal, 0.02; zero biases), except for the heads' biases: see `DisparityHead`.
 
     Args:
         features: The encoder's features, finest first.

@@ -16,17 +16,17 @@ from saunet.registry import decoders
 from saunet.types import FeatureSpec
 
 _MIN_DEPTH = 0.5
-"""Of PackNet's inverse depth, sigmoid / 0.5; what a level tells the next finer one."""
+"""Limit of PackNet's inverse depth, sigmoid / 0.5, which each level passes to the next finer one."""
 
 
 @decoders.register("packnet")
 class PackNetDecoder(Decoder):
     """Unpack, join with the skip and the coarser disparity, convolve (PackNet Table 1, version with concatenation).
 
-    As in the published code, a level hands sigmoid / 0.5 to the next finer one, the heads pad with zeros, and weights
-    start from Glorot and Bengio's uniform distribution. Two things are this library's for all decoders: the heads'
-    biases start as in `DisparityHead` instead of at 0, and `DepthNet` maps the sigmoid to depth by its own limits,
-    where PackNet takes sigmoid / 0.5 for inverse depth.
+    As in the published code, a level passes sigmoid / 0.5 to the next finer one, the heads pad with zeros, and weights
+    start from Glorot and Bengio's uniform distribution. Two things differ, as in all decoders of this library: the
+    heads' biases start as in `DisparityHead` instead of at 0, and `DepthNet` maps the sigmoid to depth with its own
+    limits, while PackNet uses sigmoid / 0.5 as inverse depth.
 
     Args:
         features: The encoder's features, finest first.
@@ -43,7 +43,7 @@ class PackNetDecoder(Decoder):
         super().__init__(features, scales)
         if len(channels) < self.deepest or any(c < 1 or c % (2 * GROUPS) for c in channels):
             raise ConfigError(
-                f"channels is {list(channels)}; needed: {self.deepest} multiples of {2 * GROUPS}, a level each"
+                f"channels is {list(channels)}; it must be {self.deepest} multiples of {2 * GROUPS}, one per level"
             )
         unpackings, joins, inputs = [], [], self.skips[self.deepest]
         for level in range(self.deepest - 1, -1, -1):

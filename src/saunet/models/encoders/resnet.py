@@ -22,7 +22,7 @@ _STATISTICS = {
     "monodepth2": ((0.45,), (0.225,)),
     "imagenet": ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)),
 }
-"""Mean and standard deviation, of all channels alike or of each."""
+"""Mean and standard deviation, for all channels or for each."""
 
 
 class BasicBlock(nn.Module):
@@ -76,9 +76,9 @@ class Bottleneck(nn.Module):
 class ResNet(StemEncoder):
     """ResNet features at 1/2, 1/4, 1/8, 1/16, 1/32, the encoder of Monodepth2 (SAU-Net Table 3, first row).
 
-    State-dict keys are torchvision's without ``fc``. Images come in [0, 1]; as in Monodepth2 every channel has 0.45
-    subtracted and is divided by 0.225, or as in torchvision each channel its own. The first feature follows the first
-    ReLU, before the max-pooling.
+    State-dict keys are torchvision's without ``fc``. Images in [0, 1] are normalized: with 0.45 and 0.225 for all
+    channels as in Monodepth2, or per channel as in torchvision. The first feature follows the first ReLU, before the
+    max-pooling.
 
     Args:
         blocks: Residual blocks in each of the four stages.
@@ -103,7 +103,7 @@ class ResNet(StemEncoder):
         blocks = tuple(blocks)
         if len(blocks) != 4 or min(blocks) < 1:
             raise ConfigError(
-                f"blocks is {blocks}; a ResNet has four stages of at least one block, such as (2, 2, 2, 2)"
+                f"blocks is {blocks}; a ResNet has four stages with at least one block each, such as (2, 2, 2, 2)"
             )
         positive("frames", frames)
         kind: type[BasicBlock] | type[Bottleneck] = Bottleneck if bottleneck else BasicBlock
@@ -128,7 +128,7 @@ class ResNet(StemEncoder):
         outputs = (64, *(width * kind.expansion for width in _WIDTHS))
         self.features = tuple(FeatureSpec(channels, 2 ** (i + 1)) for i, channels in enumerate(outputs))
         self.size_divisor = 32
-        for module in self.modules():  # He et al.'s normal distribution (fan out), as torchvision does
+        for module in self.modules():  # He et al.'s normal distribution (fan-out), as in torchvision
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         if weights is not None:

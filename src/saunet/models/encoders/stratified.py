@@ -18,16 +18,17 @@ class StratifiedTransformer(WindowEncoder):
     """SAU-Net's stratified transformer, section III.B: a convolution, then four stages of eqs. (1)-(4) at 1/2 ... 1/16.
 
     The stem is a 3x3 convolution with stride 2 and a LayerNorm; each pixel of its output is a token. Between stages the
-    2x2 neighbors are concatenated (4C) and projected to 2C, as in Swin, whose public weights fit all but the stem.
+    2x2 neighbors are concatenated (4C) and projected to 2C, as in Swin; Swin's public weights fit everything but the
+    stem.
 
     Args:
         dim: Channels of the first stage; they double from stage to stage.
         depths: Blocks per stage.
         heads: Attention heads per stage.
-        window: Side of a window in tokens, per stage; any will do, one that divides the map is fastest.
+        window: Side of a window in tokens, per stage; any size works, and one that divides the map is fastest.
         mlp_ratio: Hidden channels of the MLPs per channel.
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
-        mask_padding: Windows over the border attend to real tokens only; False pads with zeros that take part.
+        mask_padding: Windows across the border attend to real tokens only; False pads with zeros that take part.
         weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
     """
 
@@ -43,7 +44,7 @@ class StratifiedTransformer(WindowEncoder):
         weights: str | None = None,
     ) -> None:
         super().__init__(2, dim, depths, heads, window, mlp_ratio, drop_path, mask_padding)
-        self.size_divisor = 2 * self.features[-1].stride  # decoders may halve the deepest map once more
+        self.size_divisor = 2 * self.features[-1].stride  # decoders may halve the deepest map again
         self.stem = nn.ModuleDict({"conv": nn.Conv2d(3, dim, 3, stride=2, padding=1), "norm": nn.LayerNorm(dim)})
         self.not_pretrained += ("stem.",)
         self.start_weights(weights)

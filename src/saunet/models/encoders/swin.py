@@ -1,4 +1,4 @@
-"""The Swin Transformer (Liu et al. 2021) as a feature extractor, and what it shares with the stratified transformer."""
+"""The Swin Transformer (Liu et al. 2021) as a feature extractor, and the stratified transformer's base."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PUBLIC: dict[tuple[int, tuple[int, ...], tuple[int, ...]], str] = {
     (96, (2, 2, 6, 2), (3, 6, 12, 24)): "swin_tiny",
     (96, (2, 2, 18, 2), (3, 6, 12, 24)): "swin_small",
 }
-"""Dim, depths and heads -> the public weights that fit."""
+"""Dim, depths and heads -> the matching public weights."""
 
 
 class WindowEncoder(nn.Module):
@@ -58,7 +58,7 @@ class WindowEncoder(nn.Module):
         self.size_divisor = self.features[-1].stride
         self.variant = _PUBLIC.get((dim, depths, heads))
         self.not_pretrained: tuple[str, ...] = tuple(f"norm{i}." for i in range(stages - 1))
-        """Beginnings of the names of entries that no public file has."""
+        """Prefixes of the names of entries that no public file has."""
         self.register_buffer("mean", torch.tensor((0.485, 0.456, 0.406)).view(3, 1, 1), persistent=False)  # ImageNet's
         self.register_buffer("std", torch.tensor((0.229, 0.224, 0.225)).view(3, 1, 1), persistent=False)
 
@@ -85,7 +85,7 @@ class WindowEncoder(nn.Module):
         return tuple(maps)
 
     def start_weights(self, weights: str | None) -> None:
-        """Initialize as Swin (truncated normal for linear weights, zero biases), then take public weights."""
+        """Initialize like Swin (truncated normal for linear weights, zero biases), then load public weights."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.trunc_normal_(module.weight, std=0.02)
@@ -98,10 +98,10 @@ class WindowEncoder(nn.Module):
 @encoders.register("swin_tiny")
 @encoders.register("swin_small", depths=(2, 2, 18, 2), drop_path=0.3)
 class SwinTransformer(WindowEncoder):
-    """Swin features at 1/4, 1/8, 1/16, 1/32 (Liu et al. 2021); numbers are those of torchvision with the same weights.
+    """Swin features at 1/4, 1/8, 1/16, 1/32 (Liu et al. 2021); results equal torchvision's with the same weights.
 
-    State-dict keys are those of the dense Swin backbone. As in torchvision, maps that the window does not divide are
-    padded with zeros that take part in attention, and an axis that fits in one window is not shifted.
+    State-dict keys are those of the dense Swin backbone. As in torchvision, maps not divisible by the window are padded
+    with zeros that take part in attention, and an axis that fits in one window is not shifted.
 
     Args:
         patch: Side of a patch in pixels.
@@ -111,7 +111,7 @@ class SwinTransformer(WindowEncoder):
         window: Side of a window in tokens, per stage.
         mlp_ratio: Hidden channels of the MLPs per channel.
         drop_path: Probability of stochastic depth at the last block, growing linearly from 0 at the first.
-        mask_padding: True keeps padded tokens out of the attention instead.
+        mask_padding: Exclude padded tokens from the attention instead.
         weights: Public weights to start from: ``imagenet``, a name, a URL or a file; see `load_pretrained`.
     """
 

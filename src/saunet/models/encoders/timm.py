@@ -1,4 +1,4 @@
-"""Any network of timm that gives feature maps; the extra ``timm`` has it."""
+"""Any network of timm that returns feature maps (extra ``timm``)."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class TimmEncoder(nn.Module):
 
     Args:
         model: Name of the network in timm, such as ``convnext_tiny`` or ``efficientnet_b0``.
-        weights: ``imagenet`` for the public weights, which timm fetches, or a file of the network's weights.
-        image_size: Height and width of the images, for networks that are built for one size, such as Swin's and ViT's.
+        weights: ``imagenet`` for the public weights, which timm downloads, or a file with the network's weights.
+        image_size: Height and width of the images, for networks built for one size, such as Swin and ViT.
     """
 
     mean: Tensor
@@ -50,13 +50,13 @@ class TimmEncoder(nn.Module):
             more["pretrained_cfg_overlay"] = {"file": str(_existing(str(weights)))}
         try:
             self.network = timm.create_model(model, features_only=True, **more)
-        except Exception as reason:  # each network of timm has its own ways to refuse
+        except Exception as reason:  # timm's networks refuse in different ways
             text = " ".join(str(reason).split())[:300]
             if weights is not None:
                 raise CheckpointError(
-                    f"timm cannot give '{model}' the weights '{weights}' ({text}); give a file of this network's"
+                    f"timm cannot load the weights '{weights}' into '{model}' ({text}); give a file for this network"
                 ) from reason
-            raise ConfigError(f"timm's '{model}' gives no feature maps ({type(reason).__name__}: {text})") from reason
+            raise ConfigError(f"timm's '{model}' returns no feature maps ({type(reason).__name__}: {text})") from reason
         if weights not in (None, "imagenet"):
             self._check_complete(model, str(weights))
         info = self.network.feature_info
@@ -72,9 +72,9 @@ class TimmEncoder(nn.Module):
             self.register_buffer(name, torch.tensor(values).view(3, 1, 1), persistent=False)
 
     def _check_complete(self, model: str, weights: str) -> None:
-        """Check that a file has every weight, which timm leaves as it was where it finds none."""
+        """Check that a file has every weight, because timm keeps initial values for missing ones."""
 
-        def plain(name: str) -> str:  # timm names parts of a network for features with _ in place of .
+        def plain(name: str) -> str:  # timm uses _ instead of . in the names of feature networks
             return re.sub(r"[._]", "", name.removeprefix("model."))
 
         given = {plain(name) for name in read_state(_existing(weights))}
@@ -89,7 +89,7 @@ class TimmEncoder(nn.Module):
         if self.image_size is not None and tuple(image.shape[-2:]) != self.image_size:
             size, wanted = ("x".join(map(str, each)) for each in (image.shape[-2:], self.image_size))
             raise ConfigError(
-                f"the image is {size} and the encoder was built for {wanted}; give image_size of the images"
+                f"the image is {size} but the encoder was built for {wanted}; set image_size to the size of the images"
             )
         maps = self.network((image - self.mean) / self.std)
         chosen = [maps[index] for index in self.taken]
@@ -99,7 +99,7 @@ class TimmEncoder(nn.Module):
 def _timm() -> Any:
     try:
         import timm
-    except Exception as missing:  # a torchvision of another torch breaks in many ways when it is imported
+    except Exception as missing:  # importing a torchvision for another torch fails in many ways
         why = "is not installed" if isinstance(missing, ModuleNotFoundError) else f"cannot be imported ({missing})"
         raise ConfigError(
             f"model/encoder=timm needs the package timm, which {why}; run: pip install 'saunet[timm]'"

@@ -1,4 +1,4 @@
-"""Layers that several networks share: reflection-padded 3×3, upsampling, the disparity head, stochastic depth."""
+"""Layers shared by several networks: reflection-padded 3×3, upsampling, the disparity head, stochastic depth."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from torch import Tensor, nn
 from saunet.errors import ConfigError
 
 START = 0.3
-"""Sigmoid disparity that an untrained `DisparityHead` predicts on average."""
+"""Average sigmoid disparity predicted by an untrained `DisparityHead`."""
 
 
 class Conv3x3(nn.Conv2d):
-    """3×3 convolution with one pixel of reflection padding, as in Monodepth2's decoder: no frame along the border."""
+    """3×3 convolution with one pixel of reflection padding, as in Monodepth2's decoder: no border artifacts."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(inputs, outputs, 3)
 
     def forward(self, x: Float[Tensor, "b ci h w"]) -> Float[Tensor, "b co h w"]:
-        mode = "reflect" if min(x.shape[-2:]) > 1 else "replicate"  # one pixel has nothing to reflect
-        # Autocast on a CPU would pad in float32, and the convolution cast it back: two copies of the map for nothing.
+        mode = "reflect" if min(x.shape[-2:]) > 1 else "replicate"  # a single pixel has nothing to reflect
+        # Autocast on a CPU would pad in float32, and the convolution cast it back: two needless copies of the map.
         with torch.autocast(device_type=x.device.type, enabled=False):
             padded = F.pad(x, (1, 1, 1, 1), mode=mode)
         return F.conv2d(padded, self.weight, self.bias)
@@ -40,11 +40,11 @@ class ConvELU(nn.Sequential):
 class DisparityHead(nn.Module):
     """Sigmoid disparity in (0, 1) from a feature map: a 3×3 convolution and the logistic function.
 
-    The bias starts at logit(0.3) instead of 0. With the usual limits of 0.1 and 100 an untrained network then predicts
-    a depth of a third of a unit, three times the nearest one: room on both sides, and about where networks trained from
-    video settle. Logit 0 is only twice the nearest depth, and most of a road scene lies further away than that.
+    The bias starts at logit(0.3) instead of 0. With the usual limits of 0.1 and 100, an untrained network then predicts
+    a depth of a third of a unit, three times the nearest depth: there is room on both sides, and networks trained from
+    video settle about there. Logit 0 would be only twice the nearest depth, and most of a road scene is farther away.
 
-    With ``enlarge`` the disparity is that much larger than the feature map: the logits are upsampled.
+    With ``enlarge``, the logits are upsampled by that factor.
     """
 
     def __init__(self, inputs: int, enlarge: int = 1, padding: Literal["reflect", "zeros"] = "reflect") -> None:
@@ -57,7 +57,7 @@ class DisparityHead(nn.Module):
         nn.init.constant_(self.conv.bias, math.log(START / (1 - START)))  # type: ignore[arg-type]
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 _ _"]:
-        # Outside autocast: a logit of bfloat16 near -4, a far pixel, would round depth to about two per cent.
+        # Outside autocast: a logit of bfloat16 near -4, a far pixel, would round depth to about two percent.
         with torch.autocast(device_type=x.device.type, enabled=False):
             logits: Tensor = self.conv(x.to(self.conv.weight.dtype))
             return (upsample(logits, self.enlarge) if self.enlarge > 1 else logits).sigmoid()
@@ -86,10 +86,10 @@ def upsample(x: Float[Tensor, "b c h w"], factor: int = 2) -> Float[Tensor, "b c
 
 
 def sum_of(fresh: Float[Tensor, "b c h w"], x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-    """Return ``fresh + x``; written over ``fresh``, which nobody else holds, where no gradient is wanted.
+    """Return ``fresh + x``, in place in ``fresh`` (which nothing else uses) if no gradient is needed.
 
-    Fresh memory of a large map's size costs more than the sum. With gradients the map stays as its layer made it, for
-    hooks that look at it.
+    New memory for a large map costs more than the sum. With gradients, the layer's map is left intact for hooks that
+    look at it.
     """
     if torch.is_grad_enabled() or fresh.dtype != x.dtype:
         return fresh + x
@@ -103,8 +103,8 @@ def lay_out(network: nn.Module, memory_format: torch.memory_format = torch.chann
     """
     network.memory_format = memory_format  # type: ignore[assignment]
     for parameter in network.parameters():
-        if parameter.ndim == 4:  # 3-D convolutions have another format of that kind, which gains nothing here
-            # a 1x1 kernel counts as contiguous in either format, and its strides still choose that of the output
+        if parameter.ndim == 4:  # 3-D convolutions have their own such format, which gains nothing here
+            # a 1x1 kernel counts as contiguous in both formats, but its strides still decide the output's format
             parameter.data = torch.empty_like(parameter, memory_format=memory_format).copy_(parameter.data)
 
 
@@ -113,7 +113,7 @@ def training_format(network: nn.Module, device: torch.device) -> torch.memory_fo
 
     Without AVX-512 oneDNN (torch 2.13) has no fast gradient of dense kernels for channels-last maps: that of a 3x3
     convolution of 64 channels takes 1.8 times as long as for contiguous maps, ResNet-18's whole step 1.28 times.
-    Pointwise and depthwise convolutions are faster channels-last all the same (EfficientNet-Lite0's step: 0.8).
+    Pointwise and depthwise convolutions are nevertheless faster channels-last (EfficientNet-Lite0's step: 0.8).
     """
     if device.type != "cpu" or torch.backends.cpu.get_cpu_capability() != "AVX2":
         return torch.channels_last

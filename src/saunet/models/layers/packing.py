@@ -1,4 +1,4 @@
-"""PackNet's blocks: folding space into channels and back with 3-D convolutions, in place of strides."""
+"""PackNet's blocks: folding space into channels and back with 3-D convolutions, instead of strides."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Unpacking(nn.Module):
 
 
 def initialize(network: nn.Module) -> None:
-    """Draw convolutions uniformly as Glorot and Bengio do and set biases to zero, as PackNet was trained."""
+    """Initialize convolutions with Glorot and Bengio's uniform distribution and zero biases, as PackNet was trained."""
     for module in network.modules():
         if isinstance(module, nn.Conv2d | nn.Conv3d):
             nn.init.xavier_uniform_(module.weight)

@@ -1,13 +1,13 @@
-"""The Swin layer: which token belongs to which window, attention inside windows, the block, the stage, the merging.
+"""The Swin layer: assigning tokens to windows, attention inside windows, the block, the stage, the merging.
 
-A shifted window that the cyclic shift glued together from opposite borders is masked so that its parts never see each
-other; a window that reaches into masked padding sees only its real tokens. In both cases the attention of a part is
-that of a smaller window of its own. So a map is cut into windows of a few sizes ("groups"), and no roll, mask or
-padding is ever computed.
+In Swin, a shifted window joined by the cyclic shift from opposite borders is masked so that its parts never see each
+other, and a window that reaches into masked padding sees only its real tokens. In both cases a part's attention equals
+that of a separate smaller window. So a map is cut into windows of a few sizes ("groups"), and no roll, mask or padding
+is ever computed.
 
 For prediction on a CPU, each half of a block (norm, layer, residual) runs a few rows at a time, with one small buffer
-for all: at 192x640 the hidden activations of one block of the first stage fill 47 MB, and fresh memory of that size
-costs more than the arithmetic.
+for all: at 192x640 the hidden activations of one block of the first stage take 47 MB, and new memory of that size costs
+more than the arithmetic.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from saunet.models.layers.conv import DropPath
 _KEPT: dict[tuple[object, ...], Tensor] = {}
 _KEPT_AT_MOST = 512
 _FUSED = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")  # type: ignore[no-untyped-call]
-"""Whether oneDNN applies a linear layer and GELU in one pass; what torch.compile uses too."""
+"""Whether oneDNN applies a linear layer and GELU in one pass, as torch.compile also does."""
 _CACHED_ELEMENTS = 1_500_000
 """Elements of the widest intermediate result of a piece: a few MB, about the cache of two cores."""
 
@@ -40,7 +40,7 @@ class WindowGroup(NamedTuple):
     height: int
     width: int
     windows: int
-    """How many of them one image has."""
+    """Number of them per image."""
 
     @property
     def area(self) -> int:
@@ -61,7 +61,7 @@ def axis_windows(size: int, window: int, shift: int) -> list[tuple[int, int]]:
 
 
 def window_groups(height: int, width: int, window: int, shift: int) -> list[WindowGroup]:
-    """Return the window sizes of a map and how many there are of each, in the order in which they first appear."""
+    """Return the window sizes of a map and the number of each, in order of first appearance."""
     counts: dict[tuple[int, int], int] = {}
     for _, tall in axis_windows(height, window, shift):
         for _, wide in axis_windows(width, window, shift):
@@ -75,7 +75,7 @@ def window_order(
     """Return the permutation that sorts the flat tokens of a batch of maps by window, and its inverse.
 
     The order is (group, image, window row, window column, token row, token column), groups as in `window_groups`.
-    Results are kept and shared between all modules; a compiled or exported graph holds them as constants.
+    Results are cached and shared between all modules; a compiled or exported graph has them as constants.
     """
     arguments = (batch, height, width, window, shift, str(device))
     return _plan("order", *arguments), _plan("inverse", *arguments)
@@ -87,19 +87,19 @@ def relative_position_index(height: int, width: int, window: int, device: torch.
 
 
 def _plan(kind: str, *arguments: Any) -> Tensor:
-    """Return an index tensor, made once: ``arguments`` are sizes, which a tracer may wrap, and last the device."""
+    """Return a cached index tensor: ``arguments`` are sizes, which a tracer may wrap, and the device comes last."""
     if torch.compiler.is_dynamo_compiling():
         _mark_for_compiler()
     return _kept_plan(kind, *arguments)
 
 
 def _mark_for_compiler() -> bool:
-    """Tell the compiler to call `_kept_plan`, not to look into it."""
+    """Tell the compiler to call `_kept_plan` without tracing it."""
     torch.compiler.allow_in_graph(_kept_plan)  # type: ignore[no-untyped-call]
     return True
 
 
-# What torch.compiler.assume_constant_result sets: the compiler calls the function when it meets it. Marking either by
+# The attribute set by torch.compiler.assume_constant_result: the compiler calls the function when it meets it. Using
 # torch.compiler's functions here would import the whole compiler with the network, seconds for each prediction.
 _mark_for_compiler._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
@@ -176,9 +176,9 @@ def reorder(rows: Float[Tensor, "n c"], order: Int[Tensor, " n"], inverse: Int[T
 class WindowAttention(nn.Module):
     """Multi-head self-attention inside (shifted) windows with relative position bias, SAU-Net eqs. (1) and (3).
 
-    With ``mask_padding`` a window that reaches over the border attends to real tokens only, so a map that the window
-    does not divide has the same features as one that it does, wherever windows coincide. Without it such maps are
-    padded with zeros that take part in attention, as in the dense Swin backbone and torchvision.
+    With ``mask_padding``, a window across the border attends to real tokens only, so features do not depend on whether
+    the window divides the map, wherever windows coincide. Without it, such maps are padded with zeros that take part in
+    attention, as in the dense Swin backbone and torchvision.
     """
 
     def __init__(self, dim: int, heads: int, window: int, shift: int = 0, mask_padding: bool = True) -> None:
@@ -206,11 +206,11 @@ class WindowAttention(nn.Module):
         qkv = torch.split(self.qkv(tokens), [batch * group.windows * group.area for group in groups])
         parts = [self.attend(part, group) for part, group in zip(qkv, groups, strict=True)]
         attended = self.proj(parts[0] if len(parts) == 1 else torch.cat(parts))
-        out = reorder(attended, inverse, order).view(x.shape)  # which a trace, made for one size, refuses for others
+        out = reorder(attended, inverse, order).view(x.shape)  # a trace, made for one size, refuses other sizes
         return out if (rows, columns) == (height, width) else out[:, :height, :width]
 
     def _attend_each(self, x: Float[Tensor, "b h w c"]) -> Float[Tensor, "b h w c"]:
-        """Attend with one image's order of tokens for all."""
+        """Attend with the same token order for all images."""
         _, rows, columns, _ = x.shape
         order, inverse = window_order(1, rows, columns, self.window, self.shift, x.device)
         groups = window_groups(rows, columns, self.window, self.shift)
@@ -242,15 +242,15 @@ class WindowAttention(nn.Module):
 
 
 def _symbolic(size: object) -> bool:
-    """Whether an exported network leaves a size open; the annotations of torch call it an int all the same."""
+    """Whether an exported network leaves a size open; torch annotates it as an int anyway."""
     return isinstance(size, torch.SymInt)
 
 
 def streams(tokens: Tensor, block: nn.Module) -> bool:
-    """Return whether a block may work in pieces: on a CPU, in prediction, while nobody is watching its layers.
+    """Return whether a block may work in pieces: on a CPU, in prediction, while nothing observes its layers.
 
-    Gradients, autocast, a compiler, exporter or tracer, a dispatch mode (which counts FLOPs by the operators it knows),
-    hooks and layers that somebody replaced (quantized, adapted) get the plain way through the layers' own ``forward``.
+    With gradients, autocast, a compiler, exporter or tracer, a dispatch mode (which counts FLOPs by known operators),
+    hooks, or replaced layers (quantized, adapted), the layers' own ``forward`` is used.
     """
     return (
         tokens.device.type == "cpu"
@@ -304,7 +304,7 @@ def add_mlp_(x: Float[Tensor, "*n c"], norm: nn.LayerNorm, fc1: nn.Linear, fc2: 
 
 
 def _hidden(rows: Tensor, layer: nn.Linear, buffer: Tensor) -> Tensor:
-    """Return ``gelu(layer(rows))``; where it takes two passes, both work on ``buffer``."""
+    """Return ``gelu(layer(rows))``; if that takes two passes, both use ``buffer``."""
     if _FUSED and rows.dtype == torch.float32:
         fused: Tensor = torch.ops.mkldnn._linear_pointwise(rows, layer.weight, layer.bias, "gelu", [], "none")
         return fused
@@ -399,7 +399,7 @@ class SwinStage(nn.Module):
         self.downsample = PatchMerging(dim) if merge else None
 
     def forward(self, x: Float[Tensor, "b h w c"]) -> tuple[Tensor, Tensor]:
-        """Return the map after the last block, b h w c, and what the next stage starts from, b h/2 w/2 2c."""
+        """Return the map after the last block, b h w c, and the input of the next stage, b h/2 w/2 2c."""
         for block in self.blocks:
             x = block(x)
         return x, x if self.downsample is None else self.downsample(x)
