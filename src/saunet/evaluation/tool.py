@@ -172,8 +172,10 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult:
     """Score a model or the predictions of another system, and write the results.
 
     Args:
-        options: What to score, and how. Returns: The errors of each image with their means and tables;
-            `EvaluationResult.show` prints them.
+        options: What to score, and how.
+
+    Returns:
+        The errors of each image with their means and tables; `EvaluationResult.show` prints them.
 
     Raises:
         ConfigError: if a protocol does not fit the data, or needs motion and there is none.

@@ -23,7 +23,10 @@ def ssim_loss(prediction: Float[Tensor, "*b c h w"], target: Float[Tensor, "*#b 
 
     Args:
         prediction: Images in [0, 1].
-        target: The expected images; broadcast over the leading dimensions. Returns: One map per channel.
+        target: The expected images; broadcast over the leading dimensions.
+
+    Returns:
+        One map per channel.
 
     Examples:
         >>> image = torch.rand(1, 3, 8, 8)

@@ -179,10 +179,11 @@ class EfficientNetLitePose(StackedPose):
 class PoseCNN(PoseNetwork):
     """Pose from seven strided convolutions and a 1×1 to six numbers, mean over the map (Zhou et al. 2017).
 
-    About 1.6 M parameters; it accepts any size and is slimmed as in Monodepth2. Pairs are ordered in time. Weights
-    start from He et al.'s normal distribution, biases at zero. There is no normalization: with PyTorch's default, the
-    signal would shrink to 0.4 from layer to layer, all pairs would look alike after the seventh, and for a long time
-    the network would learn little but a constant motion.
+    About 1.6 M parameters; it accepts any size and is slimmed as in Monodepth2. Pairs are ordered in time.
+
+    Weights start from He et al.'s normal distribution, biases at zero. There is no normalization: with PyTorch's
+    default, the signal would shrink by a factor of 0.4 per layer, all pairs would look alike after the seventh, and for
+    a long time the network would learn little but a constant motion.
 
     Args:
         offsets: Time offset of each source, in frames.

@@ -38,8 +38,8 @@ def apply_scale(
 ) -> None:
     """Set a predictor's scale according to the options; print and record the measurement.
 
-    The camera's height in its file applies unless the options give one. ``store_in`` is the file of the model that keeps
-    the factor.
+    The camera's height in its file applies unless the options give one. ``store_in`` is the file of the model that
+    keeps the factor.
     """
     if options.measures:
         import torch
