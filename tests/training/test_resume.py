@@ -215,7 +215,7 @@ def test_a_warm_start_takes_what_fits_and_says_how_much(model: Any, tmp_path: Pa
     assert "pose network (left unchanged: layers.0.weight, not in it, and 1 more)" in said
     assert torch.equal(next(other.depth.parameters()), next(model.depth.parameters()))
     atomic_save({"saunet": model.record, "state_dict": {"depth.x": torch.zeros(1)}}, tmp_path / "b.ckpt")
-    with pytest.raises(CheckpointError, match=r"no weights in  .*b\.ckpt fit the depth network"):
+    with pytest.raises(CheckpointError, match=r"no weights in .*b\.ckpt fit the depth network"):
         warm_start(other, tmp_path / "b.ckpt")
 
 
