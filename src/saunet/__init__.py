@@ -1,7 +1,7 @@
 """saunet: self-supervised monocular depth, assembled from registered components.
 
-Each tool of the command line is an options class and a function here: `TrainOptions` and `train`. Names are
-imported when they are first used, so ``import saunet`` stays cheap.
+Each command-line tool is an options class and a function here, such as `TrainOptions` and `train`. Names are imported
+on first use, so ``import saunet`` stays fast.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def available(kind: str) -> list[str]:
     """Return the registered names of a kind, sorted.
 
     Args:
-        kind: What `build` takes, or ``"weights"`` for the trained models that come with saunet.
+        kind: A kind that `build` accepts, or ``"weights"`` for the trained models that come with saunet.
 
     Returns:
         The names.
@@ -160,11 +160,11 @@ def load(
             packnet-sfm.
         device: Where to run, such as ``"cpu"`` or ``"cuda"``.
         flip: Average with the prediction of the mirrored image.
-        keep_aspect: Feed each image at its own aspect ratio.
-        foreign: What an ONNX or TorchScript model of another system takes and gives.
+        keep_aspect: Keep each image's aspect ratio instead of the training's.
+        foreign: Input and output of another system's ONNX or TorchScript model.
 
     Returns:
-        A `saunet.prediction.Predictor`, or for ONNX a `saunet.exporting.onnx.OnnxPredictor`, which does without torch.
+        A `saunet.prediction.Predictor`, or for ONNX a `saunet.exporting.onnx.OnnxPredictor`, which needs no torch.
 
     Raises:
         CheckpointError: if it is missing, broken, or not a model that saunet has.

@@ -78,11 +78,11 @@ class DataError(SaunetError, ValueError):
 
 
 class UnreadableError(DataError):
-    """A file that is there and cannot be read: empty, truncated, or not what its name says."""
+    """A file that exists but cannot be read: empty, truncated, or not what its name says."""
 
 
 class CameraError(DataError):
-    """A camera that cannot belong to its images, whatever is in their files."""
+    """A camera that does not fit its images, whatever their files contain."""
 
 
 class CheckpointError(SaunetError, ValueError):
@@ -104,7 +104,7 @@ def suggest(name: str, allowed: Iterable[str]) -> str:
 
 
 def one_of(name: str, value: str, allowed: Iterable[str]) -> str:
-    """Return the value of a parameter if it is one of the allowed words; the error names the nearest and lists all."""
+    """Return the value of a parameter if it is one of the allowed words; the error suggests the nearest."""
     words = list(allowed)
     if value not in words:
         hint = suggest(str(value), words)
@@ -164,9 +164,9 @@ def usable_device(name: str | torch.device) -> torch.device:
 
 
 def checked(target: C) -> C:
-    """Let a function, or a class when it is made, refuse arguments that its annotations do not allow.
+    """Make a function, or a class on construction, refuse arguments that its annotations do not allow.
 
-    Shapes are compared with each other too. It takes some microseconds a call, so it belongs where users' values enter.
+    Shapes are also compared with each other. It takes a few microseconds per call, so use it where users' values enter.
     """
     function: Any = target.__init__ if inspect.isclass(target) else target
     signature = inspect.signature(function)

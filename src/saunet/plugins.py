@@ -1,6 +1,6 @@
 """Components from outside the package, in modules that register them when imported.
 
-Only what the user names, or has installed, is ever imported; a checkpoint names the plugins it needs, the user decides.
+Only modules that the user names or has installed are ever imported; a checkpoint only lists the plugins it needs.
 """
 
 from __future__ import annotations

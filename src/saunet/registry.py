@@ -179,14 +179,14 @@ def registry(kind: str) -> Registry:
 @checked
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """A component that will be built later: which one, and the parameters given for it so far.
+    """A component to build later: which one, and the parameters given so far.
 
-    Options of tools hold components this way, since a tool may decide some parameters itself (evaluation reads the
-    images at the size of the network).
+    Options of tools hold components this way, because a tool may set some parameters itself (evaluation reads images at
+    the network's size).
 
     Args:
         node: Plain containers: ``_target_`` and parameters; nested components are nodes too.
-        name: The registered name, where it is known: several names can share a class.
+        name: The registered name, if known: several names can share a class.
 
     Examples:
         >>> data = saunet.Spec.of("data", "synthetic_tiny", workers=0)

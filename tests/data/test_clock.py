@@ -172,10 +172,10 @@ def test_a_table_of_times_orders_a_clip_and_gives_its_clock(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("file,time\na.png,1\n", r"times\.csv has no time of 1 of 2 images, such as b\.png"),
-        ("file,time\na.png,1\nb.png,soon\n", r"times\.csv, line 3: 'soon' is no time"),
-        ("file,time\na.png,1\nb.png\n", r"times\.csv, line 3: '' is no time"),
-        ("file,time\na.png,1\nb.png,1\n", r"2 images at 1 different times"),
+        ("file,time\na.png,1\n", r"times\.csv has no time for 1 of 2 images, such as b\.png"),
+        ("file,time\na.png,1\nb.png,soon\n", r"times\.csv, line 3: 'soon' is not a time"),
+        ("file,time\na.png,1\nb.png\n", r"times\.csv, line 3: '' is not a time"),
+        ("file,time\na.png,1\nb.png,1\n", r"only 1 different times for 2 images"),
         ("frame,time\n0,1\n", r"has the columns frame, time; expected the columns 'file'"),
         ("", r"has the columns none; expected"),
         ("file,time\n\xff,1\n", r"is not a CSV file of text"),
@@ -248,11 +248,14 @@ def test_a_table_beside_a_video_goes_before_its_own_times(tmp_path):
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (["0, 1", "1, 2"], "has the times of 2 frames, and .*a.mp4 has more"),
-        ([f"{each}, {each}" for each in range(8)], "of 8 frames, and .*a.mp4 only 6; is it the table of another"),
+        (["0, 1", "1, 2"], "has the times of 2 frames, but .*a.mp4 has more"),
+        (
+            [f"{each}, {each}" for each in range(8)],
+            "of 8 frames, but .*a.mp4 has only 6; check whether the table belongs to another",
+        ),
         (["0, 1", "2, 2"], "has 2 frames, but none of them is 1; number them all from 0"),
         (["0, 1", "1, 1"], "has frame 1 at 1 s, not after 1 s; times must ascend"),
-        (["0, soon"], "line 2: 'soon' is no time; expected the columns 'frame'"),
+        (["0, soon"], "line 2: 'soon' is not a time; expected the columns 'frame'"),
         ([], "contains no time"),
     ],
 )

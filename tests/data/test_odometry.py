@@ -148,7 +148,7 @@ def test_malformed_files_are_named(root):
     with pytest.raises(DataError, match=r"09.txt, line 1"):
         OdometrySequence(root, "09")
     (root / "poses" / "09.txt").write_text("\n")
-    with pytest.raises(DataError, match=r"09.txt holds no pose"):
+    with pytest.raises(DataError, match=r"09.txt has no pose"):
         OdometrySequence(root, "09")
     (root / "sequences" / "00" / "calib.txt").write_text("P0: 50 0 30 0 0 50 10 0 0 0 1 0\n")
     with pytest.raises(DataError, match=r"calib.txt lacks P2"):

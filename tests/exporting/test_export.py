@@ -304,7 +304,7 @@ def test_full_disk(checkpoint: Path, tmp_path: Path) -> None:
     said = result.stdout.splitlines()
     for line, file in zip(said, ("onnx", "pt2", "aoti.pt2", "safetensors"), strict=True):
         assert line.startswith(f"cannot write {tmp_path / 'out'}/model.{file}")
-        assert "File too large; check the folder, its rights and its space" in line
+        assert "File too large; check the folder, its permissions and free space" in line
     assert list((tmp_path / "out").iterdir()) == []
 
 

@@ -67,8 +67,8 @@ def test_values_without_end(content: dict[str, Any]) -> None:
         (nested, "levels of nesting"),
         (10**500, "bits"),
         ("x" * 100_000, "100,000 characters"),
-        (torch.zeros(2), "no plain data"),
-        ({1: 2}, "no plain data"),
+        (torch.zeros(2), "not plain data"),
+        ({1: 2}, "not plain data"),
     ):
         with pytest.raises(CheckpointError, match=words):
             ModelRecord.from_plain({**content["saunet"], "data": {"x": value}})

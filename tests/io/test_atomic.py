@@ -68,7 +68,7 @@ def test_json_keeps_names_of_files_that_are_not_utf8(tmp_path: Path) -> None:
 def test_json_without_finite_numbers_is_refused_and_the_old_file_stays(tmp_path: Path, value: float) -> None:
     path = tmp_path / "a.json"
     write_json(path, [1])
-    with pytest.raises(ConfigError, match=r"cannot write .*a\.json: .*JSON has finite numbers only"):
+    with pytest.raises(ConfigError, match=r"cannot write .*a\.json: .*JSON has only finite numbers"):
         write_json(path, {"a": [value]}, ConfigError)
     assert json.loads(path.read_text()) == [1]
     assert list(tmp_path.iterdir()) == [path]
@@ -83,7 +83,7 @@ def test_a_folder_is_looked_at_and_not_made(tmp_path: Path) -> None:
             check_folder(tmp_path / place, ConfigError)
     if os.geteuid() != 0:  # root may write everywhere
         (tmp_path / "closed").mkdir(mode=0o500)
-        with pytest.raises(ConfigError, match="no right to write to"):
+        with pytest.raises(ConfigError, match="no permission to write to"):
             check_folder(tmp_path / "closed" / "x", ConfigError)
 
 

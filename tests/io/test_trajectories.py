@@ -56,8 +56,8 @@ def test_real_poses(kitti_mini):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"poses.txt holds no pose; expected lines of 12 finite numbers \(a 3 x 4 pose, row by row\)"),
-        ("\n\n", "holds no pose"),
+        ("", r"poses.txt has no pose; expected lines of 12 finite numbers \(a 3 x 4 pose, row by row\)"),
+        ("\n\n", "has no pose"),
         ("1 2 3\n", r"poses.txt, line 1: expected 12 finite numbers \(a 3 x 4 pose, row by row\), got '1 2 3'"),
         ("\n" + " ".join(["x"] * 12), "line 2: expected 12 finite numbers"),
         (" ".join(["nan"] * 12), "line 1: expected 12 finite numbers"),

@@ -308,7 +308,7 @@ class TestFiles:
 
     def test_pickled_code_is_refused(self, tmp_path: Path) -> None:
         torch.save({"model": swin()}, tmp_path / "w.pth")
-        with pytest.raises(CheckpointError, match=r"w\.pth holds pickled objects, .* refused"):
+        with pytest.raises(CheckpointError, match=r"w\.pth contains pickled objects, .* refused"):
             load_pretrained(swin(), str(tmp_path / "w.pth"))
 
     @pytest.mark.parametrize("content", [{"epoch": 3}, [1, 2], {0: torch.zeros(2)}])

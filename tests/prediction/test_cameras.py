@@ -76,7 +76,7 @@ def test_a_video_has_the_file_beside_it(
 def test_a_lens_with_distortion_leads_to_undistort(predictor: Predictor, clips: Path, tmp_path: Path) -> None:
     describe(clips / "camera.yaml", 80.0, (0.1, 0.0, 0.0, 0.0))
     for needs in ({"outputs": ["html"]}, {"scale": ScaleOptions(method="camera_height", camera_height=1.0)}):
-        with pytest.raises(ConfigError, match=r"a lens with distortion.*undistort=.*camera\.yaml in its place"):
+        with pytest.raises(ConfigError, match=r"a lens with distortion.*undistort=.*camera\.yaml instead"):
             run(predictor, clips, tmp_path / "out", **needs)
 
 

@@ -124,7 +124,7 @@ class TestNothingIsRun:
             with pytest.raises((CheckpointError, ConfigError)):
                 saunet.load(path)
         torch.save({"state_dict": {}, "saunet": Evil()}, tmp_path / "y.ckpt")
-        with pytest.raises(CheckpointError, match="holds pickled objects, which could run code"):
+        with pytest.raises(CheckpointError, match="contains pickled objects, which could run code"):
             saunet.load(tmp_path / "y.ckpt")
         assert not marker.exists()
 

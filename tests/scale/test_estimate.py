@@ -78,7 +78,7 @@ def test_what_a_method_needs(options: dict[str, Any], message: str) -> None:
 
 
 def test_nothing_measured_is_one_sentence() -> None:
-    with pytest.raises(DataError, match="cannot be measured by speed: in none of the 2 frames the speed is known"):
+    with pytest.raises(DataError, match="cannot be measured by speed: none of the 2 frames has a known speed"):
         estimate_scale("speed", speed_batches(0.0, float("nan")), no_depth, one_meter)
 
 
@@ -146,7 +146,7 @@ def test_speeds_of_several_drives(tmp_path: Path) -> None:
     assert table.distance("a l", 0, 5, fps=10) == pytest.approx(0.5)
     assert np.isnan(table.distance("c", 0, 5, fps=10))
     table.check_drives(["c", "b"])
-    with pytest.raises(DataError, match=r"of the drives a l, b, which are not asked for; call them c, d, or leave the"):
+    with pytest.raises(DataError, match=r"of the drives a l, b, which are not needed; call them c, d, or leave the"):
         table.check_drives(["c", "d"])
     with pytest.raises(DataError, match=r"a single recording has no name, so leave the column 'drive' out"):
         table.check_drives([])
@@ -157,7 +157,7 @@ def test_speeds_of_several_drives(tmp_path: Path) -> None:
     [
         ("frame,velocity\n0,1\n", "has the columns frame, velocity; expected columns"),
         ("", "has the columns none; expected"),
-        ("frame,speed\n", "holds no line of numbers"),
+        ("frame,speed\n", "has no line of numbers"),
         ("frame,speed\n0,fast\n", r"line 2 is not a time and a speed of at least 0 \(frame=0, speed=fast\)"),
         ("frame,speed\n0,1\n1,-3\n", r"line 3 is not a time"),
         ("frame,speed\n0\n", r"line 2 is not a time"),

@@ -636,8 +636,8 @@ class TestMonodepth2:
     @pytest.mark.parametrize(
         ("content", "message"),
         [
-            ({"pose_conv.weight": torch.zeros(6, 256, 1, 1)}, "PoseCNN sees images that are not normalized"),
-            ({"net.1.weight": torch.zeros(256, 512, 3, 3)}, "does not see pairs"),
+            ({"pose_conv.weight": torch.zeros(6, 256, 1, 1)}, "PoseCNN expects unnormalized images"),
+            ({"net.1.weight": torch.zeros(256, 512, 3, 3)}, "does not get pairs"),
         ],
     )
     def test_a_pose_network_of_another_kind_is_left(
@@ -661,9 +661,9 @@ class TestMonodepth2:
 @pytest.mark.parametrize(
     ("state", "message"),
     [
-        ({"depth_net.decoder.upconvs0.0.conv.conv.weight": torch.zeros(256, 512, 3, 3)}, "SC-Depth and is not a whole"),
+        ({"depth_net.decoder.upconvs0.0.conv.conv.weight": torch.zeros(256, 512, 3, 3)}, "SC-Depth but is incomplete"),
         ({"nets.depth.encoder.conv1.weight": torch.zeros(1)}, "slowtv's decoder 'unknown'"),
-        ({f"{SLOWTV.first.format(0)}.weight": torch.zeros(256, 9, 3, 3)}, "does not say which network of timm"),
+        ({f"{SLOWTV.first.format(0)}.weight": torch.zeros(256, 9, 3, 3)}, "does not name the timm network"),
         ({"model.depth_net.x": torch.zeros(1)}, "'model.depth_net.x'.*PackNet01 and DepthResNet"),
         ({"model.depth_net.pack1.conv3d.weight": torch.zeros(8, 1, 3, 3, 3)}, "looks like a model of PackNet, but"),
         ({"layer1.0.conv1.weight": torch.zeros(1)}, r"image encoder.*model\.encoder\.weights="),

@@ -1,4 +1,4 @@
-"""The clock of a table of speeds: found where the speeds rise and fall as the motion in the pictures does."""
+"""The clock of a table of speeds, found by matching changes of speed with motion in the pictures."""
 
 from __future__ import annotations
 
@@ -13,61 +13,61 @@ from saunet.io.speeds import SpeedTable
 
 Series = NDArray[np.float64]
 STEP = 0.1
-"""Seconds between the offsets that are tried."""
+"""Seconds between tried offsets."""
 _SHORTEST = 20.0
-"""Seconds of common time with less of which nothing is compared."""
+"""Shortest common time to compare, in seconds."""
 _POSSIBLE = 6.6
 """Chi-squared of one degree of freedom at 99 %: offsets that explain the motion so much worse are excluded."""
 _MIN_CORRELATION = 0.5
 _MOST = 2.0
-"""Seconds to which an offset must be known."""
+"""Required accuracy of an offset in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """By how much a table's clock is ahead of a recording's."""
+    """The offset of a table's clock from a recording's."""
 
     offset: float
     """Seconds to subtract from the table's times."""
     known_to: float
-    """Seconds to either side that are possible too."""
+    """Uncertainty of the offset: seconds to either side."""
     correlation: float
 
     def __str__(self) -> str:
         return (
-            f"its clock is {self.offset:+.2f} s off that of the frames (known to {self.known_to:.1f} s, correlation of "
-            f"speed and motion {self.correlation:.2f})"
+            f"its clock is {self.offset:+.2f} s off that of the frames (known to {self.known_to:.1f} s, correlation "
+            f"of speed and motion {self.correlation:.2f})"
         )
 
 
 def align_speeds(table: SpeedTable, drive: str, times: Series, motion: Series) -> tuple[SpeedTable, Alignment]:
-    """Return a table whose speeds of a drive are on the clock of its frames, and by how much they were off.
+    """Return a table with a drive's speeds on the clock of its frames, and the offset found.
 
     Args:
         table: Speeds over seconds of any clock.
         drive: The recording; the table may have one without a name instead.
-        times: When the motion was, ascending seconds.
-        motion: How fast the camera moved, in any unit (translation or optical flow per second); NaN if unknown.
+        times: Times of the motion, ascending, in seconds.
+        motion: Speed of the camera's motion, in any unit (translation or optical flow per second); NaN if unknown.
 
     Raises:
         DataError: if no offset, or more than one, explains the motion.
     """
     name = drive if drive in table.drives else ""
     if table.unit != "time" or name not in table.drives:
-        raise DataError(f"{table.path} has no speeds over time of '{drive}', so its clock cannot be aligned")
+        raise DataError(f"{table.path} has no speeds with times for '{drive}', so its clock cannot be aligned")
     ticks, speeds = table.drives[name]
     what = f"the speeds of {table.path} cannot be aligned with the frames"
     known = np.isfinite(motion)
     times, motion = times[known], motion[known]
     if min(np.ptp(times) if len(times) > 1 else 0.0, np.ptp(ticks)) < _SHORTEST:
-        raise DataError(f"{what}: both must last {_SHORTEST:g} seconds at least")
+        raise DataError(f"{what}: both must last at least {_SHORTEST:g} seconds")
     motion = np.sqrt(np.minimum(motion, np.quantile(motion, 0.95)))  # turns and near scenes look fast
     offsets, r, seconds = _correlations(ticks - ticks[0], np.sqrt(speeds), times - times[0], motion)
     best = int(np.argmax(r))
     if r[best] < _MIN_CORRELATION:
         raise DataError(
             f"{what}: they explain the motion in the pictures at no offset (correlation {r[best]:.2f}, at least "
-            f"{_MIN_CORRELATION:g} is required); are they of this drive, and does its speed change?"
+            f"{_MIN_CORRELATION:g} is required); check that they belong to this drive, and that its speed changes"
         )
     at = times - times[0] + ticks[0] + offsets[best]
     common = (at >= ticks[0]) & (at <= ticks[-1])
@@ -77,8 +77,8 @@ def align_speeds(table: SpeedTable, drive: str, times: Series, motion: Series) -
     known_to = max(STEP / 2, float(np.ptp(possible)) / 2)
     if known_to > _MOST:
         raise DataError(
-            f"{what}: offsets up to {2 * known_to:.0f} seconds apart explain the motion alike; use a part of the drive "
-            "with stops and starts, or correct the times of the table"
+            f"{what}: offsets up to {2 * known_to:.0f} seconds apart explain the motion equally well; use a part of "
+            "the drive with stops and starts, or correct the times of the table"
         )
     shift = 0.0
     if 0 < best < len(r) - 1:  # the top of the parabola through three points

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all: a temporary neighbor takes the name only once it is complete."""
+"""Files written completely or not at all: a temporary file beside it takes the name only once complete."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _PARTIAL = re.compile(rf"\..*\.{_HOST}\.(\d+)\.partial(\.\w+)?")
 
 
 def partial_name(name: str, suffix: str = "") -> str:
-    """Return how this process calls what becomes ``name``, a file or a folder, while it is incomplete."""
+    """Return this process's name for the file or folder ``name`` while it is incomplete."""
     return f".{name}.{_HOST}.{os.getpid()}.partial{suffix}"
 
 
 def remove_partial_files(folder: str | Path, pattern: str = "**/.*.partial*") -> list[Path]:
-    """Remove what processes of this machine that were killed left incomplete in a folder; return what it was."""
+    """Remove and return incomplete files left in a folder by killed processes of this machine."""
     found = ((path, _PARTIAL.fullmatch(path.name)) for path in Path(folder).glob(pattern))
     gone = [path for path, name in found if name and not process_lives(int(name[1]))]
     for path in gone:
@@ -41,17 +41,18 @@ def process_lives(pid: int) -> bool:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except OSError:  # it exists and belongs to someone else
+    except OSError:  # it exists but belongs to another user
         return True
     return True
 
 
 @contextlib.contextmanager
 def replacing(path: str | Path, error: type[SaunetError] = DataError) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` that replaces it when the block ends well and vanishes when it does not.
+    """Yield a temporary path beside ``path`` that replaces it if the block succeeds and is removed if it fails.
 
-    The temporary name keeps the suffix, for writers that choose a format by it. Missing parent folders are made. Nobody
-    ever reads half a file, even after Ctrl-C, a full disk or a power cut (data reach the disk before the name does).
+    The temporary name keeps the suffix, for writers that choose a format by it. Missing parent folders are created.
+    Nobody ever reads half a file, even after Ctrl-C, a full disk or a power failure (data reach the disk before the
+    name).
     """
     path = Path(path)
     temporary = path.with_name(partial_name(path.stem[:100], path.suffix))
@@ -65,7 +66,7 @@ def replacing(path: str | Path, error: type[SaunetError] = DataError) -> Iterato
         os.replace(temporary, path)
     except OSError as reason:
         raise error(
-            f"cannot write {path}: {reason.strerror or reason}; check the folder, its rights and its space"
+            f"cannot write {path}: {reason.strerror or reason}; check the folder, its permissions and free space"
         ) from reason
     finally:
         with contextlib.suppress(OSError):
@@ -93,9 +94,9 @@ class Session:
 
 
 def check_folder(folder: str | Path, error: type[SaunetError] = DataError) -> Path:
-    """Return a folder, which need not exist, once it is sure that files can be written to it.
+    """Return a folder, which need not exist, after checking that files can be written to it.
 
-    What killed processes left incomplete there, not below, is removed.
+    Incomplete files of killed processes directly in it are removed.
     """
     place = Path(folder).absolute()
     while not os.path.lexists(place):
@@ -103,22 +104,25 @@ def check_folder(folder: str | Path, error: type[SaunetError] = DataError) -> Pa
     if not place.is_dir():
         raise error(f"cannot write to {folder}: {place} is not a folder; choose another one")
     if not os.access(place, os.W_OK | os.X_OK):
-        raise error(f"cannot write to {folder}: no right to write to {place}; change the rights, or choose another one")
+        raise error(
+            f"cannot write to {folder}: no permission to write to {place}; change the permissions, or choose another "
+            "one"
+        )
     remove_partial_files(folder, ".*.partial*")
     return Path(folder)
 
 
 def write_bytes(path: str | Path, data: bytes, error: type[SaunetError] = DataError) -> None:
-    """Write ``data`` to ``path``, whole or not at all."""
+    """Write ``data`` to ``path``, completely or not at all."""
     with replacing(path, error) as temporary:
         temporary.write_bytes(data)
 
 
 def write_json(path: str | Path, content: object, error: type[SaunetError] = DataError, indent: int | None = 2) -> None:
-    """Write plain data to ``path`` as JSON in UTF-8, whole or not at all."""
+    """Write plain data to ``path`` as JSON in UTF-8, completely or not at all."""
     try:
         text = json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=False)
     except ValueError as reason:
-        raise error(f"cannot write {path}: {reason}; JSON has finite numbers only") from reason
+        raise error(f"cannot write {path}: {reason}; JSON has only finite numbers") from reason
     # Names of files may hold bytes that are not UTF-8, surrogates in Python: these become JSON's own \u escapes.
     write_bytes(path, f"{text}\n".encode(errors="backslashreplace"), error)

@@ -18,7 +18,7 @@ COLORMAPS: tuple[str, ...] = (*_MAPS, "gray")
 
 
 def value_range(values: Float[np.ndarray, "..."], low: float = 0.5, high: float = 98.0) -> tuple[float, float]:
-    """Return the percentiles ``low`` and ``high`` of the finite values: a range that a few outliers cannot stretch."""
+    """Return the percentiles ``low`` and ``high`` of the finite values, a range robust to a few outliers."""
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return 0.0, 1.0
@@ -27,7 +27,7 @@ def value_range(values: Float[np.ndarray, "..."], low: float = 0.5, high: float 
 
 
 class RunningRange:
-    """Color limits that follow a clip slowly: an exponential mean of each frame's range."""
+    """Color limits that follow a clip slowly: an exponential average of the frames' ranges."""
 
     def __init__(self, smoothing: float | int = 0.95) -> None:
         self.smoothing = in_range("range_smoothing", smoothing, 0.0, 0.999999)

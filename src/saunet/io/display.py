@@ -1,4 +1,4 @@
-"""Showing a result to whoever looks: in the notebook, or as a page in the browser."""
+"""Showing a result: in the notebook, or as a page in the browser."""
 
 from __future__ import annotations
 

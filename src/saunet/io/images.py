@@ -1,4 +1,4 @@
-"""The one reader, writer and resize of images, so that a model sees in use what it saw in training."""
+"""The only reader, writer and resize of images, so that a model gets the same in use as in training."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from saunet.errors import DataError, UnreadableError, one_of
 from saunet.io.atomic import write_bytes
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
-"""File name endings that are taken for images when a folder is read."""
+"""File name endings that count as images in a folder."""
 
 _NUMBER = re.compile(r"(\d{9,}\.\d+|\d+)", re.ASCII)
 """A number in a name; with decimals only where they are those of a time, in seconds since 1970."""
@@ -63,7 +63,7 @@ def name_times(names: Sequence[str]) -> list[float] | None:
 
 
 def frame_order(names: Sequence[str]) -> list[int]:
-    """Return the places of frames in order of time: by the time stamps in their names, else by the numbers in them."""
+    """Return the order of frames in time: by the time stamps in their names, else by the numbers in them."""
     times = name_times([name.rpartition(".")[0] for name in names])
     alike = len({name.translate(_ZEROS) for name in names}) < 2  # digits at the same places: text sorts them alike
     keys: Sequence[Any] = times or (names if alike else [natural_order(name) for name in names])
@@ -78,7 +78,7 @@ def read_bytes(path: str | Path) -> UInt8[np.ndarray, " n"]:
     except FileNotFoundError as reason:
         raise DataError(f"no file at {path}; check the path or copy the file again") from reason
     except IsADirectoryError as reason:
-        raise DataError(f"{path} is a folder where a file is needed") from reason
+        raise DataError(f"{path} is a folder, but a file is needed") from reason
     except OSError as reason:
         raise UnreadableError(f"cannot read {path}: {reason.strerror or reason}") from reason
     if data.size == 0:
@@ -89,8 +89,8 @@ def read_bytes(path: str | Path) -> UInt8[np.ndarray, " n"]:
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     """Read an image file as RGB bytes.
 
-    Gray images get three equal channels, 16-bit ones are scaled by the bits that the images of their folder use (16, 12
-    or 10), so that white stays white, transparency is dropped, and the camera's EXIF rotation is applied.
+    Gray images get three equal channels. 16-bit images are scaled by the bits that the images of their folder use (16,
+    12 or 10), so that white stays white. Transparency is dropped, and the camera's EXIF rotation is applied.
     """
     image = _decode(path, _COLOR)
     bits = 8
@@ -105,7 +105,7 @@ def decode_image(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def read_depth(path: str | Path, steps: float | int = 256) -> Float32[np.ndarray, "h w"]:
-    """Return a depth map stored as 16-bit PNG, 0 where unknown, with so many steps a meter (KITTI's 256)."""
+    """Return a depth map stored as 16-bit PNG, 0 where unknown, with so many steps per meter (KITTI's 256)."""
     stored = read_unchanged(path)
     if stored.dtype != np.uint16 or stored.ndim != 2:
         raise DataError(
@@ -190,7 +190,7 @@ def as_rgb_bytes(
 
 
 _COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-_SAMPLED = 8  # images of a folder that are looked at for the bits in use
+_SAMPLED = 8  # images of a folder to check for the bits in use
 
 
 def _bits(image: NDArray[Any]) -> int:
@@ -210,7 +210,7 @@ def _folder_bits(folder: Path, suffix: str) -> int:
             bits = max(bits, _bits(image)) if image.dtype == np.uint16 else bits
     if bits < 16:
         logging.getLogger(__name__).warning(
-            "%s: 16-bit images that use %d bits, as sensors of %d bits have them; %d is white in them",
+            "%s: 16-bit images that use %d bits, as from %d-bit sensors, so %d is white",
             folder, bits, bits, 2**bits - 1,
         )  # fmt: skip
     return bits
@@ -219,7 +219,7 @@ def _folder_bits(folder: Path, suffix: str) -> int:
 def resize(array: NDArray[Any], height: int, width: int) -> NDArray[Any]:
     """Resize h x w or h x w x c, averaging areas when it shrinks and interpolating linearly when it grows.
 
-    Pixel u moves to (u + 0.5) * s - 0.5. An array that has the size already is returned itself.
+    Pixel u moves to (u + 0.5) * s - 0.5. An array that already has the size is returned itself.
     """
     if array.shape[:2] == (height, width):
         return array
@@ -275,8 +275,8 @@ def _decoded(data: UInt8[np.ndarray, " n"], path: str | Path, flags: int) -> NDA
         )
     if (claimed := _claimed_bytes(data[:26].tobytes())) > _DEFLATE * data.size:  # decoders would make room for it first
         raise UnreadableError(
-            f"{path} is damaged: it says that it holds {claimed} bytes of pixels, which {data.size} bytes cannot; "
-            "copy it again"
+            f"{path} is damaged: its header claims {claimed} bytes of pixels, too many for {data.size} bytes; copy "
+            "it again"
         )
     try:
         image = cv2.imdecode(data, flags)
@@ -284,8 +284,8 @@ def _decoded(data: UInt8[np.ndarray, " n"], path: str | Path, flags: int) -> NDA
         raise UnreadableError(f"{path} cannot be decoded: {str(reason).strip().splitlines()[-1]}") from reason
     if image is None:
         raise UnreadableError(
-            f"{path} is not an image that OpenCV can read, or is damaged ({data.size} bytes); "
-            "copy it again or convert it to PNG or JPEG"
+            f"{path} is not an image that OpenCV can read, or is damaged ({data.size} bytes); copy it again or "
+            "convert it to PNG or JPEG"
         )
     return np.asarray(image)
 

@@ -1,4 +1,4 @@
-"""Pictures of a camera that is connected, or of an address: the newest ones, whatever happens on the way."""
+"""The newest pictures of a connected camera or an address, even if the connection fails in between."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from saunet.errors import DataError, one_of
 from saunet.io.video import Deinterlacer, Picture, VideoFrame, to_rgb
 
 SCHEMES = ("rtsp", "rtsps", "rtmp", "http", "https", "tcp", "udp")
-"""Kinds of addresses that are taken for cameras."""
+"""Kinds of addresses that count as cameras."""
 _WAITING = 1
-"""Pictures that wait at most; a newer one takes the place of the oldest. Each one more is one more turn of latency."""
+"""Most waiting pictures; a newer one replaces the oldest. Each further one adds a frame of latency."""
 _SILENCE = 5.0
 """Seconds without a picture after which a connection counts as lost."""
 _PATIENCE = 60.0
@@ -74,9 +74,9 @@ class _Arrived:
 
 
 class CameraReader:
-    """Frames of a camera or an address until somebody stops it; times are those of arrival.
+    """Frames of a camera or an address until it is stopped; times are those of arrival.
 
-    A thread receives; only the newest picture waits to be taken. A connection that is lost is opened again.
+    A thread receives; only the newest picture waits. A lost connection is reopened.
 
     Attributes:
         fps: Frames per second, as far as known.
@@ -145,15 +145,15 @@ class CameraReader:
 
     @property
     def notes(self) -> list[str]:
-        """How it went, a sentence each."""
+        """Notes about the recording, one sentence each."""
         found = list[str]()
         if self._latencies:
             usual, worst = statistics.median(self._latencies), max(self._latencies)
             found.append(f"latency from arrival to result: median {1000 * usual:.0f} ms, at most {1000 * worst:.0f} ms")
         if self.dropped:
-            found.append(f"{self.dropped} frames came faster than they were predicted, and newer ones were taken")
+            found.append(f"{self.dropped} frames arrived faster than prediction and were replaced by newer ones")
         if self.lost:
-            found.append(f"the connection to {self.name} was lost and opened again {self.lost} times")
+            found.append(f"the connection to {self.name} was lost and reopened {self.lost} times")
         return found
 
     @property
@@ -197,7 +197,7 @@ class CameraReader:
                     return
                 if container.duration and container.duration > 0:
                     raise DataError(
-                        f"{self.name} is a finished video, of which a live camera's pace would lose frames; "
+                        f"{self.name} is a finished video, and reading it like a live camera would lose frames; "
                         "download it, and give the file"
                     )
                 stream.thread_type = "SLICE"  # threads that work on several frames would hold them back

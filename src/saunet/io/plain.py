@@ -1,7 +1,7 @@
-"""Plain data from files that anyone may have written, with limits set beforehand; nothing in a file is ever run.
+"""Plain data from untrusted files, with limits set beforehand; no code in a file is ever run.
 
-Whatever is wrong with the content ends in one sentence: size, depth, repeated keys, numbers without end, aliases that
-grow exponentially, damaged headers. What the system refuses (no such file, no rights) is an `OSError` as always.
+Anything wrong with the content becomes one sentence: size, depth, repeated keys, endless numbers, aliases that grow
+exponentially, damaged headers. System errors (no such file, no permission) stay an `OSError`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def read_bytes(path: str | Path, most: int = JSON_BYTES, error: type[SaunetError
     with Path(path).open("rb") as stream:
         data = stream.read(most + 1)
     if len(data) > most:
-        raise error(f"{path} has more than {most:,} bytes, the most that are read of such a file; check what it is")
+        raise error(f"{path} has more than {most:,} bytes, the most allowed for such a file; check what it is")
     return data
 
 
@@ -212,8 +212,8 @@ def read_torch(path: Path, what: str, *, stand_ins: bool = False) -> Any:
                     continue
             if any(mark in str(reason) for mark in ("GLOBAL", "Unsupported class", "Trying to")):
                 raise CheckpointError(
-                    f"{path} holds pickled objects, which could run code when read, so it is refused; "
-                    "save plain containers and tensors only, as saunet train does"
+                    f"{path} contains pickled objects, which could run code when read, so it is refused; save plain "
+                    "containers and tensors only, as saunet train does"
                 ) from reason
             raise CheckpointError(f"{path} is not {what}, or is damaged; copy it again") from reason
         except OSError as reason:

@@ -59,7 +59,7 @@ class SpeedTable:
         return float(np.sum(np.diff(at) * (speeds[1:] + speeds[:-1]) / 2)) / (high - low)
 
     def start(self, first: float, drive: str = "") -> float:
-        """Return the table's zero on a clock on which the first frame was at ``first``.
+        """Return the table's zero on a clock that shows ``first`` at the first frame.
 
         It is that clock's own, but the first frame if the two clocks are months apart: frames with Unix time, and a
         table that counts from their start.
@@ -72,8 +72,8 @@ class SpeedTable:
         if not {"", *names} & set(self.drives):
             expected = f"call them {_some(names)}, or leave" if names else "a single recording has no name, so leave"
             raise DataError(
-                f"{self.path} gives speeds of the drives {_some(list(self.drives))}, which are not asked for; "
-                f"{expected} the column 'drive' out"
+                f"{self.path} has speeds of the drives {_some(list(self.drives))}, which are not needed; {expected} "
+                "the column 'drive' out"
             )
 
 
@@ -100,8 +100,8 @@ def read_speeds(path: str | Path) -> SpeedTable:
                 of_drive = rows.setdefault(drive, {})
                 if tick in of_drive:
                     raise DataError(
-                        f"{path}, line {number} gives a second speed at {unit} {tick:g}"
-                        f"{f' of {drive}' if drive else ''}; keep one line of each"
+                        f"{path}, line {number} has a second speed for {unit} "
+                        f"{tick:g}{f' of {drive}' if drive else ''}; keep one line of each"
                     )
                 of_drive[tick] = speed
     except OSError as reason:
@@ -109,7 +109,7 @@ def read_speeds(path: str | Path) -> SpeedTable:
     except (UnicodeDecodeError, csv.Error) as reason:
         raise DataError(f"{path} is not a CSV file of text ({reason}); {_FORMAT}") from reason
     if not rows:
-        raise DataError(f"{path} holds no line of numbers; {_FORMAT}")
+        raise DataError(f"{path} has no line of numbers; {_FORMAT}")
     sorted_rows = {drive: np.array(sorted(of_drive.items())) for drive, of_drive in rows.items()}
     return SpeedTable(Path(path), unit, {drive: (each[:, 0], each[:, 1]) for drive, each in sorted_rows.items()})
 

@@ -1,4 +1,4 @@
-"""When frames were taken: by a table beside them; images of a folder also by stamps in their names, or by EXIF."""
+"""Times of frames, from a table beside them; for images also from stamps in their names, or EXIF."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _table(path: Path, key: str, expected: str) -> dict[str, float]:
                 with suppress(ValueError):
                     seconds = float(row["time"] or "")
                 if not math.isfinite(seconds):
-                    raise DataError(f"{path}, line {number}: '{(row['time'] or '')[:40]}' is no time; {expected}")
+                    raise DataError(f"{path}, line {number}: '{(row['time'] or '')[:40]}' is not a time; {expected}")
                 found[(row[key] or "").strip()] = seconds
     except OSError as reason:
         raise DataError(f"cannot read {path}: {reason.strerror or reason}") from reason
@@ -91,9 +91,9 @@ def _table_times(path: Path, names: Sequence[str]) -> list[float]:
     times = [found.get(name, found.get(os.path.splitext(name)[0])) for name in names]
     without = [name for name, seconds in zip(names, times, strict=True) if seconds is None]
     if without:
-        raise DataError(f"{path} has no time of {len(without)} of {len(names)} images, such as {without[0]}; add them")
+        raise DataError(f"{path} has no time for {len(without)} of {len(names)} images, such as {without[0]}; add them")
     if len(set(times)) < len(times):
-        raise DataError(f"{path} has {len(times)} images at {len(set(times))} different times; give each its own")
+        raise DataError(f"{path} has only {len(set(times))} different times for {len(times)} images; give each its own")
     return [seconds for seconds in times if seconds is not None]
 
 

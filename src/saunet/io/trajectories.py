@@ -14,7 +14,7 @@ from saunet.io.atomic import write_bytes
 
 
 def write_kitti(path: Path, T_world_cam: Float64[ndarray, "n 4 4"]) -> None:
-    """Write a trajectory as KITTI does: a line a frame, the upper 3 x 4 of the camera-to-world matrix row by row."""
+    """Write a trajectory in KITTI's format: per frame a line with the upper 3 x 4 of the camera-to-world matrix."""
     _write(path, T_world_cam[:, :3].reshape(-1, 12))
 
 
@@ -52,7 +52,7 @@ def read_kitti(path: Path) -> Float64[ndarray, "n 4 4"]:
             raise DataError(f"{path}, line {number}: expected {expected}, got '{line.strip()[:60]}'")
         rows.append(row)
     if not rows:
-        raise DataError(f"{path} holds no pose; expected lines of {expected}; copy the file again")
+        raise DataError(f"{path} has no pose; expected lines of {expected}; copy the file again")
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = np.array(rows).reshape(-1, 3, 4)
     return poses

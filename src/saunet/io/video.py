@@ -1,4 +1,4 @@
-"""Videos in and out: frames in the order in which a player shows them, with their times, colors and rotation."""
+"""Reading and writing videos: frames in display order, with their times, colors and rotation."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ class VideoReader(Session):
     colors are converted, which takes half the time of shrinking them after.
 
     Attributes:
-        fps: Mean frames per second; None if nobody knows.
+        fps: Mean frames per second; None if unknown.
         declared: Number of frames as the file states it, or estimated from its duration; None if unknown.
-        height: Of the frames, after rotation and shrinking.
-        width: Of the frames, after rotation and shrinking.
+        height: Height of the frames, after rotation and shrinking.
+        width: Width of the frames, after rotation and shrinking.
         origin: Time stamp of the first frame in the file, in seconds; 0 if it has none.
-        missing: After reading to the end: frames that a truncated file lacks.
-        damaged: After reading to the end: frames that could be decoded in part or not at all.
-        plain: After reading to the end: frames of one single color.
+        missing: After reading to the end: number of frames missing from a truncated file.
+        damaged: After reading to the end: number of frames decoded only in part or not at all.
+        plain: After reading to the end: number of frames in one single color.
         count: Frames decoded since the start of the last reading.
     """
 
@@ -90,7 +90,7 @@ class VideoReader(Session):
             first = next(self._decoded(container, stream), None)
             if first is None:
                 raise UnreadableError(
-                    f"{self.name} holds no frame that can be decoded; it may be truncated or have an unusual codec"
+                    f"{self.name} has no frame that can be decoded; it may be truncated or have an unusual codec"
                 )
             self.height, self.width = self._picture(first).shape[:2]
             self._timed = container.format.name not in _RAW and first.time is not None
@@ -119,9 +119,9 @@ class VideoReader(Session):
             image = self._picture(frame)
             if image.shape[:2] != (self.height, self.width):
                 raise DataError(
-                    f"{self.name} changes its size from {self.width}x{self.height} to {image.shape[1]}x"
-                    f"{image.shape[0]} (width x height) at frame {number}; frames share one size, so split the file "
-                    "there"
+                    f"{self.name} changes its size from {self.width}x{self.height} to "
+                    f"{image.shape[1]}x{image.shape[0]} (width x height) at frame {number}; all frames must have one "
+                    "size, so split the file there"
                 )
             self.plain += _one_color(image)
             yield VideoFrame(number, seconds, image)
@@ -182,8 +182,8 @@ class VideoReader(Session):
                 if self._times is not None:
                     if number >= len(self._times):
                         raise DataError(
-                            f"{times_file(self.path)} has the times of {len(self._times)} frames, and {self.name} has "
-                            "more; add the others"
+                            f"{times_file(self.path)} has the times of {len(self._times)} frames, but {self.name} "
+                            "has more; add the others"
                         )
                     yield number, self._times[number], frame
                     continue
@@ -197,15 +197,15 @@ class VideoReader(Session):
                 yield number, seconds, frame
         if self.plain and self.plain == self.count:
             raise DataError(
-                f"every one of the {self.plain} frames of {self.name} has one single color; it was not decoded, or the "
-                "camera was covered; convert it to H.264 and look at it"
+                f"every one of the {self.plain} frames of {self.name} has one single color; it was not decoded, or "
+                "the camera was covered; convert it to H.264 and check it"
             )
         if self._broken or _truncated(self.path):
             self.missing = max(1, (self.declared or 0) - self.count)
         elif self._times is not None and self.count < len(self._times):
             raise DataError(
-                f"{times_file(self.path)} has the times of {len(self._times)} frames, and {self.name} only "
-                f"{self.count}; is it the table of another video?"
+                f"{times_file(self.path)} has the times of {len(self._times)} frames, but {self.name} has only "
+                f"{self.count}; check whether the table belongs to another video"
             )
 
     def _rates(self, container: Any, stream: Any) -> tuple[float | None, float | None]:
@@ -253,9 +253,9 @@ def nearest_steps(
 
 
 class VideoWriter(Session):
-    """Writes RGB frames to an mp4 file that gets its name only when it is complete.
+    """Writes RGB frames to an mp4 file that gets its name only when complete.
 
-    Use it as a context manager; leaving it by an error discards the file.
+    Use it as a context manager; an error discards the file.
     """
 
     def __init__(self, path: str | Path, fps: float | int, codec: str = "h264") -> None:
@@ -301,7 +301,7 @@ class VideoWriter(Session):
             av.Codec(name, "w")
         except ValueError as reason:
             raise ConfigError(
-                f"codec is {self.codec}, with which this PyAV cannot write {self.path}; set codec=mp4v"
+                f"codec is {self.codec}, which this PyAV cannot write to {self.path}; set codec=mp4v"
             ) from reason
         self._container = av.open(f"file:{self._temporary}", "w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(self.fps).limit_denominator(1001)

@@ -93,7 +93,7 @@ def read_given(
         found, size = read_model(options.checkpoint).record.intrinsics, recording.first_size
         if found is None:
             raise ConfigError(
-                f"camera=checkpoint asks for the focal length that a training found, and '{options.checkpoint}' has "
+                f"camera=checkpoint uses the focal length that a training found, but '{options.checkpoint}' has "
                 "none; give the camera, or train with model.intrinsics=learned"
             )
         view = math.degrees(2 * math.atan(0.5 / found.mean[1]))
@@ -117,8 +117,8 @@ def read_given(
         return Camera(lens.K, lens.height, lens.width), file.camera_height
     if not file.is_straight:
         raise ConfigError(
-            f"camera={given} describes a lens with distortion, and points need straight images; "
-            f"set undistort={given} in its place"
+            f"camera={given} describes a lens with distortion, but points need undistorted images; set "
+            f"undistort={given} instead"
         )
     size = recording.first_size
     camera = None if size is None else Camera(file.intrinsics(*size, "the images"), *size)

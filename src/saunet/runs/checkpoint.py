@@ -1,4 +1,4 @@
-"""A trained model on disk: ``state_dict`` (keys ``depth.*`` and ``pose.*``) beside ``saunet``, the plain `ModelRecord`.
+"""A trained model on disk: ``state_dict`` (keys ``depth.*`` and ``pose.*``) and ``saunet``, the plain `ModelRecord`.
 
 It is read with ``weights_only=True``, and only registered components are ever built from it: reading runs nothing.
 """
@@ -114,7 +114,7 @@ def build_networks(record: ModelRecord, pretrained: bool = False) -> tuple[Depth
     Otherwise no file makes us fetch another: enough where a checkpoint's weights are loaded next.
 
     Raises:
-        CheckpointError: if a component is not registered, or public weights cannot be had.
+        CheckpointError: if a component is not registered, or public weights are not available.
         ConfigError: if a component refuses its recorded parameters.
     """
     record.check_registered()
@@ -146,14 +146,14 @@ def load_weights(module: nn.Module, state: Mapping[str, Tensor], what: str) -> N
     shapes = [key for key in expected if key in state and expected[key].shape != state[key].shape]
     if shapes:
         got, wanted = (tuple(tensors[shapes[0]].shape) for tensors in (state, expected))
-        differences.append(f"'{shapes[0]}' is {got} where the model has {wanted}{_more(shapes)}")
+        differences.append(f"'{shapes[0]}' is {got} but the model has {wanted}{_more(shapes)}")
     if differences:
         raise CheckpointError(f"checkpoint of another model, the {what} does not fit: {'; '.join(differences)}")
     module.load_state_dict(state, strict=True)
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:
-    """Read a checkpoint into memory, on the CPU, without running anything from it.
+    """Read a checkpoint into memory, on the CPU, without running any code from it.
 
     Raises:
         CheckpointError: if the file is missing, is a folder, is broken, holds pickled objects, is no saunet checkpoint,

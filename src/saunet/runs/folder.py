@@ -175,7 +175,7 @@ def read(folder: str | Path) -> dict[str, Any]:
     return read_mapping(Path(folder) / FILE)
 
 
-def mark_lost(folder: str | Path, error: str = f"ended without a word: {LOST}") -> None:
+def mark_lost(folder: str | Path, error: str = f"ended without a message: {LOST}") -> None:
     """Mark a run as failed that still claims to run though nobody runs it."""
     content = read(folder)
     if content.get("status") == "running":

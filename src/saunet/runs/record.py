@@ -123,7 +123,7 @@ class ModelRecord:
     def __post_init__(self) -> None:
         if not 0 < self.min_depth < self.max_depth < math.inf:
             raise CheckpointError(
-                f"the model record's depth range is {self.min_depth} to {self.max_depth}; needed: 0 < min < max"
+                f"the model record's depth range is {self.min_depth} to {self.max_depth}; it must satisfy 0 < min < max"
             )
         if self.height < 1 or self.width < 1:
             raise CheckpointError(f"the model record's size is {self.height}x{self.width}; both must be above 0")
@@ -214,7 +214,9 @@ def _check_bounds(plain: Any) -> None:
     for _ in range(_DEPTH):
         for name, value in level:
             if not isinstance(value, str | int | float | Mapping | list | tuple | None) or not isinstance(name, str):
-                raise CheckpointError(f"the model record's '{name}' is a {type(value).__name__}, no plain data")
+                raise CheckpointError(
+                    f"the model record's '{name}' is a {type(value).__name__}, which is not plain data"
+                )
             if isinstance(value, int) and abs(value) >= 1 << 63:
                 raise CheckpointError(f"the model record's '{name}' is a number of {value.bit_length()} bits")
             if isinstance(value, str) and len(value) > _TEXT:
@@ -239,8 +241,8 @@ def _check_numbers(slot: str, node: Any) -> None:
             _check_numbers(slot, value)
     elif isinstance(node, int) and abs(node) > (most := int(MAX_NUMBER * limit_factor())):
         raise CheckpointError(
-            f"the recorded {slot} asks for {node:,}; whole numbers up to {most:,} are allowed, "
-            f"or more with {LIMIT_FACTOR}"
+            f"the recorded {slot} asks for {node:,}; whole numbers up to {most:,} are allowed, or more with "
+            f"{LIMIT_FACTOR}"
         )
 
 
@@ -281,7 +283,7 @@ def _focals(found: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
         pair = _get(focals, name, list | tuple)
         if len(pair) != 2 or not all(isinstance(each, float) for each in pair):
             raise CheckpointError(
-                f"the model record's focal lengths of '{name[:60]}' are {_short(pair)}; two numbers are needed"
+                f"the model record's focal lengths of '{name[:60]}' are {_short(pair)}; they must be two numbers"
             )
     return {name: (pair[0], pair[1]) for name, pair in focals.items()}
 

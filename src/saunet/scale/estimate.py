@@ -38,12 +38,12 @@ _MIN_DISPARITY = 1.5  # pixels; an eighth of a pixel of matching error is then 8
 _LARGEST_DISPARITY = 0.15  # of the image's width
 
 _WHY_NOT = {
-    "camera_height": "in none of the {count} frames the lower part of the depth map is a level plane; the road is not "
-    "in view, the intrinsics are wrong, or the model is not trained",
-    "speed": "in none of the {count} frames the speed is known and the car moves; give speeds of those frames, or set "
+    "camera_height": "the lower part of the depth map is not a level plane in any of the {count} frames; the road is "
+    "not in view, the intrinsics are wrong, or the model is not trained",
+    "speed": "none of the {count} frames has a known speed and a moving car; give speeds of those frames, or set "
     "scale.align=true if their clock starts at another time",
-    "stereo": "in none of the {count} frames enough pixels of the stereo pair match; check that both cameras' images "
-    "are rectified and belong together",
+    "stereo": "too few pixels of the stereo pair match in all {count} frames; check that both cameras' images are "
+    "rectified and belong together",
 }
 
 
@@ -133,7 +133,7 @@ def estimate_scale(
         camera_height: Meters above the road, for ``camera_height``.
 
     Raises:
-        ConfigError: for an unknown method, or if what it needs is not given.
+        ConfigError: for an unknown method, or if something it needs is not given.
         DataError: if no frame could be measured.
     """
     one_of("scale.method", method, METHODS)

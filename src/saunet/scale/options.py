@@ -1,4 +1,4 @@
-"""How depth becomes meters, and where motion comes from: the options that evaluation and prediction share."""
+"""Options shared by evaluation and prediction: how depth becomes meters, and the source of motion."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _USED_BY = {
 }
 
 MOTIONS = ("auto", "tracked")
-"""Where the camera's motion comes from once a model is trained: a pose network if there is one, or tracked points."""
+"""Source of the camera's motion after training: a pose network if there is one, or tracked points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,17 +32,17 @@ class ScaleOptions:
     Args:
         method: ``auto`` (the factor that the checkpoint stores, if any), ``none``, ``stored``, or one that measures:
             ``camera_height``, ``speed``, ``stereo``.
-        camera_height: Meters from the road to the camera; by default what the data or ``camera.yaml`` say.
-        speeds: A CSV file with the columns ``time`` or ``frame``, ``speed`` and, of several drives, ``drive``.
-        align: Find the clock of the speeds by the predicted motion, if it is not that of the frames.
+        camera_height: Meters from the road to the camera; by default from the data or ``camera.yaml``.
+        speeds: A CSV file with the columns ``time`` or ``frame``, ``speed`` and, for several drives, ``drive``.
+        align: Find the clock offset of the speeds from the predicted motion, if their clock differs from the frames'.
         fps: Frames per second of the speeds.
         stereo: Images of the other camera of a stereo pair.
         baseline: Meters to the other camera.
-        frames: Of more frames, only so many are measured, evenly spread.
+        frames: Largest number of frames to measure, evenly spread.
         store: Write the measured factor into the checkpoint, or into an exported folder's ``config.json``.
 
     Raises:
-        ConfigError: if a value is out of range, or nothing is measured that could be stored.
+        ConfigError: if a value is out of range, or ``store`` is set without a measurement.
     """
 
     method: str = "auto"
@@ -89,7 +89,7 @@ class ScaleOptions:
         """Return the scale to apply, given the measured or stored one."""
         if self.method == "stored" and known is None:
             raise ConfigError(
-                "scale.method=stored and the checkpoint stores no scale; measure one, "
-                "such as with scale.method=camera_height, and keep it with scale.store=true"
+                "scale.method is 'stored' but the checkpoint stores no scale; measure one, such as with "
+                "scale.method=camera_height, and keep it with scale.store=true"
             )
         return None if self.method == "none" else known

@@ -45,7 +45,8 @@ def clip_batches(
     for number, (frame, other) in enumerate(itertools.zip_longest(frames, () if stereo is None else stereo)):
         if frame is None or (stereo is not None and other is None):
             raise DataError(
-                f"the two cameras have different numbers of images (one ends after {number}); give pairs of one moment"
+                f"the two cameras have different numbers of images (one ends after {number}); give pairs taken at "
+                "the same moment"
             )
         window.append(network_input(frame, height, width))
         others.append(other)

@@ -240,7 +240,7 @@ def write_odometry(
 def _whole_folder(target: Path) -> Iterator[Path]:
     """Yield a folder beside ``target`` that becomes ``target`` when all went well and disappears otherwise."""
     if target.exists():
-        raise DataError(f"{target} exists and is not overwritten; remove it or choose another place")
+        raise DataError(f"{target} exists and is not overwritten; remove it or choose another folder")
     temporary: Path | None = None
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -250,7 +250,7 @@ def _whole_folder(target: Path) -> Iterator[Path]:
         temporary.rename(target)
         temporary = None
     except OSError as reason:
-        fix = "check the folder, its rights and its space"
+        fix = "check the folder, its permissions and free space"
         raise DataError(f"cannot write {target}: {reason.strerror or reason}; {fix}") from reason
     finally:
         if temporary is not None:

@@ -18,7 +18,7 @@ from saunet.weights.locate import CONFIG, POSE, WEIGHTS, locate
 
 
 def read_model(source: str | Path) -> Checkpoint:
-    """Read a trained model into memory, without running anything from it.
+    """Read a trained model into memory, without running any code from it.
 
     It is a checkpoint, a folder written by ``saunet export`` (or the safetensors file in it), the name of a shipped
     model, a hub id (see `saunet.weights.locate.locate`), or a model of another system (see `saunet.weights.foreign`).

@@ -1,8 +1,8 @@
-"""Depth networks of other systems, read as ours: their files' names and shapes say what to build; nothing is run.
+"""Depth networks of other systems, read as ours: names and shapes in their files decide what to build; no code is run.
 
-Taken are Monodepth2 and what is stored like it (ManyDepth's single-frame networks, Lite-Mono), SC-Depth, slowtv's
+Supported are Monodepth2 and models stored like it (ManyDepth's single-frame networks, Lite-Mono), SC-Depth, slowtv's
 benchmark and packnet-sfm. Each reader below states what to build and, for each of our names, where that file keeps it.
-Depth is that of their own code. A pose network is taken where it means the same motion as ours.
+Depth equals that of their own code. A pose network is used if it predicts the same motion as ours.
 """
 
 from __future__ import annotations
@@ -58,10 +58,11 @@ class _Model:
 
 
 def read_foreign(path: Path) -> Checkpoint | None:
-    """Read a file or folder of another system; None if it is of none that is known.
+    """Read a file or folder of another system; None if it belongs to no known system.
 
     Raises:
-        CheckpointError: if it is of a known system and incomplete, damaged, or a network that saunet does not have.
+        CheckpointError: if it belongs to a known system but is incomplete, damaged, or a network that saunet does not
+            have.
     """
     if path.is_dir():
         found = _folder(path)
@@ -82,7 +83,7 @@ def read_foreign(path: Path) -> Checkpoint | None:
         raise CheckpointError(f"{path} is one part of a model in several files; give its folder, {path.parent}")
     if any(re.match(r"(layer1\.0|features\.\d|patch_embed|conv_stem|stem)\b", name) for name in state):
         raise CheckpointError(
-            f"{path} holds an image encoder and no depth network; start a training from it with "
+            f"{path} has an image encoder but no depth network; start a training from it with "
             f"model.encoder.weights={path}"
         )
     return None
@@ -100,7 +101,7 @@ def _folder(path: Path) -> tuple[_Model, State] | None:
         return None
     if missing:
         other = next(name for name in files if name not in missing)
-        raise CheckpointError(f"{path} has {other} and no {missing[0]}, which belongs to it; copy that too")
+        raise CheckpointError(f"{path} has {other} but no {missing[0]}, which belongs to it; copy that too")
     facts, state = dict[str, Any](), State()
     sizes = ["encoder.pth"] if prefix and (path / "encoder.pth").is_file() else []
     for name in (*sizes, *files):
@@ -142,9 +143,9 @@ def _folder_pose(path: Path, state: State) -> tuple[Spec | None, _Rules, tuple[s
     if first is None or joined is None:
         why = "its two files are pose_encoder.pth and pose.pth with a ResNet for pairs of frames"
         if _has(found, "pose.pth:pose_conv."):
-            why = "PoseCNN sees images that are not normalized, ours normalized ones"
+            why = "its PoseCNN expects unnormalized images, ours normalized ones"
     elif first.shape[1:2] != (6,) or joined.shape[1:2] != (256,):
-        why = "it does not see pairs of frames in the order of time"
+        why = "it does not get pairs of frames in temporal order"
     else:
         state |= found
         parts = _resnet(found, "pose_encoder.pth:encoder.")
@@ -242,7 +243,7 @@ def _slowtv(path: Path, state: State, content: Mapping[str, Any]) -> _Model:
     else:
         kind = _setting(config, "net", "depth", "enc_name")
         if not isinstance(kind, str):
-            raise CheckpointError(f"{path} does not say which network of timm its encoder is (net.depth.enc_name)")
+            raise CheckpointError(f"{path} does not name the timm network of its encoder (net.depth.enc_name)")
         encoder = Spec.of("encoder", "timm", model=kind)
         names.append((r"^depth\.encoder\.network\.", "nets.depth.encoder."))
     pose, left = None, []
@@ -303,7 +304,7 @@ def _packnet_sfm(path: Path, state: State, content: Mapping[str, Any]) -> _Model
     joined = state.get(f"{front}iconv5.conv_base.weight")
     if joined is not None and joined.shape[1:2] != (widths[4] + channels[3],):
         raise CheckpointError(
-            f"{path} is PackNet01 in its version B, which adds skips; saunet's concatenates them as version A does"
+            f"{path} is PackNet01 version B, which adds skips; saunet's concatenates them as in version A"
         )
     dropped = _has(state, f"{front}conv2.0.conv3.0.")  # a dropout stands behind the shortcut
     names = [
@@ -387,7 +388,7 @@ def _check_complete(
         wrong.append(f"'{extra[0]}'{_more(extra)} belongs to no part of it")
     if wrong:
         raise CheckpointError(
-            f"{path} looks like a model of {model.system} and is not a whole one: {'; '.join(wrong)}; copy it again"
+            f"{path} looks like a model of {model.system} but is incomplete: {'; '.join(wrong)}; copy it again"
         )
 
 
@@ -431,7 +432,7 @@ def _kind(state: State, front: str) -> str:
     for pattern, kind in known.items():
         if any(re.match(pattern, name) for name in names):
             return f"it is {kind}"
-    return f"its first entry is '{names[0]}'" if names else "it holds no weights"
+    return f"its first entry is '{names[0]}'" if names else "it has no weights"
 
 
 def _tensors(content: object) -> State:

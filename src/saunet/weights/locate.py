@@ -1,4 +1,4 @@
-"""Where a trained model is: shipped with saunet, a local checkpoint or folder, or on the Hugging Face hub."""
+"""Locating a trained model: shipped with saunet, a local checkpoint or folder, or on the Hugging Face hub."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def locate(source: str | Path) -> Path:
     """Return the local path of a model, fetched from the hub where ``source`` is a hub id.
 
     A text is the name of a shipped model such as ``street`` (``./street`` is a local folder of that name), a path, or a
-    hub id: ``hf://organization/name``, or short ``organization/name``, with ``@revision`` for a certain one. The folder
-    of a training stands for its ``best.ckpt``.
+    hub id: ``hf://organization/name``, or short ``organization/name``, with ``@revision`` for a certain one. A
+    training's folder means its ``best.ckpt``.
     """
     text, path = str(source), Path(source).expanduser()
     if isinstance(source, Path):
@@ -52,7 +52,7 @@ def locate(source: str | Path) -> Path:
         return BOX / text
     if text == DEFAULT and not path.exists():
         raise CheckpointError(
-            f"no model '{DEFAULT}' comes with this installation of saunet; give checkpoint= a model of your own"
+            f"no model '{DEFAULT}' comes with this installation of saunet; set checkpoint= to your own model"
         )
     hint = suggest(text, shipped()) if path.name == text and not path.exists() else ""
     if hint and path.suffix.lower() not in _FILE_SUFFIXES:
@@ -70,7 +70,7 @@ def of_run(path: Path, names: Sequence[str] = ("best", "last")) -> Path:
 def check_push(name: str) -> None:
     """Check a hub id to upload to, and that there is a package which can."""
     if not _HUB_ID.fullmatch(name) or "@" in name:
-        raise ConfigError(f"push is '{name}'; give a repository of the hub as organization/name")
+        raise ConfigError(f"push is '{name}'; give a hub repository as organization/name")
     if find_spec("huggingface_hub") is None:
         raise ConfigError("push needs huggingface_hub; run: pip install 'saunet[hub]'")
 
@@ -88,8 +88,8 @@ def push(folder: Path, name: str) -> str:
         api.upload_folder(repo_id=name, folder_path=folder, allow_patterns=_WANTED, commit_message="Upload by saunet")
     except Exception as reason:  # as in `_fetch`
         raise CheckpointError(
-            f"{folder} is complete, but cannot be uploaded to '{name}' ({_first_line(reason)}); check the connection, "
-            f"and that `hf auth login` has your token, then run: hf upload {name} {folder}"
+            f"{folder} is complete but could not be uploaded to '{name}' ({_first_line(reason)}); check the "
+            f"connection, and that `hf auth login` has your token, then run: hf upload {name} {folder}"
         ) from reason
     return str(address)
 
@@ -104,14 +104,14 @@ def _fetch(name: str) -> Path:
         from huggingface_hub import snapshot_download
     except ImportError as missing:
         raise ConfigError(
-            f"there is no file '{name}', and fetching it from the hub needs huggingface_hub; "
-            "check the path, or run: pip install 'saunet[hub]'"
+            f"there is no file '{name}', and downloading it from the hub needs huggingface_hub; check the path, or "
+            "run: pip install 'saunet[hub]'"
         ) from missing
     repository, _, revision = name.partition("@")
     try:
         return Path(snapshot_download(repository, revision=revision or None, allow_patterns=_WANTED))
     except Exception as reason:  # the hub's errors, the network's and the HTTP client's share no base class
         raise CheckpointError(
-            f"cannot fetch '{name}' from the hub ({_first_line(reason)}); check the name and the "
-            "connection; what was fetched once is used without one"
+            f"cannot download '{name}' from the hub ({_first_line(reason)}); check the name and the connection "
+            "(earlier downloads need none)"
         ) from reason
