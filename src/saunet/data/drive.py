@@ -183,7 +183,7 @@ class Drive(ABC):
         return ""
 
     @property
-    def calibration(self) -> str | None:
+    def camera_id(self) -> str | None:
         """A text that differs between recordings of different cameras; None if all of a data set are of one kind."""
         return None
 

@@ -457,7 +457,7 @@ def _check_one_camera(data: EvaluationData, split: str) -> None:
     """Check that one factor can be right for all recordings of a split."""
     names = dict[str | None, str]()
     for drive in data.datasets[split].drives:
-        names.setdefault(drive.calibration, drive.name)
+        names.setdefault(drive.camera_id, drive.name)
     if len(names) > 1:
         first, second, *_ = names.values()
         raise ConfigError(

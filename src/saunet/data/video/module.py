@@ -187,7 +187,7 @@ class ClipDrive(Drive):
         return self._lens.recorded
 
     @property
-    def calibration(self) -> str:
+    def camera_id(self) -> str:
         camera = self.clip.camera
         known = (camera.K.tolist(), camera.image_size, camera.model, camera.distortion)
         return repr((*known, self.camera_height))
