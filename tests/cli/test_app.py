@@ -291,7 +291,7 @@ def test_help_shows_the_values_that_a_command_has(capsys: pytest.CaptureFixture[
     said = " ".join(capsys.readouterr().out.split())
     for each in ("trainer.max_epochs: Optional[int] = 80", "trainer.log_every_n_steps: Optional[int] = 10"):
         assert each in said  # of our YAML files; Lightning's own are null
-    assert re.search(r"trainer.gradient_clip_val: Union\[[a-zA-Z, ]+\] \(as Lightning has it\)", said)
+    assert re.search(r"trainer.gradient_clip_val: Union\[[a-zA-Z, ]+\] \(Lightning's default\)", said)
     assert "resume: str (not set)" in said
     assert "null" not in said
     app.main(["demo", "--help"])

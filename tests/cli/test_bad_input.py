@@ -87,7 +87,7 @@ KITTI = (
         ("experiment=smoke model.decoder.attention=eac", ("unknown attention 'eac'", "did you mean 'eca'?")),
         ("experiment=smoke model.pose.input=triplet data.offsets=[1]", ("'triplet' but there are 2 frames", "needs 3")),
         ("experiment=smoke model/encoder=resnet18 model.encoder.weights=no/w.pth", ("there is no such file",)),
-        ("experiment=smoke model/encoder=resnet18 model.encoder.frames=2", ("frames 2; depth comes from one image",)),
+        ("experiment=smoke model/encoder=resnet18 model.encoder.frames=2", ("frames=2; depth comes from one image",)),
         ("-m experiment=glob(table9/*)", ("experiment=glob(table9/*) matches none of", "table3/stf_t_aunet")),
         ("experiment=smoke data.batch_size=99", ("batch_size is 99 but there are only 4 training samples",)),
         ("experiment=smoke resume=true", ("resume is 'true'", "resume=auto")),

@@ -51,7 +51,7 @@ def test_a_trained_model_becomes_a_folder(
     assert [path.name for path in tmp_path.iterdir() if path.name != "model"] == []  # no run folder, no log
     code, _, err = export(*arguments)
     assert code == 1
-    assert "model holds config.json already; choose another output folder, or set overwrite=true" in err
+    assert "model already has config.json; choose another output folder, or set overwrite=true" in err
 
 
 @pytest.mark.parametrize(

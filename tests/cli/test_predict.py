@@ -247,7 +247,7 @@ class TestBadInput:
         (tmp_path / "x.avi").write_bytes(data[: len(data) * 6 // 10])
         outcome = run("x.avi", "outputs=[mp4,npy]")
         assert outcome.code == 1
-        assert "frames earlier than it declares: it is truncated" in outcome.err
+        assert "is truncated: it ends 5 frames earlier than it declares" in outcome.err
         assert (tmp_path / "out" / "x_disparity.mp4").is_file()
         count = len(list((tmp_path / "out" / "x").iterdir()))
         assert 2 < count < 9

@@ -360,7 +360,7 @@ def test_speeds_of_other_drives_are_one_sentence(tool: Tool, checkpoint: Path, t
     (tmp_path / "speeds.csv").write_text("drive,frame,speed\nelsewhere,0,8\nelsewhere,5,8\n")
     common = (f"checkpoint={checkpoint}", "data=synthetic_tiny", "baselines=false", "output_dir=results")
     outcome = tool("evaluate", *common, "scale.method=speed", "scale.speeds=speeds.csv")
-    outcome.says("speeds of the drives elsewhere, which are not asked for; call them synthetic/020000")
+    outcome.says("speeds of the drives elsewhere, which are not needed; call them synthetic/020000")
 
 
 @pytest.mark.parametrize("offsets", ["[]", "[-1,1]"])

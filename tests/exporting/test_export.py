@@ -224,7 +224,7 @@ def test_a_folder_with_another_export_is_not_mixed(
     exported: tuple[Path, list[Parity]], checkpoint: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(exported[0], tmp_path / "out")
-    with pytest.raises(ConfigError, match=r"holds config\.json already; choose another output folder"):
+    with pytest.raises(ConfigError, match=r"already has config\.json; choose another output folder"):
         exported_files(checkpoint, tmp_path / "out", ["safetensors"])
     with pytest.raises(ConfigError, match="contains the model itself"):
         exported_files(tmp_path / "out", tmp_path / "out", ["safetensors"], overwrite=True)
@@ -410,7 +410,7 @@ class TestOnnxFile:
     def test_truncated(self, exported: tuple[Path, list[Parity]], tmp_path: Path) -> None:
         data = (exported[0] / "model.onnx").read_bytes()
         (tmp_path / "x.onnx").write_bytes(data[: len(data) // 2])
-        with pytest.raises(CheckpointError, match="or is damaged"):
+        with pytest.raises(CheckpointError, match="is damaged, or not an ONNX model"):
             OnnxPredictor(tmp_path / "x.onnx")
 
     def test_device(self, exported: tuple[Path, list[Parity]]) -> None:

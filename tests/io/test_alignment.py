@@ -62,9 +62,9 @@ def test_without_a_clear_peak_it_is_refused() -> None:
     times, ticks = np.arange(0, 200, 0.1), np.arange(0, 400, 0.5)
     motion = seen(times, stop_and_go(times))
     for speeds, words in (
-        *((stop_and_go(ticks, seed), "no offset|alike") for seed in range(50, 56)),  # of other drives
+        *((stop_and_go(ticks, seed), "no offset|equally well") for seed in range(50, 56)),  # of other drives
         (np.full(len(ticks), 25.0), "at no offset"),
-        (8 + 4 * np.sin(ticks / 3), "no offset|alike"),
+        (8 + 4 * np.sin(ticks / 3), "no offset|equally well"),
     ):
         with pytest.raises(DataError, match=rf"speeds\.csv cannot be aligned.*({words})"):
             align_speeds(table(ticks, speeds), "", times, motion)

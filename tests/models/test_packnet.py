@@ -102,5 +102,5 @@ def test_wrong_encoder(kwargs, message):
 
 @pytest.mark.parametrize("channels", [(32, 32), (32, 16, 32)])
 def test_wrong_decoder(channels):
-    with pytest.raises(ConfigError, match="needed: 3 multiples of 32"):
+    with pytest.raises(ConfigError, match="it must be 3 multiples of 32"):
         decoders.build("packnet", features=(FeatureSpec(16, 4), FeatureSpec(16, 8)), channels=channels, scales=(0,))

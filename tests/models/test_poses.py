@@ -133,7 +133,7 @@ def test_wrong_offsets(name, offsets):
 
 @pytest.mark.parametrize("name", ["resnet18", "posecnn"])
 def test_wrong_number_of_sources(name):
-    with pytest.raises(ConfigError, match=r"3 source frames, the pose network was built for offsets \[-1, 1\]"):
+    with pytest.raises(ConfigError, match=r"3 source frames but the pose network was built for offsets \[-1, 1\]"):
         poses.build(name)(_images(1)[:, 0], _images(3))
 
 

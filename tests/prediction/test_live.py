@@ -173,7 +173,7 @@ def test_what_comes_too_fast_is_dropped_and_the_newest_is_taken(served: Callable
     camera.close()
     assert camera.dropped >= 15
     assert max(late[2:]) < (5 + 5 + 3) / FPS  # one turn of waiting, one of work
-    assert f"{camera.dropped} frames came faster" in " ".join(camera.notes)
+    assert f"{camera.dropped} frames arrived faster" in " ".join(camera.notes)
 
 
 def test_a_lost_connection_is_opened_again(served: Callable[..., Server], predictor: Predictor, tmp_path: Path) -> None:
@@ -185,7 +185,7 @@ def test_a_lost_connection_is_opened_again(served: Callable[..., Server], predic
         frames = list(reader.frames())
     assert len(frames) == 60
     assert max(np.diff([frame.time for frame in frames])) > 0.2  # the gap is in its times
-    assert any("was lost and opened again" in note for note in result.notes)
+    assert any("was lost and reopened" in note for note in result.notes)
     assert "median" in result.notes[0]
     assert result.notes[0] in str(result)
 

@@ -140,7 +140,7 @@ def test_an_evaluation_that_does_not_say_its_images_stands_apart(tmp_path: Path)
     table, _ = table1({"a": collect([run]).runs[0]})
     groups = {row.group for row in table.rows if row.kind == "measured"}
     assert len(groups) == 2
-    assert any(group.endswith("6 images (which, it does not say)") for group in groups)
+    assert any(group.endswith("6 images (the file does not say which)") for group in groups)
 
 
 def test_another_systems_row_bears_its_name(tmp_path: Path) -> None:

@@ -250,7 +250,7 @@ class TestWeights:
 
     def test_shape_is_named(self) -> None:
         state = {"weight": torch.zeros(3, 2), "bias": torch.zeros(3)}
-        with pytest.raises(CheckpointError, match=r"'weight' is \(3, 2\) where the model has \(3, 4\)"):
+        with pytest.raises(CheckpointError, match=r"'weight' is \(3, 2\) but the model has \(3, 4\)"):
             load_weights(nn.Linear(4, 3), state, "layer")
 
     def test_extra_and_missing_are_named_and_nothing_changes(self) -> None:

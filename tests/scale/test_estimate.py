@@ -161,8 +161,8 @@ def test_speeds_of_several_drives(tmp_path: Path) -> None:
         ("frame,speed\n0,fast\n", r"line 2 is not a time and a speed of at least 0 \(frame=0, speed=fast\)"),
         ("frame,speed\n0,1\n1,-3\n", r"line 3 is not a time"),
         ("frame,speed\n0\n", r"line 2 is not a time"),
-        ("frame,speed\n0,1\n1,1\n1.0,2\n", r"line 4 gives a second speed at frame 1; keep one line of each"),
-        ("drive,time,speed\na,0,1\nb,0,1\na,0,2\n", r"line 4 gives a second speed at time 0 of a;"),
+        ("frame,speed\n0,1\n1,1\n1.0,2\n", r"line 4 has a second speed for frame 1; keep one line of each"),
+        ("drive,time,speed\na,0,1\nb,0,1\na,0,2\n", r"line 4 has a second speed for time 0 of a;"),
     ],
 )
 def test_bad_tables_are_one_sentence(text: str, message: str, tmp_path: Path) -> None:

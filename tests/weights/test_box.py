@@ -166,7 +166,7 @@ def test_refused(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     folder = tmp_path / "street"
     pack(checkpoint, folder)
     before = (folder / "model.safetensors").read_bytes()
-    with pytest.raises(ConfigError, match=r"holds config\.json already"):
+    with pytest.raises(ConfigError, match=r"already has config\.json"):
         pack(checkpoint, folder)
     with pytest.raises(ConfigError, match="contains the model itself"):
         pack(folder, folder, overwrite=True)

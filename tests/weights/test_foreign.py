@@ -593,7 +593,7 @@ class TestMonodepth2:
         with pytest.raises(CheckpointError, match=r"one part of a model.*give its folder"):
             saunet.load(copy / "depth.pth")
         (copy / "depth.pth").unlink()
-        with pytest.raises(CheckpointError, match=r"encoder\.pth and no depth\.pth"):
+        with pytest.raises(CheckpointError, match=r"encoder\.pth but no depth\.pth"):
             saunet.load(copy)
 
     @pytest.mark.parametrize(

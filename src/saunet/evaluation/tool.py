@@ -213,8 +213,8 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth has the same images
         if store_in is not None:
             _check_one_camera(passes[0][0], options.split)
-        about_scale = {"first": team.rank == 0, "store_in": store_in}
-        depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device, **about_scale)
+        first = team.rank == 0
+        depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device, first, store_in)
         model = NetworkPredictor(depth, options.flip)
         settings |= {"checkpoint": str(options.checkpoint), "scale": scale}
     else:

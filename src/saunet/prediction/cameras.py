@@ -36,7 +36,7 @@ def with_camera(
     given = options.camera if options.undistort is None else options.undistort
     if given is None and not needs:
         return options
-    from saunet.data.video.clips import nearest_camera
+    from saunet.data.video.calibrations import nearest_camera
 
     clips = clips_of(options.input, recording.images)
     if given is not None:

@@ -146,7 +146,8 @@ def write_output(output: str, folder: Path, stem: str, result: Prediction, style
 
 def write_pairs_camera(folder: Path, camera: Camera, fps: float | None) -> None:
     """Write the ``camera.yaml`` of pairs, so that training on them knows K."""
-    from saunet.data.video.camera import FILE_NAME, CameraFile, write_camera
+    from saunet.data.video.calibrations import FILE_NAME
+    from saunet.data.video.camera import CameraFile, write_camera
 
     path, size = folder / FILE_NAME, (camera.height, camera.width)
     write_camera(

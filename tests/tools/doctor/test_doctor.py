@@ -66,7 +66,7 @@ def test_cuts_are_counted_whoever_reads_the_frames(tmp_path):
     one, other = frames(10, 1), frames(10, 1, seed=1)
     make_clip(tmp_path / "r", "a", [*one, *other])
     text = look(campus(tmp_path / "r"))[2]
-    assert "note: places where the picture changes altogether (cuts, loops, recordings in one folder): 1" in text
+    assert "note: positions where the picture changes completely (cuts, loops, recordings in one folder): 1" in text
     assert "hardly resemble" not in text  # no sample reaches across
     images = make_drive(tmp_path / "k", 1, frames=range(20), sides=(2,)) / "image_02" / "data"
     for number, picture in enumerate([*one, *other]):
@@ -138,7 +138,7 @@ def test_cameras_that_cannot_be_right_are_named(tmp_path):
 def test_a_field_of_view_that_was_not_checked_is_told(tmp_path, focal, level):
     make_clip(tmp_path / "r", "a", frames(16), camera=CAMERA.replace("K: [250, 252", f"K: [{focal}, {focal}"))
     text = look(campus(tmp_path / "r"))[2]
-    assert f"{level}: K was not checked, as no examined drive tells the focal length" in text
+    assert f"{level}: K was not checked, because the focal length cannot be estimated" in text
     assert ("car cameras usually have 60 to 120" in text) == (level == "warning")
 
 
@@ -240,7 +240,7 @@ def test_files_that_break_the_set_up_are_counted_with_on_error(tmp_path):
     (drive / "image_02" / "data" / "0000000002.png").write_bytes(b"")
     text = look(kitti(tmp_path, static="flow"))[2]
     assert "0000000002.png is empty" in text
-    assert "data.on_error=skip counts all files that are broken" in text
+    assert "data.on_error=skip counts all broken files" in text
 
 
 def test_a_video_that_cannot_be_decoded_to_its_end_is_a_finding(tmp_path):
@@ -280,7 +280,7 @@ def test_reading_a_cache_is_measured_by_its_files_and_offered_where_there_is_one
         found = survey(data)
         found.frames = [replace(frame, seconds=0.1) for frame in found.frames]
         text = "\n".join(map(str, diagnose(found)))
-        assert "a core reads 10 images per second" in text
+        assert "one core reads 10 images per second" in text
         assert f"of {found.samples} samples needs {3 * found.samples} images" in text
         assert found.samples == data.batch_size
         assert ("make a cache of small images once" in text) == offered

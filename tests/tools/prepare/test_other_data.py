@@ -101,7 +101,7 @@ def test_clips_whose_frames_are_others_now_are_refused(clips, tmp_path, change):
     elif change == "file":
         (clips / "a" / "000003.png").unlink()
     options = {"fps": 10.0, **(change if isinstance(change, dict) else {})}
-    with pytest.raises(DataError, match=r"the copies of 'a' in the cache (were made from other|come from).*; .*delete"):
+    with pytest.raises(DataError, match=r"the copies of 'a' in the cache (were made from|come from).*; .*delete"):
         campus(clips, **options, cache=str(tmp_path / "small")).setup("fit")
     with pytest.raises(DataError, match=r"the copies of 'a' in the cache .* complete the cache: saunet prepare cache"):
         build_cache(module_recordings(campus(clips, **options)), tmp_path / "small", settings)

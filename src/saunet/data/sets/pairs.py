@@ -16,7 +16,8 @@ from typing_extensions import Unpack
 from saunet.data.drive import Drive
 from saunet.data.loading.options import Loading
 from saunet.data.sets.files import RecordingsDataModule
-from saunet.data.video.camera import FILE_NAME, CameraFile, read_camera, unknown_camera
+from saunet.data.video.calibrations import FILE_NAME
+from saunet.data.video.camera import CameraFile, read_camera, unknown_camera
 from saunet.errors import DataError, positive
 from saunet.io.images import IMAGE_SUFFIXES, frame_order, image_size, read_depth, read_image
 from saunet.io.plain import read_array

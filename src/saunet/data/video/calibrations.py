@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 Plain = dict[str, Any]
 Cameras = Iterator[tuple[str, Plain]]
 SUFFIXES = (".yaml", ".yml", ".json", ".txt", ".bin", ".xml")
+FILE_NAME = "camera.yaml"
 EXPORTS = {"ros": "_ros.yaml", "kalibr": "_kalibr.yaml", "colmap": "_colmap.txt", "opencv": "_opencv.yaml"}
 """Formats that can be written, with the endings of their file names."""
 
@@ -36,6 +37,18 @@ def split_name(given: str | Path) -> tuple[Path, str | None]:
     path = Path(given).expanduser()
     before, colon, name = str(path).rpartition(":")
     return (Path(before), name) if colon and not path.exists() and Path(before).is_file() else (path, None)
+
+
+def highest_folder(path: Path, base: Path) -> Path:
+    """Return the topmost folder with a clip's camera file: the root, or the one around a clip that is the root."""
+    return base.parent if path == base else base
+
+
+def nearest_camera(path: Path, base: Path) -> Path | None:
+    """Return the nearest camera file of a clip that was found below ``base``, or is it; None if there is none."""
+    folders = [path, *path.parents] if path.is_dir() else list(path.parents)
+    files = (folder / FILE_NAME for folder in folders[: folders.index(highest_folder(path, base)) + 1])
+    return next((file for file in files if file.is_file()), None)
 
 
 def find_camera(path: Path, name: str | None) -> Any:

@@ -42,7 +42,6 @@ from saunet.errors import CameraError, DataError, SaunetError, suggest
 from saunet.geometry.camera import GUESS, crop_intrinsics, scale_intrinsics
 from saunet.io.atomic import write_bytes
 
-FILE_NAME = "camera.yaml"
 FIX = "is K in pixels of images of this size, or normalized (then set normalized: true)?"
 """What to check if K does not fit the images."""
 _SAME_SHAPE = 0.02

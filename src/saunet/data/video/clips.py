@@ -19,7 +19,8 @@ from typing import overload
 
 import numpy as np
 
-from saunet.data.video.camera import FILE_NAME, CameraFile, forgotten, read_camera, unknown_camera
+from saunet.data.video.calibrations import FILE_NAME, highest_folder, nearest_camera
+from saunet.data.video.camera import CameraFile, forgotten, read_camera, unknown_camera
 from saunet.errors import DataError
 from saunet.io.atomic import partial_name, remove_partial_files, write_json
 from saunet.io.images import IMAGE_SUFFIXES, encode_jpeg, frame_order, natural_order
@@ -95,7 +96,7 @@ def find_clips(root: str | Path, camera: str | Path | None = None) -> list[Clip]
         if unknown:  # the rest of the file still applies
             return forgotten(found) if found else unknown_camera(Path(UNKNOWN))
         if found is None:
-            place = _highest(path, base) / FILE_NAME
+            place = highest_folder(path, base) / FILE_NAME
             raise DataError(
                 f"no {FILE_NAME} for {path}: put one beside it or at {place}, or set data.camera; saunet "
                 "calibrate makes one, and data.camera=unknown estimates the focal length from turns (see "
@@ -299,18 +300,6 @@ def _clip_paths(folder: Path, seen: set[str] | None = None) -> Iterator[Path]:
                 yield Path(place) / name
     for link in sorted(links):
         yield from _clip_paths(link, seen)
-
-
-def _highest(path: Path, base: Path) -> Path:
-    """Return the topmost folder with a clip's camera file: the root, or the one around a clip that is the root."""
-    return base.parent if path == base else base
-
-
-def nearest_camera(path: Path, base: Path) -> Path | None:
-    """Return the nearest camera file of a clip that was found below ``base``, or is it; None if there is none."""
-    folders = [path, *path.parents] if path.is_dir() else list(path.parents)
-    files = (folder / FILE_NAME for folder in folders[: folders.index(_highest(path, base)) + 1])
-    return next((file for file in files if file.is_file()), None)
 
 
 def _camera_of(path: Path, base: Path, known: dict[Path, CameraFile]) -> CameraFile | None:

@@ -26,7 +26,8 @@ from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.options import Loading
 from saunet.data.loading.selecting import BETWEEN, Division, divide
 from saunet.data.loading.windows import Selection, reach
-from saunet.data.video.camera import FILE_NAME, CameraFile, Lens, check_crop, write_camera
+from saunet.data.video.calibrations import FILE_NAME
+from saunet.data.video.camera import CameraFile, Lens, check_crop, write_camera
 from saunet.data.video.clips import (
     Clip,
     FramesCacheError,

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from saunet.data.video.camera import FILE_NAME, read_camera, write_camera
+from saunet.data.video.calibrations import FILE_NAME
+from saunet.data.video.camera import read_camera, write_camera
 from saunet.data.video.clips import QUALITY
 from saunet.data.video.module import SPEEDS
 from saunet.errors import ConfigError, DataError, one_of

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from saunet.data.video.camera import FILE_NAME, read_camera, write_camera
+from saunet.data.video.calibrations import FILE_NAME
+from saunet.data.video.camera import read_camera, write_camera
 from saunet.errors import ConfigError, DataError
 from saunet.io.video import VIDEO_SUFFIXES
 from saunet.tools.prepare.bags import Bag, BagClip
