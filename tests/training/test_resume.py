@@ -24,7 +24,7 @@ from saunet.runs.checkpoint import atomic_save, read_checkpoint
 from saunet.runs.folder import Stopped
 from saunet.training.callbacks import LastCheckpoint
 from saunet.training.optim import Recipe
-from saunet.training.resume import changes, check_resume, resume_path, warm_start
+from saunet.training.resume import changes, check_resume, resume_path, stretched, warm_start
 from saunet.training.stopping import GracefulStop
 from saunet.training.tool import assemble
 from saunet.weights import locate
@@ -185,6 +185,62 @@ def test_a_changed_rate_is_not_kept_in_silence(tmp_path: Path, caplog: pytest.Lo
     assert "start from its weights with init_from=" in said
 
 
+class Rates(Callback):
+    """The learning rate of each step, as it is taken."""
+
+    def __init__(self) -> None:
+        self.seen: list[float] = []
+
+    def on_before_optimizer_step(self, trainer: Trainer, pl_module: Any, optimizer: Any) -> None:
+        self.seen.append(optimizer.param_groups[0]["lr"])
+
+
+def test_a_later_end_says_the_rate_and_has_it_from_the_first_step(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    recipe, rates = Recipe(lr=1e-2, schedule="cosine"), Rates()
+    first = tiny.tiny_trainer(tmp_path, max_epochs=1, callbacks=[LastCheckpoint(str(tmp_path))])
+    first.fit(tiny.tiny_model(recipe), tiny.tiny_walls())
+    assert first.optimizers[0].param_groups[0]["lr"] == 0
+    for epochs, words in ((1, ""), (2, "0.005, 50% of the highest")):
+        caplog.clear()
+        again = tiny.tiny_trainer(tmp_path, max_epochs=epochs, callbacks=[rates])
+        with caplog.at_level("INFO"):
+            again.fit(
+                tiny.tiny_model(recipe), tiny.tiny_walls(), ckpt_path=str(tmp_path / "last.ckpt"), weights_only=True
+            )
+        said = [record.getMessage() for record in caplog.records if "learning rate" in record.getMessage()]
+        assert len(said) == bool(words)
+        assert words in "".join(said)
+    assert rates.seen[0] == pytest.approx(5e-3)
+    assert len(rates.seen) == first.global_step
+    assert "init_from" not in "".join(said)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "total", "words"),
+    [
+        (Recipe(schedule="cosine"), 13, "1.45e-06, 1.45% of the highest"),
+        (Recipe(schedule="one_cycle", warmup=0.3), 13, "init_from=runs/a"),
+        (Recipe(), 24, "a learning rate of 0.0001, 100% of the highest"),
+        (Recipe(schedule="constant"), 24, None),
+        (Recipe(schedule="cosine"), 12, None),
+        (Recipe(schedule="cosine", warmup=0.5), 10_000, "0.26% of the highest"),
+    ],
+)
+def test_a_low_rate_at_a_later_end_comes_with_advice(recipe: Recipe, total: int, words: str | None) -> None:
+    state = {"last_epoch": 12, "base_lrs": [1e-4]}
+    checkpoint = {"global_step": 12, "saunet_training": {"steps": 12}, "lr_schedulers": [state]}
+    said = stretched(checkpoint, recipe, total, "runs/a/checkpoints/last.ckpt")
+    if words is None:
+        assert said is None
+    else:
+        assert said is not None
+        assert words in said
+        assert ("init_from=runs/a and" in said) == (total == 13)  # not where it rises
+    assert stretched({**checkpoint, "saunet_training": {}}, recipe, total, None) is None
+
+
 def test_an_optimizer_that_does_not_fit_is_refused() -> None:
     before = Recipe().to_plain()
     assert Recipe().resumed_from(before) is None
@@ -248,7 +304,7 @@ def test_a_warm_start_from_a_shipped_model(
     pose = node("pose", "efficientnet_lite0")
     options = train_options({**config, "model": {**model_config, "pose": pose}})
     said = warm_start(assemble(options, walls), "street")
-    assert "no pose network that fits" in said
+    assert "it has no pose network that fits, so this training's pose network starts from fresh weights" in said
 
 
 def test_a_writer_that_dies_midway_leaves_the_previous_checkpoint(tmp_path: Path) -> None:

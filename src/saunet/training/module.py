@@ -27,7 +27,7 @@ from saunet.training.health import DOUBTED, health, learned_from
 from saunet.training.intrinsics import FocalLengths
 from saunet.training.loop import total_steps
 from saunet.training.optim import MovingAverage, Recipe
-from saunet.training.resume import continuation, owe_validation, validation_due
+from saunet.training.resume import continuation, owe_validation, stretched, validation_due
 from saunet.training.speed import Speed
 from saunet.types import DepthPyramid, EvalBatch, LossTerms, TrainBatch, View, Views
 
@@ -77,6 +77,7 @@ class SelfSupervisedDepth(LightningModule):
         self.intrinsics: FocalLengths | None = None
         """Learns the focal lengths; None if the data's are fixed."""
         self._prepared = False
+        self._steps: int | None = None  # of the whole training
         self._owed = False  # a validation that a killed run did not finish
 
     @property
@@ -249,6 +250,7 @@ class SelfSupervisedDepth(LightningModule):
 
     def configure_optimizers(self) -> Any:
         total = total_steps(self.trainer, getattr(self.trainer, "datamodule", None))
+        self._steps = total
         return self.recipe.configure(self.recipe.groups(self), total)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -272,6 +274,9 @@ class SelfSupervisedDepth(LightningModule):
             return
         for sentence in continuation(checkpoint, self, getattr(self.trainer, "datamodule", None)):
             rank_zero_info(sentence)
+        total = total_steps(self.trainer, getattr(self.trainer, "datamodule", None))
+        if moved := stretched(checkpoint, self.recipe, total, self.trainer.ckpt_path):
+            rank_zero_info(moved)
         self._owed = validation_due(checkpoint)
         if self._owed:
             owe_validation(checkpoint["loops"]["fit_loop"])
@@ -288,7 +293,9 @@ class SelfSupervisedDepth(LightningModule):
         if "train" in getattr(data, "datasets", {}):
             settings["train_split"] = data.datasets["train"].fingerprint()
         due, row = self._to_come()
-        known = {"recipe": self.recipe.to_plain(), "settings": settings, "validation_due": due}
+        known: dict[str, Any] = {"recipe": self.recipe.to_plain(), "settings": settings, "validation_due": due}
+        if self._steps is not None:
+            known["steps"] = self._steps
         return {**known, "unlogged": row} if row else known
 
     def _to_come(self) -> tuple[bool, dict[str, float]]:

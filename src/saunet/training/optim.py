@@ -104,6 +104,11 @@ class Recipe:
         falling, end = 0.5 + 0.5 * math.cos(math.pi * done), 1 / 25e4
         return falling if self.schedule == "cosine" else end + (1 - end) * falling
 
+    def factor_at(self, step: int, total: int) -> float:
+        """Return the learning rate relative to ``lr`` after so many of all steps."""
+        # The first step of a warm-up must not be lost to a rate of exactly zero.
+        return self.factor(min((step + bool(self.warmup)) / total, 1.0))
+
     def frozen(self, model: nn.Module) -> list[nn.Module]:
         """Return the parts of a model that ``freeze`` names."""
         return _parts(model, "freeze", self.freeze)
@@ -184,10 +189,15 @@ class RecipeSchedule(LRScheduler):
         super().__init__(optimizer)
 
     def get_lr(self) -> list[float]:  # type: ignore[override]
-        # The first step of a warm-up must not be lost to a rate of exactly zero.
-        ahead = 1 if self.recipe.warmup else 0
-        factor = self.recipe.factor(min((self.last_epoch + ahead) / self.total_steps, 1.0))
+        factor = self.recipe.factor_at(self.last_epoch, self.total_steps)
         return [float(rate) * factor for rate in self.base_lrs]
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue from a position; in a schedule of another length, the next step has the rate of that one already."""
+        super().load_state_dict(state_dict)
+        self._last_lr = self.get_lr()
+        for group, rate in zip(self.optimizer.param_groups, self._last_lr, strict=True):
+            group["lr"] = rate
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position in the schedule; the schedule itself comes from the config."""

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from saunet.errors import CheckpointError, ConfigError
 from saunet.registry import Spec
 from saunet.runs.checkpoint import Checkpoint, load_weights
-from saunet.training.optim import OTHER_SETTINGS
+from saunet.training.optim import OTHER_SETTINGS, Recipe
 from saunet.weights.files import read_model
 
 if TYPE_CHECKING:
@@ -120,6 +120,34 @@ def _differences(before: Any, now: Any, name: str) -> Iterator[str]:
             yield f"{name} {now} (it was {before})"
 
 
+def stretched(checkpoint: Mapping[str, Any], recipe: Recipe, total: int, source: str | Path | None) -> str | None:
+    """Say at what learning rate a resumed training continues whose end has moved; None if it has not.
+
+    Args:
+        checkpoint: What it resumes from.
+        recipe: Its recipe.
+        total: Steps of the whole training by now.
+        source: File of the checkpoint.
+    """
+    before, step = checkpoint.get("saunet_training", {}).get("steps"), int(checkpoint["global_step"])
+    if before in (None, total) or step >= total or recipe.schedule == "constant":
+        return None
+    state = checkpoint["lr_schedulers"][0]
+    factor = recipe.factor_at(state["last_epoch"], total)
+    rate = state["base_lrs"][0] * factor
+    said = (
+        f"the training now ends after step {total} (before: {before}), and its {recipe.schedule} schedule is fitted to "
+        f"that: it continues at a learning rate of {rate:.3g}, {100 * factor:.3g}% of the highest"
+    )
+    if factor >= 0.1 or step < recipe.warmup * total:
+        return said
+    file = Path(source or "RUN")
+    run = file.parent.parent if file.parent.name == "checkpoints" else file
+    return (
+        f"{said}; so little is learned with it that a new run with init_from={run} and a schedule of its own is better"
+    )
+
+
 def validation_due(checkpoint: Mapping[str, Any]) -> bool:
     """Return whether a checkpoint was saved before a validation that followed its last step."""
     return bool(checkpoint.get("saunet_training", {}).get("validation_due"))
@@ -179,7 +207,7 @@ def warm_start(model: SelfSupervisedDepth, source: str | Path) -> str:
         given = checkpoint.weights(name)
         if network is None:
             if given:
-                taken.append(f"not the {name} network, which this training does not have")
+                taken.append(f"its {name} network is not used, as this training has none")
             continue
         own = network.state_dict()
         fitting = {key: given[key] for key in own if key in given and given[key].shape == own[key].shape}
@@ -189,7 +217,8 @@ def warm_start(model: SelfSupervisedDepth, source: str | Path) -> str:
                 f"model has '{next(iter(own))}'); choose the same model/encoder and model/decoder"
             )
         network.load_state_dict(fitting, strict=False)
-        nothing = f"no {name} network{' that fits' if given else ''}; this one starts from fresh weights"
+        lacks = f"it has no {name} network{' that fits' if given else ''}"
+        nothing = f"{lacks}, so this training's {name} network starts from fresh weights"
         taken.append(_taken(name, own, given, fitting) if fitting else nothing)
     theirs, ours = checkpoint.record.to_plain()["model"], model.record.get("model", {})
     for end in ("min_depth", "max_depth"):

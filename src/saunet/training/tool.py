@@ -292,7 +292,11 @@ def train(
                 rank_zero_info(model.intrinsics.told(found))
     if resume and trainer.global_step == steps:
         more = "trainer.max_steps=N" if 0 <= trainer.max_steps <= steps else "epochs=N"
-        say(f"nothing was left to train: it was complete after step {steps}; {more} trains longer")
+        new = f"init_from={folder} in another folder starts a new one"
+        say(
+            f"nothing was left to train: it was complete after step {steps}; {more} continues to a later end, at the "
+            f"learning rate that the schedule has there, and {new}"
+        )
     elif told := _ended_early(trainer):
         rank_zero_info(told)
     if trainer.is_global_zero:
