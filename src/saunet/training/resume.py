@@ -135,9 +135,10 @@ def stretched(checkpoint: Mapping[str, Any], recipe: Recipe, total: int, source:
     state = checkpoint["lr_schedulers"][0]
     factor = recipe.factor_at(state["last_epoch"], total)
     rate = state["base_lrs"][0] * factor
+    rate = f"{state['base_lrs'][0] * factor:.3g}, {100 * factor:.3g}% of the highest"
     said = (
         f"the training now ends after step {total} (before: {before}), and its {recipe.schedule} schedule is fitted to "
-        f"that: it continues at a learning rate of {rate:.3g}, {100 * factor:.3g}% of the highest"
+        f"that: it continues at a learning rate of {rate}"
     )
     if factor >= 0.1 or step < recipe.warmup * total:
         return said
