@@ -71,7 +71,7 @@ def test_without_a_clear_peak_it_is_refused() -> None:
     rounds = 8 + 4 * np.sin(2 * np.pi * np.arange(0, 400, 0.1) / 40)  # laps of 40 s: which one is it?
     with pytest.raises(DataError, match="seconds apart explain the motion equally well"):
         align_speeds(table(np.arange(0, 400, 0.1), rounds), "", times, 8 + 4 * np.sin(2 * np.pi * times / 40))
-    with pytest.raises(DataError, match="20 seconds at least"):
+    with pytest.raises(DataError, match="at least 20 seconds"):
         align_speeds(table(ticks[:10], ticks[:10]), "", times, motion)
     frames = SpeedTable(Path("speeds.csv"), "frame", {"": (ticks, ticks)})
     with pytest.raises(DataError, match="no speeds with times for 'a'"):

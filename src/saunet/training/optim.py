@@ -195,8 +195,9 @@ class RecipeSchedule(LRScheduler):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue from a position; in a schedule of another length, the next step has the rate of that one already."""
         super().load_state_dict(state_dict)
-        self._last_lr = self.get_lr()
-        for group, rate in zip(self.optimizer.param_groups, self._last_lr, strict=True):
+        rates = self.get_lr()
+        self._last_lr = [*rates]
+        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
 
     def state_dict(self) -> dict[str, Any]:
