@@ -65,6 +65,7 @@ def test_what_a_clip_looks_like_can_be_chosen(
         with VideoReader(tmp_path / "out" / f"{name}_disparity.mp4") as reader:
             assert reader.fps == pytest.approx(30, rel=1e-3)
             assert reader.width > reader.height
+            assert f"{name}_disparity.mp4 ({reader.width}x{reader.height}, 30 fps)" in outcome.out
     refused = tool("predict", f"checkpoint={checkpoint}", "input=drive.mp4", "output=out2", "codec=avc1")
     refused.says("codec is 'avc1'", "allowed: h264, mp4v, vp09")
 

@@ -15,7 +15,7 @@ from saunet.errors import ConfigError, DataError, checked, one_of, positive, usa
 from saunet.io.atomic import remove_partial_files
 from saunet.io.colormaps import COLORMAPS, RunningRange
 from saunet.io.images import IMAGE_SUFFIXES
-from saunet.io.video import CODECS, VIDEO_SUFFIXES
+from saunet.io.video import CODECS, VIDEO_SUFFIXES, VideoReader
 from saunet.prediction import sinks
 from saunet.prediction.cameras import read_given, with_camera
 from saunet.prediction.foreign import NOTHING, ForeignOptions
@@ -192,8 +192,17 @@ class PredictResult:
         count = "1 frame" if self.frames == 1 else f"{self.frames} frames"
         for paths, what in ((self.clips, count), (self.finished, "finished before")):
             if paths:
-                lines.append(f"{what}: {', '.join(map(str, paths))}")
+                lines.append(f"{what}: {', '.join(map(_described, paths))}")
         return "\n".join([*lines, *self.notes])
+
+
+def _described(path: Path) -> str:
+    """Return a result's path, of a video with the size of its pictures and their rate."""
+    if path.suffix.lower() not in VIDEO_SUFFIXES or not path.is_file():
+        return str(path)
+    with VideoReader(path) as video:
+        rate = "" if video.fps is None else f", {video.fps:.4g} fps"
+        return f"{path} ({video.width}x{video.height}{rate})"
 
 
 def predict(

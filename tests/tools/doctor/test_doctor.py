@@ -297,6 +297,25 @@ class _TwoFolders(DepthDataModule):
         return [Selection(Wall("clip", frames=count, seed=count), range(count))]
 
 
+class _Own(_TwoFolders):
+    """Somebody's data set: one key holds drives out, and by default nothing is."""
+
+    def __init__(self, *, val_drives=(), **loading):
+        super().__init__(**loading)
+        self.val_drives = tuple(val_drives)
+
+    def select(self, split):
+        return super().select(split) if split == "train" else []
+
+
+def test_advice_on_what_to_hold_out_names_the_keys_that_there_are():
+    _, _, text = look(_Own(height=32, width=48, batch_size=2, workers=0))
+    assert "warning: nothing is held out for validation; set data.val_drives" in text
+    assert "nothing is held out for it: set data.val_drives" in text
+    assert "val_share" not in text
+    assert "check the data root" not in text
+
+
 def test_different_recordings_of_one_name_are_kept_apart(tmp_path):
     found, findings, text = look(_TwoFolders(height=32, width=48, batch_size=2, workers=0), splits=["train", "val"])
     assert {frame.drive for frame in found.frames} == {"clip", "clip (val)"}

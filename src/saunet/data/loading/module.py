@@ -128,6 +128,11 @@ class DepthDataModule(LightningDataModule):
         """
         raise NotImplementedError(f"{type(self).__name__} does not define the frames of '{split}'")
 
+    @property
+    def holding_out(self) -> list[str]:
+        """Keys of this data set that hold recordings out of training, such as ``data.val_drives``."""
+        return [f"data.{key}" for key in ("val_clips", "val_drives", "val_share") if hasattr(self, key)]
+
     def overlap(self) -> str | None:
         """Return a sentence about splits that share recordings, and how to separate them; None if none do.
 
@@ -201,6 +206,8 @@ class DepthDataModule(LightningDataModule):
             found = "; ".join(map(str, usage[:3])) or "no drives"
             needed = [f"neighbors at {list(offsets)}"] * bool(offsets) + ["a stereo view"] * stereo
             advice = "check the data root and the split"
+            if split in ("val", "test") and not usage and self.holding_out:
+                advice = f"nothing is held out for it: set {' or '.join(self.holding_out)}"
             if needed:
                 advice = f"frames need {' and '.join(needed)}: check the data root, the split and the offsets"
             reasons = Counter[str]()

@@ -73,7 +73,8 @@ def _splits(survey: Survey) -> Iterator[Finding]:
         text = f"only {count} training samples; published models use about 40 000"
         yield Finding("warning", text, "add drives, or start from a trained model")
     if count is not None and "val" not in survey.windows and "val" not in survey.problems:
-        yield Finding("warning", "nothing is held out for validation", "set data.val_share or name clips or drives")
+        advice = f"set {' or '.join(survey.holding_out)}" if survey.holding_out else ""
+        yield Finding("warning", "nothing is held out for validation", advice)
 
 
 def _names(survey: Survey) -> Iterator[Finding]:

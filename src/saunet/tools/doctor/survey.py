@@ -172,6 +172,8 @@ class Survey:
     """Samples per training step, over all devices."""
     images: int = 3
     """Images per sample: the target and its sources."""
+    holding_out: list[str] = field(default_factory=list)
+    """Keys of the data set that hold recordings out of training."""
     cacheable: bool = False
     """Whether the data module could read a cache of smaller images but does not."""
 
@@ -196,6 +198,7 @@ def survey(
         samples=data.batch_size,
         images=1 + len(data.offsets) + data.stereo,
         cacheable=cacheable,
+        holding_out=data.holding_out,
         protocol=data.protocol,
     )
     datasets = dict(_set_up(data, splits, found))
