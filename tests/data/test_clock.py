@@ -18,7 +18,7 @@ from saunet.data.kitti.files import read_timestamps
 from saunet.data.kitti.raw import KittiRaw
 from saunet.data.loading.windows import Selection, find_windows
 from saunet.data.video.clips import find_clips, frame_paths, read_clip
-from saunet.data.video.module import ClipDrive
+from saunet.data.video.drive import ClipDrive
 from saunet.errors import DataError
 from saunet.io.images import name_times
 from saunet.io.times import frame_times

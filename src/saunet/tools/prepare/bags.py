@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from saunet.data.video.calibrations import FILE_NAME
 from saunet.data.video.camera import read_camera, write_camera
 from saunet.data.video.clips import QUALITY
-from saunet.data.video.module import SPEEDS
+from saunet.data.video.drive import SPEEDS
 from saunet.errors import ConfigError, DataError, one_of
 from saunet.io.atomic import remove_partial_files, write_bytes, write_json
 from saunet.io.images import encode_jpeg

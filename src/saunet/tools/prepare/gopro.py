@@ -14,7 +14,7 @@ from typing import Any
 import av
 from av.error import FFmpegError
 
-from saunet.data.video.module import SPEEDS
+from saunet.data.video.drive import SPEEDS
 from saunet.errors import DataError
 from saunet.io.atomic import remove_partial_files, write_json
 from saunet.io.plain import read_json
