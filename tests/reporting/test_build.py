@@ -244,6 +244,19 @@ def test_a_comparison_writes_every_image_of_each_run(tmp_path: Path) -> None:
     assert all(float(line["abs_rel b"]) - float(line["abs_rel a"]) == pytest.approx(0.05) for line in lines[6:])
 
 
+def test_every_evaluation_that_is_paired_has_its_images(tmp_path: Path) -> None:
+    """The plain one and the flipped one, of the same images under one protocol."""
+    runs = [make_run(tmp_path / name, beta=beta) for name, beta in (("a", 0.1), ("b", 0.2))]
+    for folder, value in zip(runs, (0.2, 0.3), strict=True):
+        make_evaluation(folder / "plain", "x", value)
+        make_evaluation(folder / "flipped", "x", value + 0.5, post_processing="monodepth blend of two flips")
+    report(ReportOptions(runs=tuple(runs), compare=True, output_dir=tmp_path / "out"))
+    lines = list(csv.DictReader((tmp_path / "out" / "images.csv").read_text().splitlines()))
+    assert len(lines) == 12
+    for line in lines:
+        assert float(line["abs_rel a"]) > 0.6 if "flip=true" in line["evaluation"] else float(line["abs_rel a"]) < 0.3
+
+
 def test_two_evaluations_of_one_model_are_told_what_compares_them(tmp_path: Path) -> None:
     folders = [make_evaluation(tmp_path / name, "street", 0.25) for name in ("one", "two")]
     with pytest.raises(DataError, match=r"are of one model, street; .* run the second again with compare=.*one"):

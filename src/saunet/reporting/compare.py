@@ -67,8 +67,12 @@ class Scored:
         return self.images == other.images and (self.of.how == other.of.how or self.of.foreign or other.of.foreign)
 
 
-def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str], dict[str, dict[str, Scored]]]:
-    """Compare runs in pairs, image by image, if both were evaluated alike; also return the pairs.
+Pairs = Mapping[tuple[str, str], Mapping[str, Scored]]
+"""(protocol, what was evaluated and how) -> run -> its errors on each image."""
+
+
+def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str], Pairs]:
+    """Compare runs in pairs, image by image, if both were evaluated alike; also return what was paired.
 
     Up to four runs, all pairs are compared; of more, each with the first. Evaluations of two runs under the same
     protocol are paired if they have the same images and settings.
@@ -76,7 +80,7 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str], dict[s
     names = list(runs)
     found = {name: _scored(run) for name, run in runs.items()}
     tables, left_out = [], []
-    rows: dict[str, dict[str, Scored]] = defaultdict(dict)
+    compared: dict[tuple[str, str], dict[str, Scored]] = defaultdict(dict)
     for first, other in itertools.combinations(names, 2):
         if first != names[0] and len(names) > _EACH_PAIR:
             break
@@ -98,27 +102,27 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str], dict[s
                     sizes = _sizes(runs[first], runs[other], one)
                     told = _told(one.of, two.of, first, other)
                     tables.append(comparison.table(told, *_motions(one.of, two.of, first, other), *sizes))
-                    rows[protocol] |= {first: one, other: two}
+                    compared[protocol, told] |= {first: one, other: two}
                 if not pairs:
                     why = f"{_apart(ours, theirs)}; {_remedy(runs[first], runs[other])}"
                     left_out.append(f"{first} and {other} under {protocol}: {why}")
             except DataError as reason:
                 left_out.append(f"{first} and {other} under {protocol}: {reason}")
-    return tables, left_out, rows
+    return tables, left_out, compared
 
 
-def images_csv(paired: Mapping[str, Mapping[str, Scored]]) -> str:
-    """Return what was paired as CSV: a line for each protocol and image, a column for each error and run."""
-    names = list(dict.fromkeys(name for runs in paired.values() for name in runs))
-    found: dict[tuple[str, str], dict[str, float]] = defaultdict(dict)
-    for protocol, runs in paired.items():
+def images_csv(compared: Pairs) -> str:
+    """Return what was paired as CSV: a line for each evaluation and image, a column for each error and run."""
+    names = list(dict.fromkeys(name for runs in compared.values() for name in runs))
+    found: dict[tuple[str, str, str], dict[str, float]] = defaultdict(dict)
+    for evaluation, runs in compared.items():
         for name, scored in runs.items():
             for row in scored.rows:
-                found[protocol, row.name] |= {f"{error} {name}": value for error, value in row.compared.items()}
+                found[(*evaluation, row.name)] |= {f"{error} {name}": value for error, value in row.compared.items()}
     errors = [f"{error} {name}" for error in COMPARED for name in names]
     columns = [each for each in errors if any(each in values for values in found.values())]
     lines = ((*image, *map(values.get, columns)) for image, values in sorted(found.items()))
-    return csv_text(("protocol", "image", *columns), lines)
+    return csv_text(("protocol", "evaluation", "image", *columns), lines)
 
 
 def _scored(run: Run) -> dict[str, list[Scored]]:
