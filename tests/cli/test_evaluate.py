@@ -73,10 +73,11 @@ def test_a_run_on_the_data_set_of_a_plugin_names_it(tool: Tool, smoke_run: Path,
 
 def test_without_a_run_the_default_data_are_named(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
     shutil.copy(smoke_run / "checkpoints" / "best.ckpt", tmp_path / "alone.ckpt")
-    outcome = tool(
-        "evaluate", "alone.ckpt", "data.width=96", "data.frames_per_drive=3", "data.train_drives=1", "output_dir=out"
-    )
+    few = ("data.width=96", "data.frames_per_drive=3", "data.train_drives=1")
+    outcome = tool("evaluate", "alone.ckpt", *few, "output_dir=out")
     assert "data: rendered streets, data=synthetic; to score on others, give data=..." in outcome.out
+    shutil.copy(smoke_run / "run.json", tmp_path)  # of the folder that the command happens to stand in
+    assert "data: rendered streets" in tool("evaluate", "street", *few, "output_dir=out").out
 
 
 def test_protocols_side_by_side_each_on_its_own_truth(

@@ -43,7 +43,7 @@ from saunet.cli.words import hydra_value, unknown
 from saunet.errors import ConfigError, one_of
 from saunet.registry import Spec
 from saunet.runs.folder import read as read_run
-from saunet.weights.locate import of_run
+from saunet.weights.locate import of_run, run_of
 
 T = TypeVar("T")
 PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "predictions", "resume", "root")
@@ -272,8 +272,8 @@ def recorded_data(checkpoint: str, table: Table, *, needed: bool = True) -> tupl
         ConfigError: if they are needed and the data set is of a plugin that is not loaded.
     """
     path = Path(checkpoint).expanduser()
-    folder = path if path.is_dir() else path.parent.parent
-    record = read_run(folder)
+    folder = path if path.is_dir() else run_of(path.absolute())
+    record = read_run(folder) if folder is not None else {}
     name, config = (record.get("choices") or {}).get("data"), (record.get("config") or {}).get("data")
     if not name or not isinstance(config, Mapping):
         return [], None

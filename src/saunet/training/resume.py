@@ -17,6 +17,7 @@ from saunet.registry import Spec
 from saunet.runs.checkpoint import Checkpoint, load_weights
 from saunet.training.optim import OTHER_SETTINGS, Recipe
 from saunet.weights.files import read_model
+from saunet.weights.locate import run_of
 
 if TYPE_CHECKING:
     from saunet.training.module import SelfSupervisedDepth
@@ -134,7 +135,6 @@ def stretched(checkpoint: Mapping[str, Any], recipe: Recipe, total: int, source:
         return None
     state = checkpoint["lr_schedulers"][0]
     factor = recipe.factor_at(state["last_epoch"], total)
-    rate = state["base_lrs"][0] * factor
     rate = f"{state['base_lrs'][0] * factor:.3g}, {100 * factor:.3g}% of the highest"
     said = (
         f"the training now ends after step {total} (before: {before}), and its {recipe.schedule} schedule is fitted to "
@@ -143,7 +143,7 @@ def stretched(checkpoint: Mapping[str, Any], recipe: Recipe, total: int, source:
     if factor >= 0.1 or step < recipe.warmup * total:
         return said
     file = Path(source or "RUN")
-    run = file.parent.parent if file.parent.name == "checkpoints" else file
+    run = run_of(file) or file
     return (
         f"{said}; so little is learned with it that a new run with init_from={run} and a schedule of its own is better"
     )

@@ -67,6 +67,11 @@ def of_run(path: Path, names: Sequence[str] = ("best", "last")) -> Path:
     return next((file for file in files if file.is_file()), path)
 
 
+def run_of(checkpoint: Path) -> Path | None:
+    """Return the folder of the run that a checkpoint is in; None for a file that is nowhere below ``checkpoints``."""
+    return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else None
+
+
 def check_push(name: str) -> None:
     """Check a hub id to upload to, and that there is a package which can."""
     if not _HUB_ID.fullmatch(name) or "@" in name:
