@@ -18,7 +18,7 @@ from saunet import __version__, plugins
 from saunet.cli.table import TOOLS, Table, imported, read
 from saunet.cli.words import named_plugins, read_words
 from saunet.errors import ConfigError, SaunetError, suggest
-from saunet.io.said import PRINTED
+from saunet.io.said import PRINTED, say
 from saunet.threads import wait_briefly
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from saunet.cli.compose import Composed
+
+    _Handlers = dict[int, Callable[[int, FrameType | None], object] | int | None]
 
 
 @runtime_checkable
@@ -137,16 +139,10 @@ def _ended_by_signals() -> Iterator[None]:
             before[signal.SIGCHLD] = signal.signal(signal.SIGCHLD, lambda *_: None) or signal.SIG_DFL
         raise Stopped(f"stopped by {signal.Signals(number).name}; finished results are kept", 128 + number)
 
-    main = threading.current_thread() is threading.main_thread()
-    wanted = [getattr(signal, each) for each in ("SIGTERM", "SIGHUP") if main and hasattr(signal, each)]
-    before: dict[int, Callable[[int, FrameType | None], object] | int | None] = {
-        each: signal.signal(each, stop) for each in wanted if signal.getsignal(each) == signal.SIG_DFL
-    }
-    try:
+    wanted = (each for each in _signals("SIGTERM", "SIGHUP") if signal.getsignal(each) == signal.SIG_DFL)
+    before: _Handlers = {each: signal.signal(each, stop) for each in wanted}
+    with _put_back(before):
         yield
-    finally:
-        for each, handler in before.items():
-            signal.signal(each, handler)
 
 
 @contextlib.contextmanager
@@ -160,9 +156,20 @@ def _ended_at_once(name: str) -> Iterator[None]:
         word = "interrupted" if number == signal.SIGINT else f"stopped by {signal.Signals(number).name}"
         os._exit(_say(name, word, 128 + number))  # nothing has been written or printed yet
 
+    wanted = (each for each in _signals("SIGINT", "SIGTERM", "SIGHUP") if callable(signal.getsignal(each)))
+    with _put_back({each: signal.signal(each, end) for each in wanted}):
+        yield
+
+
+def _signals(*names: str) -> list[signal.Signals]:
+    """Return those of the signals that this system has; none outside the main thread, which alone may handle them."""
     main = threading.current_thread() is threading.main_thread()
-    wanted = [getattr(signal, each) for each in ("SIGINT", "SIGTERM", "SIGHUP") if main and hasattr(signal, each)]
-    before = {each: signal.signal(each, end) for each in wanted if callable(signal.getsignal(each))}
+    return [getattr(signal, each) for each in names if main and hasattr(signal, each)]
+
+
+@contextlib.contextmanager
+def _put_back(before: _Handlers) -> Iterator[None]:
+    """Restore handlers of signals in the end; ``before`` may grow meanwhile."""
     try:
         yield
     finally:
@@ -171,8 +178,7 @@ def _ended_at_once(name: str) -> Iterator[None]:
 
 
 def _say(name: str, message: str, code: int) -> int:
-    print(f"saunet {name}: {message}", file=sys.stderr)
-    PRINTED.info(f"saunet {name}: {message}")
+    say(f"saunet {name}: {message}", error=True)
     return code
 
 

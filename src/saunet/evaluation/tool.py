@@ -195,7 +195,7 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
     store_in = options.scale.storable(str(options.checkpoint))
     earlier = read_rows(Path(options.compare)) if options.compare else None
     device = team.device(usable_device(options.device))
-    folder = None if options.output_dir is None else check_folder(options.output_dir)
+    folder, first = None if options.output_dir is None else check_folder(options.output_dir), team.rank == 0
     settings: dict[str, object] = {"data": options.data.name}
     model, pose, found = None, None, None
     if options.checkpoint is not None and runs_alone(options):
@@ -213,7 +213,6 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         _set_up(passes[0][0], options.split)  # the scale is measured once: other ground truth has the same images
         if store_in is not None:
             _check_one_camera(passes[0][0], options.split)
-        first = team.rank == 0
         depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device, first, store_in)
         model = NetworkPredictor(depth, options.flip)
         settings |= {"checkpoint": str(options.checkpoint), "scale": scale}
@@ -225,7 +224,6 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
     result, exported = _score_passes(options, passes, model, pose, device, team, found)
     sources = tuple(options.data.get("sources") or ())
     result = replace(result, settings={**settings, **result.settings}, sources=sources, folder=folder, notes=exported)
-    first = team.rank == 0
     if folder is not None and earlier is not None and first:
         write_results(result, folder)  # so that an evaluation that cannot be compared is not lost
     result = with_statistics(result, options.intervals, earlier, options.compare)

@@ -19,8 +19,9 @@ from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from torch import distributed
 
 from saunet.errors import SaunetError, positive
-from saunet.io.said import PRINTED
+from saunet.io.said import PRINTED, say
 from saunet.runs.folder import Stopped, first_process, mark_lost, read
+from saunet.weights.locate import run_of
 
 LAST = "last.ckpt"
 
@@ -30,8 +31,8 @@ def way_on(folder: str | Path) -> str:
     last = Path(folder) / LAST
     if not last.is_file():
         return "no checkpoint was written yet, so start again"
-    run = last.parent.parent
-    if last.parent.name == "checkpoints" and read(run).get("overrides"):  # started from a command line
+    run = run_of(last)
+    if run is not None and read(run).get("overrides"):  # started from a command line
         return f"resume with saunet resume {shlex.quote(str(run))}"
     return f"resume with resume={last}"
 
@@ -209,8 +210,8 @@ class ProcessWatch(Callback):
     def _end(self, reason: str, started: list[Popen[bytes]]) -> None:
         sentence = f"{reason}; {way_on(self.checkpoints)}"
         mark_lost(self.folder, sentence)
-        print(f"\nsaunet train: {sentence}", file=sys.stderr, flush=True)
-        PRINTED.info(f"saunet train: {sentence}")
+        print(file=sys.stderr)  # the progress bar may have left its line open
+        say(f"saunet train: {sentence}", error=True)
         for process in started:
             process.kill()
         os._exit(1)  # the main thread is blocked in a collective call, where no exception can reach it

@@ -40,8 +40,8 @@ def check_focal(
         lens: Its center and pixel aspect ratio are trusted.
         width: Width of the pictures of its K, pixels.
         most: Number of windows to solve: those with the strongest turns.
-        seconds: Processor time after which only the windows that are needed are solved; a contradiction is checked
-            again even then.
+        seconds: Processor time to spend. Once it is used up, only the minimum of windows is solved, but a contradiction
+            is still checked again.
 
     Returns:
         The estimate, to compare with ``lens.K[0, 0] / width``; None if no window has enough points to track.
