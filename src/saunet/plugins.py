@@ -96,6 +96,9 @@ def asked_for(path: str, names: Iterable[str] = ()) -> str:
     needed = [name for name in names if name not in _loaded] or [path.rpartition(".")[0]]
     if needed[0].split(".")[0] == "saunet":
         return "see `saunet components` for what is available"
+    files = [each if "." in each else f"path/to/{each}.py" for each in needed]
+    elsewhere = f", or plugins=[{','.join(files)}] for a file elsewhere" if files != needed else ""
     return (
-        f"it needs the plugin '{needed[0]}'; if you trust it, add plugins=[{','.join(needed)}] or import it in Python"
+        f"it needs the plugin '{needed[0]}'; if you trust it, add plugins=[{','.join(needed)}] if it is installed or "
+        f"in the working directory{elsewhere}; in Python, import it"
     )

@@ -86,8 +86,18 @@ def test_an_encoder_in_a_file_trains_evaluates_and_is_asked_for(tmp_path: Path) 
     (tmp_path / "my_parts.py").write_text(MINE)
     _saunet("train", "plugins=[my_parts]", *QUICK, "hydra.run.dir=run", folder=tmp_path)
     evaluate = ("evaluate", "run", "data=synthetic_tiny", "data.workers=0", "baselines=false")
-    assert "plugins=[my_parts]" in _saunet(*evaluate, folder=tmp_path, code=1)
+    said = _saunet(*evaluate, folder=tmp_path, code=1)
+    assert "plugins=[my_parts]" in said
+    assert "plugins=[path/to/my_parts.py]" in said
     assert "model" in _saunet(*evaluate, "plugins=my_parts.py", folder=tmp_path)
+
+
+def test_only_a_module_that_can_be_a_file_is_offered_as_one() -> None:
+    said = plugins.asked_for("a.Encoder", ["my_parts", "package.parts"])
+    assert "plugins=[my_parts,package.parts]" in said
+    assert "plugins=[path/to/my_parts.py,package.parts]" in said
+    assert "path/to" not in plugins.asked_for("package.parts.Encoder")
+    assert "plugins=[package.parts]" in plugins.asked_for("package.parts.Encoder")
 
 
 def test_an_output_in_a_file_is_written_by_predict(tmp_path: Path) -> None:
