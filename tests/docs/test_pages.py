@@ -26,6 +26,7 @@ from saunet.cli import app, table
 from saunet.cli.compose import register_configs
 from saunet.cli.table import config_dir
 from saunet.cli.words import read_words
+from saunet.exporting import tool as exporting
 from saunet.registry import REGISTRIES
 
 NOT_CONFIGURED = {"components", "resume", "demo"}  # takes names, no configuration
@@ -194,6 +195,15 @@ def test_the_benchmarks_have_the_options_that_pages_name() -> None:
         source = (ROOT / script).read_text(encoding="utf-8")
         missing = [f"{page}: {option}" for page, option in options if f'"{option.partition("=")[0]}"' not in source]
         assert not missing, f"{script} has no {missing}"
+
+
+def test_the_table_of_export_formats_is_that_of_the_tool() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| (yes|no) \| `([\w.]+)`", (ROOT / "docs" / "deploy.md").read_text("utf-8"), re.M)
+    made = {
+        name: ("yes" if name in exporting.DEFAULT_FORMATS else "no", exporting.FILES[name])
+        for name in exporting.FORMATS
+    }
+    assert {name: (default, file) for name, default, file in rows} == made
 
 
 def test_every_page_is_on_the_site() -> None:

@@ -19,6 +19,7 @@ import torch
 from networks import buildable_encoders, small_network
 from numpy.typing import NDArray
 from processes import python
+from safetensors.torch import load_file
 from torch import Tensor
 
 import saunet
@@ -36,6 +37,7 @@ from saunet.prediction.predictor import Predictor
 from saunet.registry import decoders, encoders
 from saunet.runs.checkpoint import atomic_save, build_networks
 from saunet.runs.record import ModelRecord, Scale
+from saunet.weights.files import read_model
 
 Picture = NDArray[np.uint8]
 Node = Callable[..., dict[str, Any]]
@@ -130,6 +132,21 @@ def test_folder_has_files_config_report_and_card(exported: tuple[Path, list[Pari
         "| model | eigen_lidar_x | 0.111 | 0.900 |",
     ):
         assert text in card, text
+
+
+def test_safetensors_hold_the_depth_network_and_a_pose_network(
+    exported: tuple[Path, list[Parity]], record: ModelRecord, node: Node, tmp_path: Path
+) -> None:
+    assert {name.partition(".")[0] for name in load_file(exported[0] / "model.safetensors")} == {"depth"}
+    posed = dataclasses.replace(record, pose=node("pose", "posecnn"))
+    depth, pose = build_networks(posed)
+    assert pose is not None
+    state = module.named_state({"depth": depth, "pose": pose})
+    atomic_save({"state_dict": state, "saunet": posed.to_plain()}, tmp_path / "last.ckpt")
+    export(ExportOptions(checkpoint=tmp_path / "last.ckpt", output=tmp_path / "out", formats=["safetensors"]))
+    restored = read_model(tmp_path / "out").networks()[1]
+    assert restored is not None
+    assert all(torch.equal(value, pose.state_dict()[name]) for name, value in restored.state_dict().items())
 
 
 def test_onnx_predicts_what_the_checkpoint_predicts(
