@@ -216,6 +216,6 @@ def test_prediction_sees_what_training_saw(tool: Tool, smoke_run: Path, tmp_path
     np.testing.assert_allclose(np.load(tmp_path / "out" / "a_depth.npy"), expected, rtol=1e-4)
     assert expected.shape == (120, 320)
     assert (tmp_path / "out" / "a_points.ply").is_file()
-    tool("predict", *arguments, "outputs=[npy]").says("made with another undistorted")
+    tool("predict", *arguments, "outputs=[npy]").says("made with different settings (undistort")
     tool("predict", *arguments, "undistort=camera.yaml", "camera=[1,2,3,4]").says("camera and undistort are both set")
     tool("predict", *arguments, "undistort=gone.yaml").says("no camera file at gone.yaml")

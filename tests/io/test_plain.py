@@ -18,7 +18,16 @@ from hypothesis import strategies as st
 import saunet
 from saunet.errors import CheckpointError, UnreadableError
 from saunet.io import plain
-from saunet.io.plain import iterate_json, parse_json, read_array, read_arrays, read_json, read_text, read_yaml
+from saunet.io.plain import (
+    different_settings,
+    iterate_json,
+    parse_json,
+    read_array,
+    read_arrays,
+    read_json,
+    read_text,
+    read_yaml,
+)
 
 ALIASED = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]\n" for old, new in zip("abcdefgh", "bcdefghi", strict=True)
@@ -210,6 +219,14 @@ def test_a_long_list_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.Monkey
 )
 def test_a_long_list_that_is_refused(tmp_path: Path, text: str, words: str) -> None:
     assert words in refused(lambda path: list(iterate_json(path)), tmp_path / "rows.json", text.encode())
+
+
+def test_settings_that_differ_from_a_record_are_named() -> None:
+    settings = {"model": "a", "size": (64, 192), "camera": None}
+    assert different_settings({"model": "a", "size": [64, 192]}, settings) == ""
+    recorded = {"model": "b", "size": [64, 96], "camera": None}
+    assert different_settings(recorded, settings, {"model": "network"}) == "different settings (network, size)"
+    assert different_settings(["model"], settings) == "different settings (model, size)"
 
 
 def test_a_message_quotes_no_word_of_any_length() -> None:

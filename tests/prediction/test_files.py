@@ -207,7 +207,7 @@ def test_point_clouds(predictor: Predictor, folder: Path, tmp_path: Path) -> Non
         run(predictor, folder, tmp_path / "3", ["ply"], camera=(80.0, 80.0, 44.5))
     assert not (tmp_path / "3").exists()
     other = Camera.from_numbers((90.0, 80.0, 44.5, 19.5), 40, 90)
-    with pytest.raises(ConfigError, match="made with another camera"):
+    with pytest.raises(ConfigError, match=r"made with different settings \(camera\);"):
         run(predictor, folder / "a.png", tmp_path / "out", ["ply"], camera=other)
 
 
@@ -289,9 +289,11 @@ class TestRefused:
     ) -> None:
         run(predictor, folder, tmp_path / "out")
         other = Predictor(network, 32, 64, flip=True)
-        with pytest.raises(ConfigError, match="made with another model or scale; choose another output folder"):
+        with pytest.raises(
+            ConfigError, match=r"made with different settings \(model or scale\); choose another output folder"
+        ):
             run(other, folder, tmp_path / "out")
-        with pytest.raises(ConfigError, match="made with another colormap"):
+        with pytest.raises(ConfigError, match=r"made with different settings \(colormap\);"):
             run(predictor, folder, tmp_path / "out", colormap="turbo")
         run(other, folder, tmp_path / "out", overwrite=True)
         assert json.loads((tmp_path / "out" / MANIFEST).read_text())["model"] == other.fingerprint

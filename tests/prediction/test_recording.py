@@ -121,7 +121,7 @@ def test_what_others_made_is_not_replaced_unasked(
     for setting in ({"layout": "beside"}, {"fps": 30}, {"range_smoothing": 0.5}, {"codec": "vp09"}):
         with pytest.raises(ConfigError, match=r"drive_disparity\.mp4 exists; .* set overwrite=true"):
             run(["mp4"], **setting)
-    with pytest.raises(ConfigError, match="holds predictions made with another colormap"):
+    with pytest.raises(ConfigError, match=r"holds predictions made with different settings \(colormap\);"):
         run(["mp4"], colormap="turbo")
     assert made.read_bytes() == before
     assert run(["mp4"], fps=30, overwrite=True).clips == (made,)

@@ -14,10 +14,14 @@ from tiny_checkpoint import write_checkpoint
 import saunet
 from saunet.errors import CheckpointError, ConfigError
 from saunet.exporting import exporters
+from saunet.io.images import write_image
+from saunet.io.video import VideoWriter
 from saunet.prediction import runtimes
 from saunet.prediction.predictor import Predictor
+from saunet.prediction.tool import PredictResult
 from saunet.runs.checkpoint import atomic_save, build_networks
 from saunet.runs.record import ModelRecord
+from saunet.scale.options import ScaleOptions
 
 Run = Callable[[np.ndarray], np.ndarray]
 
@@ -183,6 +187,53 @@ def test_openvino_refuses_weights_that_are_not_finite(checkpoint: Path) -> None:
         next(original.network.parameters())[0, 0, 0, 0] = torch.nan
     with pytest.raises(CheckpointError, match="not finite"):
         runtimes.choose_runtime(original, checkpoint, "openvino")
+
+
+def test_a_converted_model_undistorts_as_the_original_does(pretend: Callable[[float, float], Predictor]) -> None:
+    original = pretend(1.0, 0.5)
+    original.undistort, original.undistorted_by = (lambda picture: picture[5:]), "camera 1"
+    chosen = runtimes.choose_runtime(original, "absent.ckpt")
+    assert isinstance(chosen, runtimes.ConvertedPredictor)
+    assert chosen.undistorted_by == "camera 1"
+    assert chosen.predict(image()).depth.shape == (45, 100)
+
+
+def test_a_runtime_is_chosen_once_nothing_can_be_refused(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+
+    def choose(predictor: Predictor, checkpoint: Path, runtime: str, frames: float) -> Predictor:
+        asked.append(frames)
+        return predictor
+
+    def predict(name: str, **more: Any) -> PredictResult:
+        folder = tmp_path / "out"
+        return saunet.predict(
+            saunet.PredictOptions(checkpoint=checkpoint, input=tmp_path / name, output=folder, **more)
+        )
+
+    monkeypatch.setattr(runtimes, "choose_runtime", choose)
+    for name in ("in/a.png", "in/b.png"):
+        write_image(tmp_path / name, image())
+    predict("in")
+    assert asked == [2]
+    assert predict("in").skipped == 2
+    (tmp_path / "out" / "b_depth.png").unlink()
+    predict("in")
+    assert asked == [2, 1]  # nothing left to do the time before
+    with pytest.raises(ConfigError, match=r"made with different settings \(colormap\)"):
+        predict("in", colormap="turbo")
+    scale = ScaleOptions(method="camera_height", camera_height=1.5)
+    with pytest.raises(ConfigError, match=r"made with different settings \(colormap, camera\)"):  # not measured yet
+        predict("in", colormap="turbo", scale=scale, camera=[90])
+    with VideoWriter(tmp_path / "a.mp4", 10.0) as video:
+        video.write(image())
+    predict("a.mp4")
+    assert asked[2:] == [1]
+    with pytest.raises(ConfigError, match=r"a_disparity\.mp4 exists"):
+        predict("a.mp4")
+    assert len(asked) == 3
 
 
 @pytest.mark.parametrize("encoder", ["resnet18", "stratified_nano"])

@@ -19,7 +19,7 @@ import tokenize
 import zipfile
 import zlib
 from collections import OrderedDict
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +83,22 @@ def parse_json(text: str | bytes, source: str, error: type[SaunetError] = Unread
     except ValueError as reason:
         raise error(f"{source} cannot be read as JSON ({_excerpt(reason)})") from reason
     return plain
+
+
+def different_settings(recorded: Any, settings: Mapping[str, object], names: Mapping[str, str] | None = None) -> str:
+    """Name the settings that differ from a record in JSON, such as ``different settings (camera, colormap)``.
+
+    Args:
+        recorded: The record; anything but a mapping has none of the settings.
+        settings: The settings of today.
+        names: What to call a setting, if not by its key.
+
+    Returns:
+        The end of a sentence that begins with "made with"; empty if none differs.
+    """
+    known, now = recorded if isinstance(recorded, dict) else {}, json.loads(json.dumps(dict(settings)))
+    changed = [(names or {}).get(key, key) for key, value in now.items() if known.get(key) != value]
+    return f"different settings ({', '.join(changed)})" if changed else ""
 
 
 def iterate_json(path: str | Path, error: type[SaunetError] = UnreadableError) -> Iterator[Any]:

@@ -68,6 +68,8 @@ class ConvertedPredictor(Predictor):
     def __init__(self, predictor: Predictor, run: Run, limit: Change) -> None:
         about = (predictor.device, predictor.scale, predictor.flip, predictor.keep_aspect)
         super().__init__(predictor.network, predictor.height, predictor.width, *about)
+        self.source, self.undistort = predictor.source, predictor.undistort
+        self.undistorted_by = predictor.undistorted_by
         self._converted, self._limit, self._compared = run, limit, False
 
     def disparity(self, images: Float32[np.ndarray, "b 3 h w"]) -> Float32[np.ndarray, "b h w"]:

@@ -6,11 +6,10 @@ import abc
 import contextlib
 import dataclasses
 import itertools
-import json
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ from saunet.io.atomic import Session, write_json
 from saunet.io.colormaps import RunningRange, colorize, depth_to_png16
 from saunet.io.images import write_image
 from saunet.io.live import CameraReader
-from saunet.io.plain import read_json
+from saunet.io.plain import different_settings, read_json
 from saunet.io.progress import bar
 from saunet.io.video import VideoWriter
 from saunet.prediction.panel import fit, label
@@ -79,9 +78,19 @@ class ClipInfo:
 
 
 class Manifest:
-    """The record of an output folder: the model and settings of its files."""
+    """The record of an output folder: the model and settings of its files.
 
-    def __init__(self, folder: Path, predictor: ImagePredictor, style: Style, overwrite: bool) -> None:
+    Args:
+        folder: The output folder; its files must have been made the same way, unless ``overwrite`` is set.
+        predictor: The model.
+        style: How results look.
+        overwrite: Ignore an earlier record.
+        unknown: Settings that are not known yet, which are not compared.
+    """
+
+    def __init__(
+        self, folder: Path, predictor: ImagePredictor, style: Style, overwrite: bool, unknown: Set[str] = frozenset()
+    ) -> None:
         self.path = folder / MANIFEST
         self.settings: dict[str, object] = {
             "model": predictor.fingerprint,
@@ -101,13 +110,10 @@ class Manifest:
             raise DataError(
                 f"{self.path} cannot be read ({reason}); delete it, or choose another output folder"
             ) from reason
-        current = json.loads(json.dumps(self.settings))
-        changed = [key for key in current if not isinstance(previous, dict) or previous.get(key) != current[key]]
-        if changed:
-            told = ["model or scale" if key == "model" else key for key in changed]
+        known = {key: value for key, value in self.settings.items() if key not in unknown}
+        if different := different_settings(previous, known, {"model": "model or scale", "undistorted": "undistort"}):
             raise ConfigError(
-                f"{folder} holds predictions made with another {', '.join(told)}; "
-                "choose another output folder, or set overwrite=true"
+                f"{folder} holds predictions made with {different}; choose another output folder, or set overwrite=true"
             )
         clips = previous.get("clips")
         self.written, self.clips = True, clips if isinstance(clips, dict) else {}

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -234,16 +235,21 @@ def predict(
         default = ("mp4",) if recording.images is None else ("color", "png16")
         outputs = tuple(dict.fromkeys(options.outputs or default))
         options = with_camera(options, recording, outputs)
+        choose: Callable[[ImagePredictor, float | int], ImagePredictor] = _as_it_is
         if predictor is None:
             device = str(usable_device(options.device))
             about = {"flip": options.flip, "keep_aspect": options.keep_aspect}
             predictor = load(options.checkpoint, device=device, foreign=options.foreign, **about)
             if options.runtime != "torch" and device == "cpu":
-                from saunet.prediction.runtimes import choose_runtime
-
-                most = min(options.max_frames or math.inf, recording.declared or math.inf)
-                predictor = choose_runtime(predictor, options.checkpoint, options.runtime, most)
+                choose = functools.partial(_in_runtime, options)
         camera, height = read_given(options, recording, predictor)
+        most = min(options.max_frames or math.inf, recording.declared or math.inf)
+        if options.scale.measures:  # with the network; otherwise the runtime is chosen once nothing can be refused
+            if recording.images is not None:
+                later = {"model", "unit", *({"camera"} if camera is None and "trajectory" in outputs else ())}
+                style = Style(options.colormap, None, camera, options.max_depth)
+                sinks.Manifest(folder, predictor, style, options.overwrite, unknown=later)
+            predictor, choose = choose(predictor, most), _as_it_is
         apply_scale(options.scale, predictor, options.input, camera, folder, options.checkpoint, height, store_in)
         print(f"depth is {predictor.unit}")
         if "pairs" in outputs and predictor.scale is None:
@@ -272,12 +278,13 @@ def predict(
         clips = _clip_sinks(options, outputs, recording, style, odometer)
         files = tuple(output for output in outputs if output in OUTPUTS)
         if recording.images is not None:
-            result = _predict_images(options, predictor, recording, files, clips, style)
+            result = _predict_images(options, predictor, choose, recording, files, clips, style)
         else:
             if files:
                 clips.append(sinks.FrameFilesSink(folder / recording.title, files, style))
             for sink in clips:
                 _refuse_existing(sink, options.overwrite)
+            predictor = choose(predictor, most)
             frames = itertools.islice(recording, options.max_frames)
             total = options.max_frames or recording.declared
             smoothing, batch = options.range_smoothing, options.batch_size
@@ -296,9 +303,22 @@ def predict(
         return result
 
 
+def _as_it_is(predictor: ImagePredictor, frames: float | int) -> ImagePredictor:
+    """Leave a predictor in its runtime."""
+    return predictor
+
+
+def _in_runtime(options: PredictOptions, predictor: ImagePredictor, frames: float | int) -> ImagePredictor:
+    """Return a predictor in the requested runtime; comparing runtimes takes a while."""
+    from saunet.prediction.runtimes import choose_runtime
+
+    return choose_runtime(predictor, options.checkpoint, options.runtime, frames)
+
+
 def _predict_images(
     options: PredictOptions,
     predictor: ImagePredictor,
+    choose: Callable[[ImagePredictor, float | int], ImagePredictor],
     recording: Recording,
     outputs: Sequence[str],
     clips: Sequence[Sink],
@@ -336,7 +356,7 @@ def _predict_images(
 
     count, wanted, into = 0, frames if todo else unfinished, [files, *todo]
     if wanted:
-        tolerated = failures if outputs else None
+        tolerated, predictor = failures if outputs else None, choose(predictor, len(wanted))
         count = sinks.fill(predictor, wanted, into, smoothing, batch, len(wanted), failures=tolerated, check=check)
     if todo:
         manifest.write({sink.paths[0].name: {"images": state, **look} for sink in todo})

@@ -135,7 +135,7 @@ def test_maps_made_differently_are_not_mixed(tree):
     truth = tree / name(1) / "proj_depth" / "groundtruth" / "image_02" / "0000000000.png"
     truth.parent.mkdir(parents=True)
     truth.write_bytes(b"x")
-    with pytest.raises(DataError, match="made with another depth"):
+    with pytest.raises(DataError, match=r"made with different settings \(depth\)"):
         densify(improved)
     info = tree / name(1) / "depth_linear" / "l" / "maps.json"
     info.write_text(info.read_text().replace('"version": 1', '"version": 9'))

@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 import zipfile
@@ -27,7 +26,7 @@ from saunet.errors import ConfigError, DataError, in_range, one_of, positive
 from saunet.geometry.camera import scale_intrinsics
 from saunet.io.atomic import replacing, write_json
 from saunet.io.images import read_depth, read_image
-from saunet.io.plain import read_arrays, read_json
+from saunet.io.plain import different_settings, read_arrays, read_json
 
 MapKind = Literal["linear", "colorization", "teacher"]
 DENSE_KINDS = ("linear", "colorization")
@@ -95,17 +94,14 @@ class DepthMaps:
     def claim(self, drive: Drive, made_from: Mapping[str, Any], factor: float = 1.0) -> float:
         """Record how a recording's maps are made, before the first one; existing maps must be made the same way."""
         path = self.home(drive) / MAPS
-        made = json.loads(json.dumps(dict(made_from)))
         if path.exists():
             info = self.info(drive)
-            changed = [key for key in made if info.get("made_from", {}).get(key) != made[key]]
-            if changed:
+            if different := different_settings(info.get("made_from"), made_from):
                 raise DataError(
-                    f"{path.parent} holds depth maps made with another {', '.join(changed)}; "
-                    "delete it, or set folder to another one"
+                    f"{path.parent} holds depth maps made with {different}; delete it, or set folder to another one"
                 )
             return float(info["factor"])
-        write_json(path, {"version": VERSION, "kind": self.kind, "factor": factor, "made_from": made})
+        write_json(path, {"version": VERSION, "kind": self.kind, "factor": factor, "made_from": dict(made_from)})
         return factor
 
     def check(self, wanted: Sequence[tuple[Drive, Sequence[int]]], command: str) -> None:
