@@ -82,6 +82,8 @@ def test_a_video_of_a_real_drive_goes_all_the_way(tool: Tool, kitti_mini: Path, 
     trained = tool("train", *TINY, "data.root=campus", "data.manifest=doctor/manifest.json", "output_dir=run")
     assert trained.code == 0, trained.err
     assert "training and validation share 'my drive.avi'" in trained.err
+    for said in (looked.out, trained.err, (tmp_path / "run" / "train.log").read_text()):
+        assert "camera: campus/camera.yaml" in said
     predicted = tool("predict", "checkpoint=run/checkpoints/last.ckpt", "input=campus/my drive.avi", "output=out")
     assert predicted.code == 0, predicted.err
     assert "48 frames" in predicted.out

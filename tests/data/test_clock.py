@@ -147,6 +147,12 @@ def test_speeds_of_another_clock_are_refused_and_aligned_by_the_flow(tmp_path, c
     assert float(found[1]) == pytest.approx(1_700_000_041.3, abs=0.4)
     middle = drive.indices[len(drive.indices) // 3]
     assert drive.speed(middle) == pytest.approx(np.interp(drive.time(middle), at, speed), abs=1)
+    (folder / "speeds.csv").write_text("frame,speed\n1000,8\n1010,8\n")
+    with pytest.raises(DataError, match=r"are of the frames 1000 to 1010, but it has the frames 0 to 449; number them"):
+        saunet.build("data", "video", with_speed=True, **common).drives()
+    (tmp_path / "camera.yaml").write_text(CAMERA.replace("fps: 10\n", ""))
+    with pytest.raises(DataError, match=r"its frames have no times; give fps in its camera\.yaml"):
+        saunet.build("data", "video", with_speed=True, **common).drives()
     (folder / "speeds.csv").unlink()
     with pytest.raises(DataError, match=r"no speeds\.csv to align"):
         saunet.build("data", "video", align_speeds=True, **common).drives()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from drives import NumberDrive
 
-from saunet.data.drive import Drive, DriveProxy
+from saunet.data.drive import Drive, DriveProxy, camera_files
 
 SOURCE = Path(__file__).parents[2] / "src" / "saunet"
 MEMBERS = {name for name in vars(Drive) if not name.startswith("_")}
@@ -37,7 +37,7 @@ def test_four_members_are_enough_and_the_rest_is_unknown():
     unknown = {drive.depth(0), drive.pose(0), drive.time(0), drive.timestamps, drive.fps, drive.speed(0)}
     unknown |= {drive.distance(0, 2), drive.stereo(), drive.T_stereo_cam, drive.path(0), drive.folder}
     unknown |= {drive.frame_size, drive.camera_height, drive.condition, drive.depth_key(0), drive.scene_mask}
-    unknown |= {drive.lens}
+    unknown |= {drive.lens, drive.camera_file}
     assert unknown == {None}
     assert (drive.has_depth(0), drive.recorded(2), drive.numbering, drive.origin) == (False, 2, "", "")
     assert not drive.has_scene_mask
@@ -82,6 +82,28 @@ def test_without_poses_the_distance_follows_from_speeds_and_times():
     assert drive.distance(0, 2) == drive.distance(2, 0) == pytest.approx(2.5)
     assert drive.distance(2, 2) == 0
     assert drive.distance(0, 3) is None
+
+
+def test_camera_files_are_counted_once_for_each_recording():
+    class Filmed(Bare):
+        def __init__(self, name, file):
+            self.name, self._file = name, file
+
+        @property
+        def camera_file(self):
+            return None if self._file is None else Path(self._file)
+
+    assert camera_files([Bare()]) == ""
+    assert camera_files([Filmed("a", "x.yaml"), Filmed("b", "x.yaml"), Bare()]) == "camera: x.yaml"
+    drives = [
+        Filmed("a", "x"),
+        Filmed("b", "y"),
+        Filmed("b", "y"),
+        Filmed("c", "y"),
+        Filmed("d", "z"),
+        Filmed("e", "v"),
+    ]
+    assert camera_files(drives) == "cameras: 4 files: y (2 clips), x (1 clip), z (1 clip), ..."
 
 
 def test_a_proxy_forwards_every_member():

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 
 GAP = 1.5
 """A time step longer than this many median steps is a gap."""
+_NAMED = 3
+"""Number of camera files that a line names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +191,11 @@ class Drive(ABC):
         return None
 
     @property
+    def camera_file(self) -> Path | None:
+        """The file that describes the camera, where each recording may have its own; None if there is none."""
+        return None
+
+    @property
     def lens(self) -> LensModel | None:
         """The lens that `recorded_image` shows and `image` corrects; None if images are as recorded."""
         return None
@@ -220,6 +228,16 @@ class Drive(ABC):
     def condition(self) -> str | None:
         """Weather or light, such as ``night``, to group results by; None if unknown."""
         return None
+
+
+def camera_files(drives: Iterable[Drive]) -> str:
+    """Return a line that names the camera files of recordings, the most used first; empty if they have none."""
+    named = {drive.name: drive.camera_file for drive in drives}
+    used = Counter(file for file in named.values() if file is not None).most_common()
+    if len(used) < 2:
+        return f"camera: {used[0][0]}" if used else ""
+    listed = [f"{file} ({count} clip{'s' if count > 1 else ''})" for file, count in used[:_NAMED]]
+    return f"cameras: {len(used)} files: {', '.join([*listed, *['...'] * (len(used) > _NAMED)])}"
 
 
 class DriveProxy(Drive):

@@ -101,13 +101,16 @@ class MixedDataModule(DepthDataModule):
             for each in source.select(split):
                 selection = Selection(*each)
                 if source.manifest is not None and split in ("train", "val"):
-                    selection = source.manifest.apply(selection, self.offsets if split in self.neighbors else ())
+                    selection = source.manifest.apply(selection, self.offsets if self.has_neighbors(split) else ())
                 selections.append(selection._replace(drive=_Named(f"{name}/{selection.drive.name}", selection.drive)))
         return selections
 
     def overlap(self) -> str | None:
         found = ((name, self.sources[name].overlap()) for name in self._names["train"])
         return "; ".join(f"{name}: {said}" for name, said in found if said) or None
+
+    def speed_problems(self) -> list[str]:
+        return [f"{name}: {problem}" for name, source in self.sources.items() for problem in source.speed_problems()]
 
     def _check_manifests(self, names: Set[str]) -> None:
         super()._check_manifests(names)

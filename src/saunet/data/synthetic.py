@@ -103,7 +103,7 @@ class SyntheticDataModule(DepthDataModule):
                 )
                 for number in range(self.counts[name])
             ]
-            pairs = [drive.stereo() for drive in self._drives[name]] if self.stereo and name in self.neighbors else []
+            pairs = [drive.stereo() for drive in self._drives[name]] if self.stereo and self.has_neighbors(name) else []
             _render([*self._drives[name], *pairs], name, show=self._place()[0] == 0)
         return self._drives[name]
 

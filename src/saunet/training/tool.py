@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_info
 
 from saunet import plugins
+from saunet.data.drive import camera_files
 from saunet.data.loading.module import DepthDataModule
 from saunet.errors import ConfigError, SaunetError, checked, divisible, in_range, one_of, positive, suggest
 from saunet.io.atomic import remove_partial_files
@@ -246,6 +247,8 @@ def train(
     if trainer.log_every_n_steps == TRAINER["log_every_n_steps"]:  # type: ignore[attr-defined]
         often = max(1, total_steps(trainer, data) // POINTS)
         trainer.log_every_n_steps = min(TRAINER["log_every_n_steps"], often)  # type: ignore[attr-defined]
+    if files := camera_files(drive for dataset in data.datasets.values() for drive in dataset.drives):
+        rank_zero_info(files)
     if shared := data.overlap():
         rank_zero_info(shared)
     model.intrinsics = focal_lengths(options.model.intrinsics, data)

@@ -297,6 +297,97 @@ class _TwoFolders(DepthDataModule):
         return [Selection(Wall("clip", frames=count, seed=count), range(count))]
 
 
+class _WithoutTruth(_TwoFolders):
+    """A data set without depth, whose author said nothing about neighbors."""
+
+    ground_truth = "none"
+    protocol = "campus"
+
+
+class _WithoutMaps(_TwoFolders):
+    """A data set that may have depth, here without any."""
+
+    def select(self, split):
+        class Blind(Wall):
+            def depth(self, index):
+                return None
+
+        return [Selection(Blind("clip", frames=4, seed=len(split)), range(4))]
+
+
+def test_the_doctor_counts_the_test_frames_that_are_evaluated():
+    small = {"height": 32, "width": 48, "batch_size": 2, "workers": 0}
+    _, _, text = look(_TwoFolders(**small))
+    assert "views" not in text  # depth is compared, and every frame has it
+    own = _WithoutTruth(**small)
+    found, _, text = look(own)
+    assert (found.windows["test"], found.left_out["test"]) == (2, {"without neighbor": 2})
+    assert (sum(len(batch["name"]) for batch in own.batches("test", "cpu")), found.compared_views) == (2, None)
+    _, _, text = look(_WithoutMaps(**small))
+    assert "with protocols=[campus] compares views of neighboring frames, which 2 of the 4 test frames have" in text
+    evaluated = _WithoutMaps(**small)
+    evaluated.neighbors = (*evaluated.neighbors, "test")  # as that protocol does
+    evaluated.setup("test")
+    assert len(evaluated.datasets["test"]) == 2
+    mixture = datamodules.build("mixed", sources={"a": _TwoFolders(**small), "b": _WithoutTruth(**small)}, **small)
+    assert "note: evaluation also compares views of neighboring frames, which 4 of the 8 test" in look(mixture)[2]
+
+
+def test_camera_files_are_named(tmp_path):
+    root = tmp_path / "r"
+    for number in range(3):
+        make_clip(root, str(number), frames(6, 5, seed=number))
+    assert f"note: camera: {root / 'camera.yaml'}" in look(campus(root))[2]
+    (root / "2" / "camera.yaml").write_text(CAMERA)
+    several = f"cameras: 2 files: {root / 'camera.yaml'} (2 clips), {root / '2' / 'camera.yaml'} (1 clip)"
+    assert f"note: {several}" in look(campus(root))[2]
+    assert not look(campus(root, camera="unknown", guess_camera=True))[0].camera_files.startswith("camera: unknown")
+    assert "camera: " not in look(_TwoFolders(height=32, width=48, batch_size=2, workers=0))[2]
+
+
+def test_speeds_are_told_and_those_that_do_not_fit(tmp_path):
+    root = tmp_path / "r"
+    for number in range(4):
+        make_clip(root, str(number), frames(10, 5, seed=number))
+    assert "distance traveled" not in look(campus(root))[2]
+    (root / "0" / "speeds.csv").write_text("time,speed\n0,9\n1,9\n")
+    (root / "1" / "speeds.csv").write_text("frame,speed\n0,12\n5,12\n")
+    (root / "2" / "speeds.csv").write_text("time,speed\n100,9\n101,9\n")
+    (root / "3" / "speeds.csv").write_text("drive,time,speed\n3,0,9\n3,1,9\n")
+    (root / "3.speeds.csv").write_text("time,speed\n0,9\n1,9\n")
+    (root / "other.csv").write_text("a,b\n")
+    found, _, text = look(campus(root))
+    assert "note: the distance traveled is known in 2 of 4 recordings (typically 10.5 m/s, 38 km/h)" in text
+    assert "data.with_speed=true with +objective.extra.velocity.weight=0.1 trains depth in meters; scale.method" in text
+    partly = next(facts for facts in found.speeds if facts.drive == "1")
+    assert 0.4 < partly.known < 0.8
+    assert f"known in 1 of them only partly, such as {partly.known:.0%} of the steps of '1'" in text
+    assert "warning: the speeds of '2' are from 100.00 to 101.00 s, and its frames from 0.00" in text
+    assert "warning: " + str(root / "3" / "speeds.csv") + " has speeds of the drives 3, which are not needed" in text
+    assert f"warning: {root / '3.speeds.csv'} is not read: the speeds of a folder of frames are expected in it" in text
+    assert "other.csv" not in text
+    mixture = datamodules.build("mixed", sources={"a": campus(root)}, workers=0)
+    assert "warning: a: the speeds of '2' are from" in look(mixture)[2]
+    for number in (2, 3):
+        (root / str(number) / "speeds.csv").unlink()
+    assert "; +objective.extra.velocity.weight=0.1 trains" in look(campus(root, with_speed=True))[2]
+    (root / "0" / "speeds.csv").write_text("speed\n")
+    assert "warning: " + str(root / "0" / "speeds.csv") + " has the columns speed" in look(campus(root))[2]
+
+
+def test_speeds_beside_a_video_are_those_of_its_name(tmp_path):
+    video = make_video(tmp_path / "r" / "a.avi", frames(10, 5))
+    (tmp_path / "r" / "a_speed.csv").write_text("time,speed\n0,9\n1,9\n")
+    (tmp_path / "r" / "b.speeds.csv").write_text("time,speed\n0,9\n1,9\n")
+    _, _, text = look(campus(video))
+    assert "a_speed.csv is not read" in text
+    assert "b.speeds.csv" not in text  # it may be another video's
+    (tmp_path / "r" / "a_speed.csv").rename(tmp_path / "r" / "a.speeds.csv")
+    _, _, text = look(campus(video))
+    assert "not read" not in text
+    assert "known in 1 of 1 recordings" in text
+
+
 class _Own(_TwoFolders):
     """Somebody's data set: one key holds drives out, and by default nothing is."""
 

@@ -142,7 +142,6 @@ class KittiOdometryDataModule(DepthDataModule):
         ConfigError: if a parameter is out of range or a choice is unknown.
     """
 
-    neighbors = ("train", "val", "test")
     protocol = "campus"
     ground_truth = "none"
     camera_height = CAMERA_HEIGHT
@@ -184,6 +183,6 @@ class KittiOdometryDataModule(DepthDataModule):
                 if not frames:
                     continue
             selection = Selection(drive, frames, left_out)
-            posed = self.with_pose and split in self.neighbors
+            posed = self.with_pose and self.has_neighbors(split)
             selections.append(with_poses(selection, self.offsets) if posed else selection)
         return selections

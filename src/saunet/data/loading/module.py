@@ -53,7 +53,8 @@ class DepthDataModule(LightningDataModule):
         **loading: Fields of `LoadOptions`.
 
     Attributes:
-        neighbors: Splits whose samples have source frames; by default ``train`` and ``val``.
+        neighbors: Splits whose samples have source frames, by default ``train`` and ``val``; without ground truth also
+            ``test``, which is then scored by its neighbors.
         protocol: Default evaluation protocol; ``campus`` fits data without depth.
         ground_truth: Kind of depth to evaluate on: ``lidar_x``, ``camera_z``, ``improved``, ``exact`` or ``none``.
         cacheable: Whether ``saunet prepare cache`` can make smaller copies of its images.
@@ -70,7 +71,7 @@ class DepthDataModule(LightningDataModule):
     """
 
     neighbors: Sequence[str] = ("train", "val")
-    """Splits whose samples have source frames."""
+    """Splits whose samples have source frames; see `has_neighbors`."""
     protocol: str = "eigen_camera_z"
     """Name of the evaluation protocol that fits this data set's ground truth; ``campus`` if there is none."""
     ground_truth: str = "camera_z"
@@ -128,10 +129,18 @@ class DepthDataModule(LightningDataModule):
         """
         raise NotImplementedError(f"{type(self).__name__} does not define the frames of '{split}'")
 
+    def has_neighbors(self, split: str) -> bool:
+        """Return whether a split's samples have source frames: without ground truth, a test compares nothing else."""
+        return split in self.neighbors or (split == "test" and self.ground_truth == "none")
+
     @property
     def holding_out(self) -> list[str]:
         """Keys of this data set that hold recordings out of training, such as ``data.val_drives``."""
         return [f"data.{key}" for key in ("val_clips", "val_drives", "val_share") if hasattr(self, key)]
+
+    def speed_problems(self) -> list[str]:
+        """Return a sentence about each table of speeds beside the data that cannot be used, for ``saunet doctor``."""
+        return []
 
     def overlap(self) -> str | None:
         """Return a sentence about splits that share recordings, and how to separate them; None if none do.
@@ -190,7 +199,7 @@ class DepthDataModule(LightningDataModule):
 
     def _usable(self, split: str, selection: Selection) -> Selection:
         """Leave out the manifest's frames and, if these are to be skipped, unreadable ones."""
-        offsets = self.offsets if split in self.neighbors else ()
+        offsets = self.offsets if self.has_neighbors(split) else ()
         if self.manifest is not None and split in ("train", "val"):
             selection = self.manifest.apply(selection, offsets)
         if self.on_error == "skip" and split != "train":
@@ -198,7 +207,7 @@ class DepthDataModule(LightningDataModule):
         return selection
 
     def _dataset(self, split: str, selections: Sequence[Selection]) -> WindowDataset:
-        together = split in self.neighbors
+        together = self.has_neighbors(split)
         offsets = self.offsets if together else ()
         stereo = self.stereo and together
         windows, usage = find_windows(selections, offsets, stereo)
@@ -357,11 +366,7 @@ def surroundings(
     most: int = 100,
 ) -> Iterator[EvalBatch]:
     """Yield frames of a split one by one, ready for the networks, with the sources needed to measure scale."""
-    dataset = data._set_up(split)
-    wanted: dict[int, list[int]] = {}
-    for position, frame in dataset.windows:
-        wanted.setdefault(position, []).append(frame)
-    selections = [Selection(dataset.drives[position], frames) for position, frames in wanted.items()]
+    selections = data._set_up(split).selections()
     windows, usage = find_windows(selections, offsets, stereo)
     if not windows:
         raise DataError(

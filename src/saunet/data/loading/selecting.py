@@ -145,7 +145,7 @@ class Division(NamedTuple):
             told.append(f"training and validation share {names} (validation has the end of each)")
             fix.append(f"{val}=[NAME]")
         if self.val and {*self.val} == {*self.test}:
-            told.append(f"validation, which chooses best.ckpt, and test are the same {len(self.val)} frames")
+            told.append("validation, which chooses best.ckpt, and test are the same frames")
             fix.append(f"{test}=[{'ANOTHER' if fix else 'NAME'}]")
         if not told:
             return None

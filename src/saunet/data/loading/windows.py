@@ -155,6 +155,13 @@ class WindowDataset(Dataset[dict[str, Any]]):
             return {**self._sample(item.sample), "draws": torch.from_numpy(draws)}
         return self._sample(item)
 
+    def selections(self) -> list[Selection]:
+        """Return the target frames of each drive that has some."""
+        wanted: dict[int, list[int]] = {}
+        for position, frame in self.windows:
+            wanted.setdefault(position, []).append(frame)
+        return [Selection(self.drives[position], frames) for position, frames in wanted.items()]
+
     def name(self, index: int) -> str:
         """Return the readable name of a sample, such as ``2011_09_26/2011_09_26_drive_0001_sync 0000000005 l``."""
         position, frame = self.windows[index]

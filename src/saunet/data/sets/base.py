@@ -184,7 +184,7 @@ class FilesDataModule(DepthDataModule):
         selections = [Selection(drive, self.targets(split, drive)) for drive in self.drives(split)]
         if split == "test" and self.ground_truth != "none":
             selections = [with_truth(selection) for selection in selections]
-        if self.with_pose and split in self.neighbors:
+        if self.with_pose and self.has_neighbors(split):
             selections = [with_poses(selection, self.offsets) for selection in selections]
         known = (drive.has_depth(frame) for drive, frames, _ in selections for frame in frames)
         if split == "train" and self.target_depth and not any(known):

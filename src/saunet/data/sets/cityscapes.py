@@ -129,7 +129,7 @@ class CityscapesDataModule(FilesDataModule):
         cameras = sorted(root.glob(f"camera/{split}/*/*_camera.json"))
         if not cameras:
             raise DataError(f"no camera files at {root / 'camera' / split}; unpack camera_trainvaltest.zip at {root}")
-        if split in self.neighbors and self.offsets and not (root / "leftImg8bit_sequence").is_dir():
+        if self.has_neighbors(split) and self.offsets and not (root / "leftImg8bit_sequence").is_dir():
             raise DataError(
                 f"{root} has no leftImg8bit_sequence, and {split} needs the neighbors of its {len(cameras)} annotated "
                 f"frames; unpack leftImg8bit_sequence_trainvaltest.zip at {root}"

@@ -71,7 +71,6 @@ class CommaDataModule(RecordingsDataModule):
         ConfigError: if a parameter is out of range.
     """
 
-    neighbors = ("train", "val", "test")
     protocol = "campus"
     ground_truth = "none"
 

@@ -205,7 +205,7 @@ class NuScenesDataModule(FilesDataModule):
                 f"{tables.root} has none of the images of the {len(scenes)} {split} scenes in {tables.folder.name}; "
                 "unpack the files v1.0-..._blobs.tgz there"
             )
-        if split in self.neighbors and not key_frames and not (tables.root / "sweeps").is_dir():
+        if self.has_neighbors(split) and not key_frames and not (tables.root / "sweeps").is_dir():
             raise DataError(
                 f"{tables.root} has no sweeps, the frames between the key frames; unpack the files with sweeps there, "
                 "or set data.frames=key_frames"

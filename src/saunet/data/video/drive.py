@@ -17,11 +17,7 @@ from saunet.data.checks import common_size
 from saunet.data.drive import GAP, Drive, LensModel
 from saunet.data.video.calibrations import FILE_NAME
 from saunet.data.video.camera import CameraFile, Lens
-from saunet.data.video.clips import (
-    Clip,
-    Recording,
-    short_hash,
-)
+from saunet.data.video.clips import Clip, Recording, short_hash
 from saunet.data.video.motion import Motion, cuts, even_steps
 from saunet.errors import DataError
 from saunet.io.alignment import align_speeds
@@ -106,8 +102,7 @@ class ClipDrive(Drive):
 
     @functools.cached_property
     def _speeds(self) -> SpeedTable | None:
-        path = self.clip.path
-        file = path / SPEEDS if path.is_dir() else path.with_suffix(f".{SPEEDS}")
+        file = speeds_file(self.clip.path)
         return read_speeds(file) if file.is_file() else None
 
     def align_speeds(self, flow: NDArray[np.float64]) -> str:
@@ -123,16 +118,25 @@ class ClipDrive(Drive):
         return f"{moved.path}: {found}"
 
     def check_speeds(self) -> None:
-        """Check that the clip's speeds overlap with the time of its frames."""
-        known = self._speeds.drives.get("") if self._speeds and self._speeds.unit == "time" else None
-        if not self._indices or known is None:
+        """Check that the clip's speeds, if it has any, are of its frames."""
+        if not self._indices or self._speeds is None:
             return
-        (low, *_, high), first, last = known[0].tolist(), self.time(self._indices[0]), self.time(self._indices[-1])
-        if first is not None and last is not None and (first > high or last < low):
+        self._speeds.check_drives([])
+        if self.time(self._indices[0]) is None:
+            raise DataError(f"'{self.name}' has a {SPEEDS}, but its frames have no times; give fps in its {FILE_NAME}")
+        first, last = self._tick(self._indices[0]), self._tick(self._indices[-1])
+        low, *_, high = self._speeds.drives[""][0].tolist()
+        if first <= high and last >= low:
+            return
+        if self._speeds.unit == "frame":
             raise DataError(
-                f"the speeds of '{self.name}' are from {low:.2f} to {high:.2f} s, and its frames from {first:.2f} to "
-                f"{last:.2f} s; set data.align_speeds=true to find the offset of their clock"
+                f"the speeds of '{self.name}' are of the frames {low:.0f} to {high:.0f}, but it has the frames "
+                f"{first:.0f} to {last:.0f}; number them from 0, in the order of the original frames"
             )
+        raise DataError(
+            f"the speeds of '{self.name}' are from {low:.2f} to {high:.2f} s, and its frames from {first:.2f} to "
+            f"{last:.2f} s; set data.align_speeds=true to find the offset of their clock"
+        )
 
     def _tick(self, index: int) -> float:
         """Return a frame's time in the table of speeds; NaN if unknown."""
@@ -164,6 +168,11 @@ class ClipDrive(Drive):
     def recorded_size(self) -> tuple[int, int]:
         """(height, width) of the frames before they are cropped."""
         return self._lens.recorded
+
+    @property
+    def camera_file(self) -> Path | None:
+        file = self.clip.camera.path
+        return file if file.is_file() else None  # none describes an unknown camera
 
     @property
     def camera_id(self) -> str:
@@ -211,6 +220,11 @@ class ClipDrive(Drive):
     def _lens(self) -> Lens:
         example, size = common_size([self.path(index) for index in self._indices])
         return Lens(self.clip.camera, *size, self._crop, f"the frames of '{self.name}' ({example.name})")
+
+
+def speeds_file(clip: Path) -> Path:
+    """Return where the speeds of a folder of frames or of a video are."""
+    return clip / SPEEDS if clip.is_dir() else clip.with_suffix(f".{SPEEDS}")
 
 
 def _choose(recording: Recording, motion: Motion | None, parallax: float) -> tuple[dict[int, int], dict[str, int]]:

@@ -30,7 +30,7 @@ from saunet.data.video.clips import (
     read_clip,
     short_hash,
 )
-from saunet.data.video.drive import ClipDrive
+from saunet.data.video.drive import SPEEDS, ClipDrive, speeds_file
 from saunet.data.video.focal import WINDOW, FocalEstimate, drive_windows, estimate_focal, refusal
 from saunet.data.video.motion import measure, motion_key
 from saunet.errors import ConfigError, DataError, UnreadableError, in_range, one_of, positive
@@ -78,7 +78,6 @@ class VideoDataModule(DepthDataModule):
         ConfigError: if a parameter is out of range or a choice is unknown.
     """
 
-    neighbors = ("train", "val", "test")
     recognizable = False
     protocol = "campus"
     ground_truth = "none"
@@ -121,6 +120,7 @@ class VideoDataModule(DepthDataModule):
         self.max_width = int(positive("max_width", max_width))
         self.align_speeds = align_speeds
         self._drives: list[ClipDrive] | None = None
+        self._paths: list[Path] = []
         self._broken: list[str] = []
 
     def prepare_data(self) -> None:
@@ -130,6 +130,7 @@ class VideoDataModule(DepthDataModule):
     def drives(self) -> list[ClipDrive]:
         if self._drives is None:
             clips = find_clips(self.root, self.camera)
+            self._paths = [clip.path for clip in clips]
             if self.conditions:
                 found = sorted({clip.camera.condition or "none" for clip in clips})
                 for condition in self.conditions:
@@ -153,6 +154,28 @@ class VideoDataModule(DepthDataModule):
 
     def overlap(self) -> str | None:
         return self._division.overlap()
+
+    def speed_problems(self) -> list[str]:
+        """Return a sentence about each table of speeds that does not match its clip, or belongs to none by its name."""
+        problems = []
+        for drive in self.drives():
+            try:
+                drive.check_speeds()
+            except DataError as error:
+                problems.append(str(error))
+        root = Path(self.root).expanduser()
+        begins = root.stem if root.is_file() else ""  # the folder may hold other videos
+        folders = {place for path in self._paths for place in (path, *path.parents) if place.is_dir()}
+        base = root.parent if root.is_file() else root
+        tables = {file for folder in folders if folder.is_relative_to(base) for file in folder.glob(f"{begins}*.csv")}
+        read = {speeds_file(path) for path in self._paths}
+        problems += [
+            f"{file} is not read: the speeds of a folder of frames are expected in it as {SPEEDS}, and those of "
+            f"drive.mp4 beside it as drive.{SPEEDS}"
+            for file in sorted(tables - read)
+            if "speed" in file.name.lower()
+        ]
+        return problems
 
     @functools.cached_property
     def _division(self) -> Division:

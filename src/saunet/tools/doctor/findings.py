@@ -57,7 +57,7 @@ def diagnose(survey: Survey) -> list[Finding]:
         _static,
         _bonnet,
     )
-    found = [finding for rule in (*rules, _light, _truth, _speed) for finding in rule(survey)]
+    found = [finding for rule in (*rules, _light, _truth, _distances, _speed) for finding in rule(survey)]
     return sorted(found, key=lambda finding: ("error", "warning", "note").index(finding.level))
 
 
@@ -120,6 +120,8 @@ def _sizes(survey: Survey) -> Iterator[Finding]:
 
 def _cameras(survey: Survey) -> Iterator[Finding]:
     yield from (Finding("error", problem) for problem in survey.camera_problems)
+    if survey.camera_files:
+        yield Finding("note", survey.camera_files)
     for camera in survey.cameras:
         yield from _camera(camera)
     if survey.cameras:
@@ -325,11 +327,15 @@ def _truth(survey: Survey) -> Iterator[Finding]:
     truths = survey.truths
     if not survey.truth_wanted:
         return
+    have, total = survey.compared_views or (0, 0)
+    counted = f", which {have} of the {total} test frames have" if survey.compared_views else ""
     if not truths:
         how = "" if survey.protocol == "campus" else " with protocols=[campus]"
         text = f"no ground-truth depth: training needs none; evaluation{how} compares views of neighboring frames"
-        yield Finding("note", text)
+        yield Finding("note", text + counted)
         return
+    if survey.views_too:
+        yield Finding("note", f"evaluation also compares views of neighboring frames{counted}")
     known = float(np.mean([truth.known for truth in truths]))
     low, high = min(truth.low for truth in truths), max(truth.high for truth in truths)
     middle = float(np.median([truth.middle for truth in truths]))
@@ -338,6 +344,26 @@ def _truth(survey: Survey) -> Iterator[Finding]:
     if high > 1000 or not 1 <= middle <= 100:
         text = f"depths have a median of {middle:.1f} m and reach {high:.0f} m"
         yield Finding("warning", text, "are they in meters?")
+
+
+def _distances(survey: Survey) -> Iterator[Finding]:
+    yield from (Finding("warning", problem) for problem in dict.fromkeys(survey.speed_problems))
+    known = [facts for facts in survey.speeds if facts.known]
+    if not known:
+        return
+    speeds = [facts.speed for facts in known if facts.speed is not None]
+    usual = float(np.median(speeds)) if speeds else 0.0
+    typical = f" (typically {usual:.1f} m/s, {3.6 * usual:.0f} km/h)" if speeds else ""
+    text = f"the distance traveled is known in {len(known)} of {len(survey.speeds)} recordings{typical}"
+    trains = "+objective.extra.velocity.weight=0.1 trains"
+    if not survey.with_speed:
+        trains = "data.with_speed=true with +objective.extra.velocity.weight=0.1 trains"
+    yield Finding("note", text, f"{trains} depth in meters; scale.method=speed measures the factor afterwards")
+    partly = [facts for facts in known if facts.known < 0.995]
+    if partly:
+        least = min(partly, key=lambda facts: facts.known)
+        text = f"in {len(partly)} of them only partly, such as {least.known:.0%} of the steps of '{least.drive}'"
+        yield Finding("note", f"the distance traveled is known {text}", "the rest counts as unknown")
 
 
 def _speed(survey: Survey) -> Iterator[Finding]:

@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from saunet.data.drive import Drive, LensModel
+from saunet.data.drive import Drive, LensModel, camera_files
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.sampling import evenly
 from saunet.data.loading.selecting import optical_flow
-from saunet.data.loading.windows import WindowDataset
+from saunet.data.loading.windows import WindowDataset, find_windows, measured_distance
 from saunet.data.video.focal import WINDOW, FocalEstimate, drive_windows
 from saunet.data.video.focal_check import check_focal
 from saunet.data.video.motion import SAME_PICTURE, relative_change, shrink
@@ -33,6 +33,8 @@ BANDS = 32
 _TRUTHS = 16
 """Number of ground-truth maps to examine."""
 _PICTURES = 8
+_STEPS = 1000
+"""Number of steps between frames whose distance traveled is examined, over all recordings."""
 _FOCALS = 3
 """Number of cameras whose focal length is estimated."""
 FOCAL_SECONDS = 20.0
@@ -116,6 +118,17 @@ class Timeline:
 
 
 @dataclass(frozen=True)
+class SpeedFacts:
+    """How much of one recording's distance traveled is known."""
+
+    drive: str
+    known: float
+    """Fraction of the examined steps between frames with a known distance."""
+    speed: float | None
+    """Median speed in m/s; None if unknown, as for poses without times."""
+
+
+@dataclass(frozen=True)
 class TruthFacts:
     """One ground-truth map that was read."""
 
@@ -160,6 +173,17 @@ class Survey:
     """Number of frames whose ground truth was requested."""
     protocol: str = ""
     """The data set's own evaluation protocol."""
+    compared_views: tuple[int, int] | None = None
+    """Number of test frames with neighbors, whose views can be compared, and of all; None if all have them."""
+    views_too: bool = False
+    """Whether evaluation compares such views besides ground truth, unless told otherwise."""
+    camera_files: str = ""
+    """A line that names the camera files in use."""
+    speeds: list[SpeedFacts] = field(default_factory=list)
+    speed_problems: list[str] = field(default_factory=list)
+    """Sentences about speeds that lie with the data and cannot be used."""
+    with_speed: bool = False
+    """Whether batches have the distance traveled."""
     pictures: list[tuple[str, NDArray[np.uint8]]] = field(default_factory=list)
     """A few frames with their names, 320 pixels wide."""
     numbering: dict[str, str] = field(default_factory=dict)
@@ -200,6 +224,7 @@ def survey(
         cacheable=cacheable,
         holding_out=data.holding_out,
         protocol=data.protocol,
+        with_speed=data.odometer is not None,
     )
     datasets = dict(_set_up(data, splits, found))
     if "train" in datasets and "val" in datasets:
@@ -220,6 +245,11 @@ def survey(
             found.numbering[label] = drives[label].numbering
     trained = {drive.name for split in ("train", "val") if split in datasets for drive in datasets[split].drives}
     found.test_only = frozenset(wanted.keys() - trained) if trained else frozenset()
+    if "test" in datasets and not data.has_neighbors("test"):
+        windows, _ = find_windows(datasets["test"].selections(), data.offsets)
+        found.compared_views = len(windows), len(datasets["test"])
+        found.views_too = "campus" in data.protocols
+    found.camera_files = camera_files(drives.values())
     everything = [(name, frame) for name, numbers in wanted.items() for frame in sorted(numbers)]
     plan = _spread(everything, frames)
     found.known, found.judged = len(everything), len(plan)
@@ -227,6 +257,9 @@ def survey(
     found.timelines = [_timeline(found, name, drive) for name, drive in timed.items()]
     for name in wanted:
         _look_at_camera(found, name, drives[name], min(wanted[name]))
+    _measure_speeds(found, drives, wanted)
+    if datasets:
+        found.speed_problems += data.speed_problems()
     _estimate_focal(found, drives, min(frames or found.known, found.known))
     for split in ("test", "val"):
         if split in datasets and not found.truths:
@@ -372,6 +405,25 @@ def _look_at_camera(found: Survey, name: str, drive: Drive, index: int) -> None:
         # the picture before undistortion has the same size as after
         recorded = float((K if lens is None else lens.K)[0, 0]) / size[1]
         found.cameras.append(CameraFacts(name, K, size, drive.fps, drive.camera_height, recorded))
+
+
+def _measure_speeds(found: Survey, drives: Mapping[str, Drive], wanted: Mapping[str, set[int]]) -> None:
+    """Ask for the distance traveled between some neighbors of each recording, as training with speeds does."""
+    for name, frames in wanted.items():
+        steps = [(frame, frame + found.step) for frame in sorted(frames) if frame + found.step in frames]
+        chosen = [steps[place] for place in evenly(len(steps), max(2, _STEPS // len(wanted)))] if steps else []
+        distances, speeds = list[float](), list[float]()
+        try:
+            for first, second in chosen:
+                distance = measured_distance(drives[name], first, second)
+                start, end = drives[name].time(first), drives[name].time(second)
+                if math.isfinite(distance):
+                    distances.append(distance)
+                    speeds += [] if start is None or end is None or end <= start else [distance / (end - start)]
+        except DataError as error:
+            found.speed_problems.append(str(error))
+        known, median = len(distances) / max(1, len(chosen)), float(np.median(speeds)) if speeds else None
+        found.speeds.append(SpeedFacts(name, known, median))
 
 
 def _estimate_focal(found: Survey, drives: Mapping[str, Drive], frames: int) -> None:

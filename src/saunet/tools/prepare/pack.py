@@ -100,7 +100,7 @@ def pack(data: DepthDataModule, folder: str | Path, shard_mb: int, workers: int 
             described[split] = []
             for number, (drive, frames, selection) in enumerate(entries):
                 facts, known = describe(drive, frames, data.offsets, data.odometer is not None)
-                paired = data.stereo and split in data.neighbors and selection
+                paired = data.stereo and data.has_neighbors(split) and selection
                 facts |= {
                     "stereo": number + 1 if paired else None,  # the other camera follows
                     "left_out": dict(selection.left_out) if selection else {},
@@ -130,7 +130,8 @@ def pack(data: DepthDataModule, folder: str | Path, shard_mb: int, workers: int 
             write_bytes(target / f"{split}.npz", stream.getvalue())
     shards.close()
     plain = {"format": FORMAT, **{key: getattr(data, key) for key in KEPT}, "offsets": list(data.offsets)}
-    plain |= {"neighbors": list(data.neighbors), "with_speed": data.odometer is not None, "shards": shards.sizes}
+    plain |= {"neighbors": [split for split in splits if data.has_neighbors(split)]}
+    plain |= {"with_speed": data.odometer is not None, "shards": shards.sizes}
     plain |= {"maps": {key: each.kind for key, each in data.maps.items()}, "splits": described}
     plain |= {"camera_height": data.camera_height, "protocols": list(data.protocols)}
     write_json(target / DESCRIPTION, plain, indent=None)
@@ -139,7 +140,7 @@ def pack(data: DepthDataModule, folder: str | Path, shard_mb: int, workers: int 
 
 def _read(data: DepthDataModule, split: str) -> list[tuple[Drive, list[int], Selection | None]]:
     """Return each recording of a split with the frames to pack and its selection; other cameras have none."""
-    together = split in data.neighbors
+    together = data.has_neighbors(split)
     found: list[tuple[Drive, list[int], Selection | None]] = []
     for each in data.select(split):
         selection = Selection(*each)
