@@ -192,3 +192,44 @@ def test_a_damaged_page_says_so_in_a_browser(browser: Any, tmp_path: Path) -> No
         page.wait_for_selector("#problem:visible")
         assert words in page.locator("#problem").inner_text()
         assert "is the file whole?" in page.locator("#problem").inner_text()
+
+
+@pytest.mark.slow
+def test_a_road_has_no_gaps_from_above_and_no_surface_crosses_an_edge(browser: Any, tmp_path: Path) -> None:
+    disparity = np.full((60, 160), 1 / 40, np.float32)
+    disparity[14:] = np.arange(4, 50, dtype=np.float32)[:, None] / (120 * 1.3)
+    disparity[:, 70:80] = np.maximum(disparity[:, 70:80], 1 / 8)  # a post, much nearer than the wall behind it
+    image = np.full((60, 160, 3), 255, np.uint8)
+    camera = Camera.from_numbers((120.0, 120.0, 69.5, 34.5), 60, 160)
+    write_viewer(tmp_path / "x.html", [Prediction(1 / disparity, disparity, image)], camera, width=160)
+    page = browser.new_page()
+    page.goto((tmp_path / "x.html").as_uri())
+    page.wait_for_selector('body[data-frame="0"]')
+
+    def lit() -> Any:
+        shot = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+        return shot[80:340].min(axis=2) > 200  # below the caption and the photograph, above the bar
+
+    def filled(columns: Any) -> float:
+        """The fraction of lit pixels between the first and the last of each column."""
+        spans = [column[column.argmax() : len(column) - column[::-1].argmax()] for column in columns.T if column.any()]
+        return float(np.concatenate(spans).mean())
+
+    columns = np.flatnonzero(lit().any(axis=0))
+    assert columns[0] + columns[-1] == pytest.approx(799, abs=4), "the picture is in the middle"
+    page.locator("#keys").wait_for(state="hidden")  # a single picture has no frames to step through
+    for _ in range(5):
+        page.keyboard.press("s")
+    road = slice(480, 560)
+    page.locator("#size").fill("1")
+    joined = lit()[:, road]
+    page.locator("#surfaces").uncheck()
+    apart = lit()[:, road]
+    assert filled(joined) > 0.99
+    assert filled(apart) < 0.8
+    page.locator("#surfaces").check()
+    page.get_by_role("button", name="reset view").click()
+    for _ in range(5):
+        page.keyboard.press("d")
+    across = lit()[60:100]
+    assert filled(across.T) < 0.95, "the post hides a part of the road, which no surface bridges"
