@@ -61,7 +61,8 @@ def align_speeds(table: SpeedTable, drive: str, times: Series, motion: Series) -
     times, motion = times[known], motion[known]
     if min(np.ptp(times) if len(times) > 1 else 0.0, np.ptp(ticks)) < _SHORTEST:
         raise DataError(f"{what}: both must last at least {_SHORTEST:g} seconds")
-    motion = np.sqrt(np.minimum(motion, np.quantile(motion, 0.95)))  # turns and near scenes look fast
+    # Turns and near objects move the picture more than speed does, so the largest motions are cut off.
+    motion = np.sqrt(np.minimum(motion, np.quantile(motion, 0.95)))
     offsets, r, seconds = _correlations(ticks - ticks[0], np.sqrt(speeds), times - times[0], motion)
     best = int(np.argmax(r))
     if r[best] < _MIN_CORRELATION:
@@ -110,7 +111,7 @@ def _correlations(ticks: Series, speeds: Series, times: Series, motion: Series) 
     gain = there / there.mean()
 
     def sums(a: Series, b: Series) -> Series:
-        return np.asarray(fftconvolve(a, b[::-1]))  # over b moved by 1 - len(b) ... len(a) - 1 steps
+        return np.asarray(fftconvolve(a, b[::-1]))  # for b shifted by 1 - len(b), ..., len(a) - 1 steps
 
     table = (table - table.mean()) / max(float(table.std()), 1e-9)
     frames = there * (frames - motion.mean()) / max(float(motion.std()), 1e-9)

@@ -124,5 +124,5 @@ def write_json(path: str | Path, content: object, error: type[SaunetError] = Dat
         text = json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=False)
     except ValueError as reason:
         raise error(f"cannot write {path}: {reason}; JSON has only finite numbers") from reason
-    # Names of files may hold bytes that are not UTF-8, surrogates in Python: these become JSON's own \u escapes.
+    # File names may contain bytes that are not UTF-8, surrogates in Python; these become \u escapes in JSON.
     write_bytes(path, f"{text}\n".encode(errors="backslashreplace"), error)

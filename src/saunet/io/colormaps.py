@@ -69,6 +69,6 @@ def colorize(
 
 def depth_to_png16(depth: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
     """Return depth as KITTI's 16-bit integers, meters x 256: 65535 is 255.996 m or more, 0 unknown, as inf and NaN."""
-    valid = np.isfinite(depth) & (depth > 0)  # never becomes 0
+    valid = np.isfinite(depth) & (depth > 0)  # clipped to at least 1 below, because 0 means unknown
     steps = np.round(np.where(valid, depth, 0).astype(np.float64) * 256)
     return np.where(valid, np.clip(steps, 1, 65535), 0).astype(np.uint16)

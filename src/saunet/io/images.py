@@ -37,7 +37,7 @@ def natural_order(name: str | Path) -> tuple[list[tuple[int, int | Fraction, str
         (0, Fraction(part) if "." in part else int(part), "") if index % 2 else (1, 0, part)
         for index, part in enumerate(_NUMBER.split(str(name)))
     ]
-    return parts, str(name)  # frame_1 and frame_01 are equal as numbers
+    return parts, str(name)  # the name decides between frame_1 and frame_01, whose numbers are equal
 
 
 def name_times(names: Sequence[str]) -> list[float] | None:
@@ -65,7 +65,7 @@ def name_times(names: Sequence[str]) -> list[float] | None:
 def frame_order(names: Sequence[str]) -> list[int]:
     """Return the order of frames in time: by the time stamps in their names, else by the numbers in them."""
     times = name_times([name.rpartition(".")[0] for name in names])
-    alike = len({name.translate(_ZEROS) for name in names}) < 2  # digits at the same places: text sorts them alike
+    alike = len({name.translate(_ZEROS) for name in names}) < 2  # same pattern of digits: sorts as text
     keys: Sequence[Any] = times or (names if alike else [natural_order(name) for name in names])
     return sorted(range(len(names)), key=keys.__getitem__)
 
@@ -74,7 +74,7 @@ def read_bytes(path: str | Path) -> UInt8[np.ndarray, " n"]:
     """Return the content of a file that should not be empty."""
     path = Path(path)
     try:
-        data = np.fromfile(path, np.uint8)  # also for images: imread cannot open every unicode path on every system
+        data = np.fromfile(path, np.uint8)  # cv2.imread cannot open every Unicode path on every system
     except FileNotFoundError as reason:
         raise DataError(f"no file at {path}; check the path or copy the file again") from reason
     except IsADirectoryError as reason:
@@ -122,7 +122,7 @@ def read_unchanged(path: str | Path) -> NDArray[Any]:
 def image_size(path: str | Path) -> tuple[int, int]:
     """Return (height, width) of an image as `read_image` gives it, without decoding a PNG that is not rotated."""
     data = read_bytes(path).tobytes()
-    # A PNG's EXIF rotation may stand before or after the picture.
+    # In a PNG, the EXIF rotation may come before or after the picture.
     if data[:8] == b"\x89PNG\r\n\x1a\n" and data[12:16] == b"IHDR" and len(data) >= 24 and b"eXIf" not in data:
         return int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
     shape = _decode(path, cv2.IMREAD_GRAYSCALE).shape
@@ -190,7 +190,7 @@ def as_rgb_bytes(
 
 
 _COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-_SAMPLED = 8  # images of a folder to check for the bits in use
+_SAMPLED = 8  # number of images of a folder in which to look for the bits in use
 
 
 def _bits(image: NDArray[Any]) -> int:
@@ -273,7 +273,7 @@ def _decoded(data: UInt8[np.ndarray, " n"], path: str | Path, flags: int) -> NDA
         raise UnreadableError(
             f"{path} is truncated ({data.size} bytes, the end of the image is missing); copy it again"
         )
-    if (claimed := _claimed_bytes(data[:26].tobytes())) > _DEFLATE * data.size:  # decoders would make room for it first
+    if (claimed := _claimed_bytes(data[:26].tobytes())) > _DEFLATE * data.size:  # decoders would allocate it first
         raise UnreadableError(
             f"{path} is damaged: its header claims {claimed} bytes of pixels, too many for {data.size} bytes; copy "
             "it again"
@@ -306,7 +306,7 @@ def _complete(data: bytes) -> bool:
     """
     if data.startswith(b"\x89PNG"):
         at = 8
-        while at < len(data) and data[at + 4 : at + 8] != b"IEND":  # chunks; a decoder makes room for any length
+        while at < len(data) and data[at + 4 : at + 8] != b"IEND":  # a decoder allocates whatever length a chunk claims
             at += 12 + int.from_bytes(data[at : at + 4], "big")
         return at < len(data)
     if data.startswith(b"\xff\xd8"):

@@ -31,7 +31,7 @@ _SILENCE = 5.0
 _PATIENCE = 60.0
 """Seconds after which a lost connection is given up."""
 _DEVICE = re.compile(r"/dev/video\d+")
-# Playlists may name what cameras use, but no files.
+# A playlist may refer to the protocols that cameras use, but not to files.
 _OPTIONS = {"protocol_whitelist": "rtsp,rtp,rtmp,http,https,httpproxy,tcp,tls,udp,crypto", "rtsp_transport": "tcp"}
 _OPTIONS["analyzeduration"] = "1000000"  # microseconds
 
@@ -134,7 +134,7 @@ class CameraReader:
     def close(self) -> None:
         """Release the camera."""
         self.stop()
-        self._thread.join(1.0)  # a device is free again; a read from the network may take until its timeout
+        self._thread.join(1.0)  # enough to release a device; a network read may block until its timeout
 
     def answered(self, frame_arrived: float) -> str:
         """Take note that a picture's results are out, and return the latency in words."""
@@ -200,7 +200,7 @@ class CameraReader:
                         f"{self.name} is a finished video, and reading it like a live camera would lose frames; "
                         "download it, and give the file"
                     )
-                stream.thread_type = "SLICE"  # threads that work on several frames would hold them back
+                stream.thread_type = "SLICE"  # threads that work on several frames at once would delay them
                 self.fps = float(stream.average_rate or stream.guessed_rate or self.fps)
                 weave: Deinterlacer | None = None
                 converter = VideoReformatter()
@@ -210,7 +210,7 @@ class CameraReader:
                     at = time.monotonic()
                     try:
                         frames = stream.decode(packet)
-                    except FFmpegError:  # what comes next may be whole
+                    except FFmpegError:  # the next packet may be intact
                         continue
                     for frame in frames:
                         if weave is None and frame.interlaced_frame:

@@ -140,7 +140,7 @@ def parse_yaml(text: str, source: str, error: type[SaunetError] = UnreadableErro
         if len(text) > YAML_BYTES:
             raise _LimitError(f"more than {YAML_BYTES:,} characters")
         return yaml.load(text, _Loader)
-    # A broken tag or date, a key that is a list, and so on reach us as whatever PyYAML meets first.
+    # A broken tag or date, a list as a key and so on raise whatever exception PyYAML runs into first.
     except (yaml.YAMLError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as reason:
         if isinstance(reason, SaunetError):
             raise
@@ -175,7 +175,7 @@ def read_arrays(
                 _check_header(io.BytesIO(data), len(data))
                 found[each.filename.removesuffix(".npy")] = np.load(io.BytesIO(data), allow_pickle=False)
             return found
-    # A damaged offset is an invalid argument for the system, a password a RuntimeError.
+    # A damaged offset raises OSError (EINVAL), and an encrypted file RuntimeError.
     except (*_DAMAGED, zipfile.BadZipFile, zlib.error, RuntimeError, OSError) as reason:
         if isinstance(reason, OSError) and reason.errno != errno.EINVAL:
             raise

@@ -20,5 +20,5 @@ def bar(show: bool = True, unit: str = "", taken: bool = False) -> progress.Prog
 
 def watched(console: Console) -> bool:
     """Return whether somebody looks at a bar there: a terminal or a notebook, not a file or a pipe."""
-    # In a notebook, rich draws with ipywidgets, and warns at every bar where they are missing.
+    # In a notebook, rich draws with ipywidgets, and warns at every bar if it is missing.
     return console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)

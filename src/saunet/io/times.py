@@ -101,7 +101,7 @@ def _exif_times(folder: Path, names: Sequence[str]) -> list[float] | None:
     times = list[float]()
     for name in names:
         seconds = exif_time(folder / name)
-        if seconds is None:  # mostly the first image already
+        if seconds is None:  # usually the first image, so the others are not read
             return None
         times.append(seconds)
     return times if len(set(times)) == len(times) else None
@@ -118,7 +118,7 @@ def exif_time(path: Path) -> float | None:
         with path.open("rb") as file:
             head = file.read(_HEAD)
     except OSError:
-        return None  # whoever reads the picture says so
+        return None  # reported when the picture itself is read
     start = head.find(b"Exif\0\0", 0, 4096)
     if not head.startswith(b"\xff\xd8") or start < 0:
         return None

@@ -139,7 +139,7 @@ class VideoReader(Session):
             # "file:" keeps names with colons from being taken for addresses; playlists must not open others either
             options = {"protocol_whitelist": "file"}
             with av.open(f"file:{self.path}", options=options, metadata_errors="replace") as container:
-                stream: Any = container.streams.best("video")  # never a cover picture
+                stream: Any = container.streams.best("video")  # not an embedded cover picture
                 if stream is None:
                     raise UnreadableError(f"{self.name} contains no video, only sound or text")
                 if stream.codec_context is None:
@@ -217,7 +217,8 @@ class VideoReader(Session):
         with self._opened() as again:
             packets = itertools.islice((packet for packet in _packets(*again) if packet is not None), 300)
             stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
-        stamps = stamps[:-16] if len(stamps) > 200 else stamps  # the last ones may not be the next ones
+        # Packets come in decoding order, so that some of the last stamps may be missing.
+        stamps = stamps[:-16] if len(stamps) > 200 else stamps
         steps = np.diff(stamps) * float(stream.time_base)
         average = float(stream.average_rate or 0) or None
         mean, usual = (float(1 / np.mean(steps)), float(1 / np.median(steps))) if len(steps) else (average, average)
@@ -243,7 +244,7 @@ def nearest_steps(
             start = seconds
         else:
             half = (seconds - previous[1]) / 2
-            reached = (previous[1] + half - start) * fps - 1e-6  # in steps; of two equally near, the later one
+            reached = (previous[1] + half - start) * fps - 1e-6  # in steps of 1/fps; of equally near ones, the later
             if step < reached:
                 yield previous
                 step = math.ceil(reached)
@@ -287,7 +288,7 @@ class VideoWriter(Session):
             )
         pad = ((0, self._size[0] % 2), (0, self._size[1] % 2), (0, 0))
         picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(np.pad(frame, pad, mode="edge")), "rgb24")
-        # the tags alone convert nothing: the values have to be made for them
+        # Setting the tags converts nothing, so the values are converted to match them.
         picture = picture.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
         ticks = round((self.count / self.fps if seconds is None else seconds) * _TICKS)
         self._last = picture.pts = max(ticks, self._last + 1)
@@ -311,7 +312,7 @@ class VideoWriter(Session):
         context = self._stream.codec_context
         context.time_base = Fraction(1, 30_000 if self.codec == "mp4v" else _TICKS)
         context.colorspace = context.color_primaries = context.color_trc = 1  # BT.709
-        context.color_range = 1  # of television: 16 to 235
+        context.color_range = 1  # limited (TV) range, 16 to 235
 
     def _check(self) -> None:
         if self.count == 0:

@@ -38,7 +38,7 @@ def ssim_loss(prediction: Float[Tensor, "*b c h w"], target: Float[Tensor, "*#b 
     mean_p, mean_t = box_mean(prediction), box_mean(target)
     means, squares = mean_p * mean_t, mean_p * mean_p + mean_t * mean_t
     covariance = box_mean(prediction * target) - means
-    variances = box_mean(prediction * prediction + target * target) - squares  # of both, which is all that is needed
+    variances = box_mean(prediction * prediction + target * target) - squares  # their sum: SSIM needs no more
     similarity = (2 * means + _C1) * (2 * covariance + _C2) / ((squares + _C1) * (variances + _C2))
     return (0.5 - 0.5 * similarity).clamp(0, 1)
 
@@ -217,7 +217,7 @@ def gradient_loss(
     one_of("operator", operator, ("forward", "sobel"))
     if known is None:
         known = torch.ones_like(target, dtype=torch.bool)
-    difference = torch.where(known, prediction - target, 0.0)  # gradients are linear: one pass instead of two
+    difference = torch.where(known, prediction - target, 0.0)  # gradients are linear, so one pass does
     if operator == "forward":
         gx, gy = forward_differences(difference)
         pairs_x, pairs_y = known[..., :, 1:] & known[..., :, :-1], known[..., 1:, :] & known[..., :-1, :]
@@ -247,7 +247,7 @@ def pool_known(depth: Float[Tensor, "b 1 _ _"], height: int, width: int) -> Floa
 def box_mean(x: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     """3x3 mean with reflection padding over the last two dimensions (each at least 2)."""
     if x.device.type == "cpu":
-        # Pooling is a scalar loop on CPUs, and the largest part of a training step's loss; shifted sums are vectorized.
+        # On CPUs, pooling is a scalar loop, the largest part of the loss's time; shifted sums are vectorized.
         mean: Tensor = _ShiftedSums.apply(x)  # type: ignore[no-untyped-call]
         return mean
     flat = F.pad(x.reshape(-1, 1, *x.shape[-2:]), (1, 1, 1, 1), mode="reflect")

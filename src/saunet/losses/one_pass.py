@@ -49,7 +49,7 @@ def takes(batch: TrainBatch) -> bool:
     """Return whether a batch can be compared in one pass: on a CPU, without gradients for images."""
     given = batch["loss_target"], batch["loss_sources"]
     large = min(given[0].shape[-2:]) >= 4
-    plain = "target_mask" not in batch  # left-out pixels need the separate operations
+    plain = "target_mask" not in batch  # masked pixels need the separate operations
     return plain and large and given[0].device.type == "cpu" and not any(each.requires_grad for each in given)
 
 
@@ -163,7 +163,7 @@ def _combine(
         known = functools.reduce(torch.maximum, seen)
     best = functools.reduce(torch.minimum, errors)
     left, parts = known.clone(), []
-    for each in errors:  # the first of equal ones
+    for each in errors:  # of equal errors, the first source counts
         parts.append(torch.eq(each, best, out=torch.empty_like(best)).mul_(left))
         left -= parts[-1]
     return best, known, parts
@@ -240,7 +240,7 @@ class _Comparison:
     def __init__(self, like: Tensor, count: int, ssim_weight: float, learns: bool) -> None:
         shape = like.shape[1:]
         self.weight = ssim_weight
-        self.kept = like.new_empty(count if learns else 1, 4, *shape)  # kept from each source for its slope
+        self.kept = like.new_empty(count if learns else 1, 4, *shape)  # what each source's gradient needs
         self.stats, self.work = like.new_empty(7, *shape), like.new_empty(7, *shape)
         self.gradient = like.new_empty(count if learns else 0, *shape)
         self.C2 = like.new_full(shape[-1:], _C2 / 9)

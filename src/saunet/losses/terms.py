@@ -229,7 +229,7 @@ class Gradient(Term):
     def compare(self, depth: Float[Tensor, "b 1 h w"], target: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
         """Return eq. (13) for one scale."""
         known = (target > 0) & depth.isfinite()
-        target = torch.where(known, target, 1.0)  # a harmless value that never counts, but whose logarithm must exist
+        target = torch.where(known, target, 1.0)  # masked out below, but its logarithm must be finite
         if self.domain == "log_depth":
             depth, target = depth.log(), target.log()
         elif self.domain == "disparity":

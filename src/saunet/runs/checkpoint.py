@@ -91,7 +91,7 @@ class _Counted(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if args and isinstance(args[0], list | tuple) and all(isinstance(side, int) for side in args[0]):
-            self.count(math.prod(args[0]))  # what begins with a size makes a tensor
+            self.count(math.prod(args[0]))  # a function whose first argument is a size creates a tensor
         return func(*args, **(kwargs or {}))
 
 

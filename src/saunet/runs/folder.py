@@ -108,10 +108,10 @@ def recording(
         record.start()
         yield record
     except Exception as error:
-        with suppress(SaunetError):  # on a full disk, what filled it is the news, not that this cannot be noted
+        with suppress(SaunetError):  # on a full disk, the first error says more than the one raised here
             record.end("failed", _sentence(error, describe))
         raise
-    except BaseException as error:  # Ctrl-C, or a stop that was asked for
+    except BaseException as error:  # Ctrl-C, or a requested stop
         record.end("interrupted", str(error) if isinstance(error, Stopped) else "interrupted")
         raise
     record.end("finished")
@@ -140,7 +140,7 @@ def locked(folder: str | Path) -> Iterator[None]:
     if fcntl is None or not first_process():
         yield
         return
-    # A record lock, not flock(): loader processes would inherit that one, and outlive a killed run by seconds.
+    # Not flock(): loader processes would inherit that lock, and hold it for seconds after the run was killed.
     while True:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -161,7 +161,7 @@ def locked(folder: str | Path) -> Iterator[None]:
         with suppress(OSError):
             if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
                 break
-        file.close()  # the run that held it removed the file in between
+        file.close()  # the run that held the lock has meanwhile removed the file
     try:
         yield
     finally:
@@ -194,7 +194,7 @@ def versions() -> dict[str, str]:
     """Return the versions of Python, of saunet and of the libraries that can change what a training computes."""
     found = {"python": platform.python_version(), "saunet": __version__}
     for package in PACKAGES:
-        with suppress(PackageNotFoundError):  # OpenCV, for one, comes in several packages
+        with suppress(PackageNotFoundError):  # OpenCV comes in several packages, of which one is installed
             found[package] = version(package)
     return found
 

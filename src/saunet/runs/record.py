@@ -210,7 +210,7 @@ class ModelRecord:
 
 def _check_bounds(plain: Any) -> None:
     """Check that a record is plain and small, however often it refers to its own parts."""
-    level = [("", plain)]  # each value with the name it stands under
+    level = [("", plain)]  # (key, value) pairs of one level of nesting
     for _ in range(_DEPTH):
         for name, value in level:
             if not isinstance(value, str | int | float | Mapping | list | tuple | None) or not isinstance(name, str):

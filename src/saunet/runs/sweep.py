@@ -39,9 +39,9 @@ def differing(runs: Sequence[Run], *, by_overrides: bool = False) -> list[str]:
     compares what the command lines said; for the jobs of one sweep that is what was swept.
     """
     tables = [_typed(run) if by_overrides else settings(run) for run in runs]
-    tables = [table for table in tables if table]  # a job that left nothing says nothing
+    tables = [table for table in tables if table]  # a job without a record tells nothing about the others
     keys = dict.fromkeys(key for table in tables for key in table)
-    # Older versions lack keys that newer ones leave off.
+    # A key that an older version did not have counts as one that is switched off.
     given = {key: {None if table.get(key) in _OFF else table.get(key) for table in tables} for key in keys}
     different = [key for key in keys if len(given[key]) > 1]
     chosen = tuple(f"{slot.replace('/', '.')}." for slot in _SLOTS if slot.replace("/", ".") in different)
@@ -104,7 +104,7 @@ def _ends(paths: Sequence[Path]) -> list[str]:
     return found
 
 
-_LONGEST_LABEL = 32  # characters; single runs whose settings take more go by their folders
+_LONGEST_LABEL = 32  # characters; a run whose settings need more is called by its folder
 
 
 def labels(groups: Sequence[Sequence[Run]]) -> list[list[str]]:
@@ -142,7 +142,7 @@ def _label(run: Run, keys: Sequence[str]) -> str:
     slots = ("model/encoder", "model/decoder")
     others = [key for key in keys if key.replace(".", "/") not in slots]
     parts = []
-    if len(others) < len(keys):  # always named in full: encoder + decoder
+    if len(others) < len(keys):  # even if only one of the two differs, both are named
         parts.append(" + ".join(run.component(slot) or "?" for slot in slots))
     for key, value in zip(others[:3], values(run, others[:3]), strict=True):
         if value:

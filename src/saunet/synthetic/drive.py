@@ -27,7 +27,7 @@ Frame = tuple[NDArray[np.uint8], NDArray[np.float32]]
 FRAME_SECONDS = 0.1
 MAX_DEPTH = 1000.0
 """Ground farther away than this counts as unknown, like the sky; meters."""
-_HORIZON = 0.46  # height of the principal point over the image's
+_HORIZON = 0.46  # row of the principal point, as a fraction of the image's height
 
 
 @dataclass(eq=False)
@@ -119,7 +119,7 @@ class SyntheticDrive(Drive):
     def _stereo(self) -> SyntheticDrive:
         twin = replace(self, camera="right" if self.camera == "left" else "left")
         shared = {name: value for name, value in self.__dict__.items() if name in ("world", "travel")}
-        twin.__dict__.update(shared, _stereo=self)  # always the same object, so it is rendered once
+        twin.__dict__.update(shared, _stereo=self)  # each is the other's, so that no frame is rendered twice
         return twin
 
     @property

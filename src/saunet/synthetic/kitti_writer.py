@@ -41,17 +41,17 @@ def _euler(x: float, y: float, z: float) -> F64:
     return np.asarray(about_z @ about_y @ about_x)
 
 
-_MAX_RANGE = 120.0  # meters a scanner measures
+_MAX_RANGE = 120.0  # range of the scanner, meters
 _BEAMS = np.radians(np.linspace(2.0, -24.8, 64))
 _AZIMUTHS = np.radians(np.arange(-60.0, 60.0, 0.18))
 _SECONDS = 0.1
-_BASELINE = 0.54  # meters, where only one camera is recorded
-_CAMERA_2 = np.array([0.06, 0.0, 0.003])  # a point in camera 0 plus this is a point in camera 2
+_BASELINE = 0.54  # meters between the cameras; used if the drive has only one
+_CAMERA_2 = np.array([0.06, 0.0, 0.003])  # added to a point in camera 0's frame, gives it in camera 2's
 _R_RECT_00 = _euler(0.004, -0.007, -0.0098)
-_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # x forward, y left, z up -> a camera's axes
-_T_CAM0_VELO = _rigid(_euler(0.0008, -0.0145, 0.0071) @ _AXES, (-0.004, -0.076, -0.272))  # of the unrectified camera 0
-_T_VELO_CAM0 = np.linalg.inv(_T_CAM0_VELO) @ _rigid(_R_RECT_00.T, np.zeros(3))  # of the rectified camera 0
-_T_VELO_CAM = _T_VELO_CAM0 @ _rigid(np.eye(3), -_CAMERA_2)  # of camera 2
+_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # (x forward, y left, z up) to a camera's axes
+_T_CAM0_VELO = _rigid(_euler(0.0008, -0.0145, 0.0071) @ _AXES, (-0.004, -0.076, -0.272))  # for the unrectified camera 0
+_T_VELO_CAM0 = np.linalg.inv(_T_CAM0_VELO) @ _rigid(_R_RECT_00.T, np.zeros(3))  # for the rectified camera 0
+_T_VELO_CAM = _T_VELO_CAM0 @ _rigid(np.eye(3), -_CAMERA_2)  # for camera 2
 _T_VELO_IMU = _rigid(_euler(-0.0148, -0.002, -0.0008), (-0.81, 0.32, -0.80))
 _T_CAM_IMU = np.linalg.inv(_T_VELO_CAM) @ _T_VELO_IMU
 _EARTH = 6378137.0  # meters
@@ -159,7 +159,7 @@ def records(T_world_imu: Sequence[F64], seconds: float) -> F64:
     change = np.gradient(turn, seconds, axis=0) if several else np.zeros_like(turn)
     spin = np.einsum("nji,njk->nik", turn, change)
     rates = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
-    scale = np.cos(np.radians(_LATITUDE))  # of the Mercator map that readers use
+    scale = np.cos(np.radians(_LATITUDE))  # readers of KITTI project positions with Mercator at this scale
     longitude = _LONGITUDE + np.degrees(place[:, 0] / (scale * _EARTH))
     north = scale * _EARTH * np.log(np.tan(np.pi * (90 + _LATITUDE) / 360)) + place[:, 1]
     latitude = np.degrees(2 * np.arctan(np.exp(north / (scale * _EARTH)))) - 90
@@ -264,7 +264,7 @@ def _scan(drive: Drive, index: int) -> bytes:
     level = np.cos(elevation)
     beams = np.stack([level * np.cos(azimuth), -level * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(-1, 3)
     K = np.asarray(drive.intrinsics(index), np.float64)
-    # As if the scanner were at the camera's place, half a meter off: that decides only the pattern.
+    # The rays start at the camera, half a meter from the scanner: this changes only which points are hit.
     rays = beams @ np.linalg.inv(_T_VELO_CAM)[:3, :3].T
     rays = rays[rays[:, 2] > 0.1]
     pixels = np.rint(rays / rays[:, 2:] @ K.T)[:, :2].astype(np.int64)

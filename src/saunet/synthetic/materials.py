@@ -309,7 +309,7 @@ _LEVELS = SIZE.bit_length()  # 256, 128, ..., 1
 _WIDTHS = np.array([SIZE >> level for level in range(_LEVELS)])
 _STARTS = np.concatenate([[0], np.cumsum(_WIDTHS + 2)[:-1]])
 _SIDE = int((_WIDTHS + 2).sum())
-_BRIGHT = 127.5  # stored value of luminance 1, so that luminance reaches 2
+_BRIGHT = 127.5  # the byte that stores luminance 1, so that 255 is about 2
 _ROW = 512  # the flat list of samples is looked up in rows of this length
 
 

@@ -33,7 +33,7 @@ class Polygons:
     corners: F64  # q x 8 x 3, meters, world
     to_u: F64  # q x 4: texture coordinate u = to_u[:3] . point + to_u[3], in periods
     to_v: F64  # q x 4: the same downwards
-    look: F64  # q x 11: material, color (3), second color (3), grain, meters a period in u and v, grain offset
+    look: F64  # q x 11: material, color (3), second color (3), grain, meters per period in u and v, grain offset
 
     @property
     def count(self) -> int:

@@ -156,7 +156,7 @@ def _cast_quadrics(quadrics: Quadrics, first: int, camera: Camera, x: F32, y: F3
     center = offset[chosen] * scale
     outside = (center**2).sum(axis=1) - 1.0
     toward = np.einsum("nij,ni->nj", form, center)
-    # Rays are counted from the middle of the rectangle, in float64: float32 would cancel on thin far things.
+    # Relative to the middle of the rectangle, and in float64: in float32, thin distant objects suffer cancellation.
     middle = (rectangles[:, ::2] + rectangles[:, 1::2]) / 2 - camera.K[:2, 2]
     middle /= np.diag(camera.K)[:2]
     shift = np.tile(np.eye(3), (chosen.size, 1, 1))
@@ -210,7 +210,7 @@ def _cast_ground(world: World, camera: Camera, x: F32, y: F32, nearest: F32, ide
         np.abs(world.road.locate(*ground_point(camera, *rays, inverse))[1]) for inverse in (upper, lower)
     )
     on_road, on_top = edge_lower <= half, edge >= half
-    share = np.clip((half - edge) / np.maximum(edge_lower - edge, 1e-6), 0, 1)  # of the way down the kerb's face
+    share = np.clip((half - edge) / np.maximum(edge_lower - edge, 1e-6), 0, 1)  # on the kerb's face, 0 top to 1 bottom
     face = 1 / (1 / upper + share * (1 / lower - 1 / upper))
     inverse = np.where(on_top, upper, np.where(on_road, lower, face))
     beyond = edge - half

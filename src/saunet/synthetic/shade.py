@@ -22,7 +22,7 @@ F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
 
 _GRAIN_PERIOD = 13.0  # meters
-_GROUND = {  # material, meters a period, grain
+_GROUND = {  # material, meters per period, grain
     ROAD: ("asphalt", 3.1, 0.20),
     KERB_FACE: ("kerb", 4.0, 0.08),
     KERB_TOP: ("kerb", 4.0, 0.08),

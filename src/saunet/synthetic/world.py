@@ -24,7 +24,7 @@ _STEP = 0.5  # meters between centerline points
 _CELL = 1.0  # meters between points of the street-coordinate grid; bilinear lookup is then good to a few millimeters
 _REACH = 70.0  # meters to either side that have street coordinates
 _MAX_HEADING = np.radians(65.0)  # the road never turns back, so it cannot cross itself
-_OUTSIDE = (0.0, 1e3, 1.0, 0.0)  # what stands for street coordinates outside the grid
+_OUTSIDE = (0.0, 1e3, 1.0, 0.0)  # street coordinates of everything outside the grid
 SLOWEST, FASTEST = 0.6, 1.2
 """Bounds of the motion along the road, meters a frame."""
 
@@ -104,7 +104,7 @@ class Travel:
 
     along: F64  # meters along the road
     wander: F64  # meters to the right of the lane's center
-    yaw: F64  # radians beside the road's heading, positive to the right
+    yaw: F64  # radians relative to the road's heading, positive to the right
     pitch: F64  # radians, positive upwards
 
     @property
@@ -179,7 +179,7 @@ class MovingCar:
 
     shape: Polygons
     start: float
-    speed: float  # meters a frame along the road; negative for oncoming traffic
+    speed: float  # meters per frame along the road; negative for oncoming traffic
     across: float
 
     def at(self, frame: int, road: Road) -> Polygons:
@@ -221,7 +221,7 @@ class World:
 
     def _moving_car(self, rng: np.random.Generator, number: int, length: float, speed: float) -> MovingCar:
         shape = objects.car(rng)
-        if number % 2 == 0:  # ahead, in the camera's lane and a little faster, so that it is never run into
+        if number % 2 == 0:  # ahead, in the camera's lane and a little faster, so that the camera never runs into it
             gap = 13.0 + 14.0 * (number // 2) + rng.uniform(0, 5)
             return MovingCar(shape, gap, speed * rng.uniform(1.04, 1.2), self.section.lane)
         start = rng.uniform(0.3, 1.0) * length + 25.0 * (number // 2)

@@ -124,7 +124,7 @@ def draw_speed(points: Sequence[Point], accuracy: str) -> Any:
         fill = "white" if point.published else tint
         panel.plot([place], [point.seconds], marker, color=tint, markersize=7.5, mfc=fill)
         if point.accuracy is not None and point.name not in told:
-            told.add(point.name)  # once, above; towards the middle, where there is room
+            told.add(point.name)  # once, above its marker and towards the middle, where there is room
             side, offset = ("right", -9) if place > middle else ("left", 9)
             where = {"textcoords": "offset points", "xytext": (offset, 5), "ha": side}
             panel.annotate(point.name, (place, point.seconds), fontsize=9, color="#333333", **where)
