@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import glob
 import math
 import sys
 import warnings
@@ -165,9 +166,9 @@ class VideoDataModule(DepthDataModule):
                 problems.append(str(error))
         root = Path(self.root).expanduser()
         begins = root.stem if root.is_file() else ""  # the folder may hold other videos
-        folders = {place for path in self._paths for place in (path, *path.parents) if place.is_dir()}
         base = root.parent if root.is_file() else root
-        tables = {file for folder in folders if folder.is_relative_to(base) for file in folder.glob(f"{begins}*.csv")}
+        places = {place for path in self._paths for place in (path, *path.parents) if place.is_relative_to(base)}
+        tables = {file for place in places if place.is_dir() for file in place.glob(f"{glob.escape(begins)}*.csv")}
         read = {speeds_file(path) for path in self._paths}
         problems += [
             f"{file} is not read: the speeds of a folder of frames are expected in it as {SPEEDS}, and those of "
