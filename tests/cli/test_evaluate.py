@@ -73,7 +73,7 @@ def test_a_run_on_the_data_set_of_a_plugin_names_it(tool: Tool, smoke_run: Path,
 
 def test_without_a_run_the_default_data_are_named(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
     shutil.copy(smoke_run / "checkpoints" / "best.ckpt", tmp_path / "alone.ckpt")
-    few = ("data.width=96", "data.frames_per_drive=3", "data.train_drives=1")
+    few = ("data.frames_per_drive=3", "data.train_drives=1", "baselines=false")
     outcome = tool("evaluate", "alone.ckpt", *few, "output_dir=out")
     assert "data: rendered streets, data=synthetic; to score on others, give data=..." in outcome.out
     shutil.copy(smoke_run / "run.json", tmp_path)  # of the folder that the command happens to stand in

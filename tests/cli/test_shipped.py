@@ -70,7 +70,7 @@ def test_listing_needs_no_network_code() -> None:
     assert done.stdout.splitlines() == [str(locate.shipped()), "False"]
 
 
-def test_own_clips_and_paths_without_a_pose_network(tool: Tool, tmp_path: Path) -> None:
+def test_own_clips_and_paths_without_a_pose_network(tool: Tool, smoke_run: Path, tmp_path: Path) -> None:
     """The motion is that of tracked points, and runs are compared with what `street` gives."""
     drive = SyntheticDrive(seed=8, frames=8, height=120, width=400)
     (tmp_path / "clips" / "a").mkdir(parents=True)
@@ -87,6 +87,15 @@ def test_own_clips_and_paths_without_a_pose_network(tool: Tool, tmp_path: Path) 
     assert view["warped"] < 0.5 * view["unwarped"]
     assert view["explained"] > 0.8
     assert results["settings"]["motion"] == "tracked"
+    assert results["settings"]["size"] == [128, 416]
+    smaller = ("data.val_clips=[]", "motion=tracked", "compare=before", "output_dir=smaller")
+    outcome = tool("evaluate", str(smoke_run), *common, *smaller)
+    assert outcome.code == 0, outcome.err
+    assert "before was scored at 128x416 (height x width) and this model at 64x96" in outcome.out
+    tool("evaluate", "street", *common, "size=96x320", "output_dir=other").says(
+        "data.height is 96 and data.width is 320", "street takes images of 128x416", "leave the size out"
+    )
+    tool("odometry", "street", *common, "data.width=320", "output_dir=other").says("data.width is 320", "128x416")
     outcome = tool("odometry", "street", *common, "output_dir=path", "figure=false")
     assert outcome.code == 0, outcome.err
     assert "motion: from tracked points" in outcome.out

@@ -145,6 +145,23 @@ def test_files(tmp_path):
     assert math.isnan(rows[3].errors[0])
 
 
+def test_the_means_without_ground_truth_are_in_the_table_too(tmp_path):
+    about = ("model", "campus")
+    rows = (ViewRow(*about, "d 0", "day", 0.1, 0.2, 0.5, 1.0), ViewRow(*about, "d 1", "night", 1.1, 0.2, 0.5, 1.0))
+    rules = (*result().protocols, protocol("campus"))
+    for scored in (False, True):
+        found = result() if scored else EvaluationResult((), ("model",), ())
+        found = dataclasses.replace(found, protocols=rules, views=rows)
+        with write_results(found, tmp_path)["metrics.csv"].open(newline="") as file:
+            reader = csv.DictReader(file)
+            table = [row for row in reader if row["protocol"] == "campus"]
+        assert [row["condition"] for row in table] == ["day", "night", "all"]
+        assert [float(row["warped"]) for row in table] == pytest.approx([0.1, 1.1, 0.6])
+        assert [row["images"] for row in table] == ["1", "1", "2"]
+        assert list(reader.fieldnames)[:2] == ["predictor", "protocol"]
+        assert ("abs_rel" in reader.fieldnames) is scored
+
+
 def test_json_has_no_nan():
     blank = EvaluationResult((protocol("metric"),), ("m",), (ImageRow("m", "metric", "a", 0, math.nan, NAN),))
     assert json.loads(json.dumps(as_json(blank), allow_nan=False))["results"][0]["abs_rel"] is None

@@ -297,7 +297,7 @@ def _two(tmp_path: Path) -> list[Path]:
     return [make_run(tmp_path / name, beta=beta, status="finished") for name, beta in (("a", 0.1), ("b", 0.2))]
 
 
-def _explained(folder: Path, warped: float, images: int = 6, **more: str) -> Path:
+def _explained(folder: Path, warped: float, images: int = 6, **more: object) -> Path:
     """Write an evaluation of clips without ground truth."""
     rows = tuple(
         ViewRow("model", "campus", f"seq {index:06d}", "seq", warped + 0.01 * index, 0.3, 0.8, 0.9)
@@ -339,6 +339,23 @@ def test_a_model_without_a_pose_network_is_compared_and_the_motion_of_both_is_sa
     assert text.count("6 images, paired") == 1
     assert re.search(r"warped ↓ 0\.1250 0\.2250 \+0\.1000", text)
     assert "to compare depth alone" not in text
+
+
+def test_runs_scored_at_other_sizes_are_said_not_to_be_comparable(tmp_path: Path) -> None:
+    one, two = _two(tmp_path)
+    _explained(one / "test", 0.1, size=[96, 320])
+    _explained(two / "test", 0.2, size=[128, 416])
+    text = " ".join(_compared(one, two).split())
+    assert "a was scored at 96x320 (height x width) and b at 128x416" in text
+    assert "not comparable; compare models trained at one size, such as size=96x320" in text
+    assert "images of 96x320, protocol campus" in text  # two groups among the conditions
+    assert "images of 128x416, protocol campus" in text
+    street = _explained(tmp_path / "before", 0.2, size=[128, 416], checkpoint="street")
+    assert "such as size=128x416" in " ".join(_compared(one, street).split())  # the shipped model's cannot be changed
+    _explained(one / "test", 0.1)  # an older evaluation, of a run whose settings say 32x64
+    assert "a was scored at 32x64 (height x width) and b at 128x416" in " ".join(_compared(one, two).split())
+    _explained(two / "test", 0.2, size=[32, 64])
+    assert "not comparable" not in _compared(one, two)
 
 
 def test_what_is_not_compared_names_the_commands_after_which_it_is(

@@ -287,6 +287,8 @@ def call(name: str, composed: Composed, table: Table) -> tuple[int, object]:
     with _ended_at_once(name):
         made, called = map(imported, TOOLS[name].paths())
     options = compose.options(made, composed, table)
+    if name in ("evaluate", "odometry"):
+        compose.check_size(composed, options)
     record = {"choices": composed.choices, "overrides": composed.overrides, "describe": sentence}
     wanted = inspect.signature(called).parameters
     quiet()

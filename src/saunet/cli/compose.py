@@ -50,6 +50,7 @@ PATHS = ("checkpoint", "folder", "init_from", "input", "output", "output_dir", "
 """Options that name files or folders."""
 _OF_TRAINING = ("height", "width", "track_motion", "with_speed", "flip_prob", "color_jitter_prob", "crop_margin")
 """Settings of data that evaluation does not take over from a training; the size is that of the checkpoint."""
+_SIZE = ("data.height", "data.width")
 OF_SPLITS = {
     f"data.{key}"
     for key in (
@@ -313,6 +314,30 @@ def options(cls: Callable[..., T], composed: Composed, table: Table) -> T:
             found = of_run(folder, names)
             given[key] = given[key] if found == folder else str(found)
     return _build(cls, given, composed.choices, "")
+
+
+def check_size(composed: Composed, options: object) -> None:
+    """Refuse an image size on a command line that scores a model of another size: images are read at the model's.
+
+    Raises:
+        ConfigError: if the sizes differ.
+        CheckpointError: if the model cannot be read.
+    """
+    given = [key for key in _SIZE if key in parsed(composed.overrides)]
+    checkpoint, data = getattr(options, "checkpoint", None), composed.config.get("data")
+    if not given or checkpoint is None or not isinstance(data, Mapping):
+        return
+    from saunet.prediction.prediction import load
+
+    model = load(checkpoint, foreign=getattr(options, "foreign", None))
+    own = {"data.height": model.height, "data.width": model.width}
+    asked = {key: data[key.removeprefix("data.")] for key in given}
+    if any(asked[key] != own[key] for key in given):
+        told = " and ".join(f"{key} is {value}" for key, value in asked.items())
+        raise ConfigError(
+            f"{told}, but {composed.config['checkpoint']} takes images of {model.height}x{model.width} "
+            "(height x width) and is scored at that size; leave the size out, or train a model of the wanted size"
+        )
 
 
 def _check(given: Mapping[str, object], prefix: str, table: Table) -> None:

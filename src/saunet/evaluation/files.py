@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from saunet.errors import DataError
 from saunet.evaluation.result import EvaluationResult
-from saunet.evaluation.rows import BucketRow, Difference, ImageRow, ShapeRow, Spread, Summary, ViewRow
+from saunet.evaluation.rows import BucketRow, Difference, ImageRow, ShapeRow, Spread, Summary, ViewRow, ViewSummary
 from saunet.io.atomic import write_bytes, write_json
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.tables import csv_text
@@ -30,12 +30,7 @@ def write_results(result: EvaluationResult, folder: Path) -> dict[str, Path]:
     The rest of the result goes to ``buckets.csv``, ``shapes.csv`` and ``views.csv`` (one image per line) and
     ``comparison.csv``.
     """
-    summaries = [_summary(summary, result.spreads) for summary in result.summaries()]
-    header = [*_names(Summary), *(f"{name}_{end}" for end in ("low", "high") for name in ERROR_NAMES)]
-    texts = {
-        "per_image.csv": _csv(ImageRow, result.rows),
-        "metrics.csv": csv_text(header, ([row.get(name) for name in header] for row in summaries)),
-    }
+    texts = {"per_image.csv": _csv(ImageRow, result.rows), "metrics.csv": _means(result)}
     if result.buckets:
         texts["buckets.csv"] = _csv(BucketRow, result.buckets)
     if result.shapes:
@@ -78,6 +73,13 @@ def as_json(result: EvaluationResult) -> dict[str, object]:
     }
     plain: dict[str, object] = without_nan(content | {key: value for key, value in rest.items() if value})
     return plain
+
+
+def image_size(settings: object) -> tuple[int, int] | None:
+    """Return the height and width that an evaluation recorded in its settings; None if it did not."""
+    size = settings.get("size") if isinstance(settings, Mapping) else None
+    known = isinstance(size, Sequence) and len(size) == 2 and all(isinstance(each, int) for each in size)
+    return (size[0], size[1]) if known else None
 
 
 def read_rows(path: Path) -> tuple[ImageRow | ViewRow, ...]:
@@ -136,6 +138,17 @@ def _plain(row: Any) -> dict[str, Any]:
 
 def _csv(kind: type, rows: Iterable[Any]) -> str:
     return csv_text(_names(kind), (tuple(_plain(row).values()) for row in rows))
+
+
+def _means(result: EvaluationResult) -> str:
+    """Return the means as CSV: with ground truth, without it, or both, each with the columns that it has."""
+    summaries = [_summary(summary, result.spreads) for summary in result.summaries()]
+    views = [_plain(view) for view in result.view_summaries()]
+    header = ["predictor", "protocol"]
+    if summaries:
+        header += [*_names(Summary), *(f"{name}_{end}" for end in ("low", "high") for name in ERROR_NAMES)]
+    header = list(dict.fromkeys([*header, *(_names(ViewSummary) if views else ())]))
+    return csv_text(header, ([row.get(name) for name in header] for row in (*summaries, *views)))
 
 
 def _summary(summary: Summary, spreads: Sequence[Spread]) -> dict[str, object]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
 from saunet.metrics.functional import ERROR_HEADINGS, ERROR_NAMES
@@ -204,6 +205,15 @@ class Comparison:
         title = f"{self.protocol}: '{self.second}' minus '{self.first}'"
         told = f"{self.images} images, paired; {interval(self)}"
         return Table("comparison", title, headings, tuple(rows), (*notes, told))
+
+
+def sizes_told(first: str, one: Sequence[int], second: str, two: Sequence[int]) -> str:
+    """Return a sentence about two evaluations without ground truth on images of different sizes, height x width."""
+    sizes = [f"{height}x{width}" for height, width in (one, two)]
+    return (
+        f"{first} was scored at {sizes[0]} (height x width) and {second} at {sizes[1]}, and photometric errors depend "
+        f"on the image size, so they are not comparable; compare models trained at one size, such as size={sizes[0]}"
+    )
 
 
 def interval(of: Spread | Comparison) -> str:

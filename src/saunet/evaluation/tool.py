@@ -19,7 +19,7 @@ from saunet.data.loading.module import surroundings
 from saunet.data.loading.stored import cache_truths
 from saunet.data.loading.windows import measured_distance, recording_of, tracked_poses
 from saunet.errors import ConfigError, DataError, checked, one_of, usable_device
-from saunet.evaluation.files import read_rows, write_results
+from saunet.evaluation.files import image_size, read_rows, write_results
 from saunet.evaluation.predictors import (
     ExportingPredictor,
     FilePredictor,
@@ -30,6 +30,7 @@ from saunet.evaluation.predictors import (
     existing,
 )
 from saunet.evaluation.result import EvaluationResult
+from saunet.evaluation.rows import sizes_told
 from saunet.evaluation.scoring import Buckets, Shapes, score, score_views
 from saunet.evaluation.statistics import with_statistics
 from saunet.evaluation.team import Team, joined
@@ -43,6 +44,7 @@ from saunet.models.depth import DepthNet
 from saunet.prediction.foreign import NOTHING, ForeignOptions, ForeignPredictor, is_foreign
 from saunet.prediction.prediction import load
 from saunet.registry import Spec
+from saunet.runs.folder import read_mapping
 from saunet.runs.record import Intrinsics, ModelRecord
 from saunet.scale.estimate import MetricDepth, MetricMotion, estimate_scale, keep_scale
 from saunet.scale.options import MOTIONS, ScaleOptions
@@ -206,6 +208,7 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         model = NetworkPredictor(PredictorNetwork(loaded))
         about = {key: value for key, value in asdict(options.foreign).items() if value is not None}
         settings |= {"checkpoint": str(options.checkpoint), **({"foreign": about} if options.foreign.given else {})}
+        settings["size"] = [loaded.height, loaded.width]
     elif options.checkpoint is not None:
         checkpoint = read_model(options.checkpoint)
         networks, found = checkpoint.networks(), checkpoint.record.intrinsics
@@ -216,6 +219,7 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
         depth, pose, scale = _scaled(options, checkpoint.record, networks, passes[0][0], device, first, store_in)
         model = NetworkPredictor(depth, options.flip)
         settings |= {"checkpoint": str(options.checkpoint), "scale": scale}
+        settings["size"] = [checkpoint.record.height, checkpoint.record.width]
     else:
         passes = _passes(options, options.data.changed(batch_size=1), motion=False)  # files may differ in size
         existing(Path(str(options.predictions)))
@@ -227,9 +231,20 @@ def evaluate_with(options: EvaluateOptions, team: Team) -> EvaluationResult:
     if folder is not None and earlier is not None and first:
         write_results(result, folder)  # so that an evaluation that cannot be compared is not lost
     result = with_statistics(result, options.intervals, earlier, options.compare)
+    without_truth = {view.protocol for view in result.views}
+    if options.compare and any(each.protocol in without_truth for each in result.comparisons):
+        result = replace(result, notes=(*result.notes, *_sizes_apart(Path(options.compare), settings)))
     if folder is not None and first:
         write_results(result, folder)
     return result
+
+
+def _sizes_apart(earlier: Path, settings: Mapping[str, object]) -> list[str]:
+    """Return a note if an earlier evaluation without ground truth was of images of another size."""
+    folder = earlier if earlier.is_dir() else earlier.parent
+    before = image_size(read_mapping(folder / "metrics.json").get("settings"))
+    now = image_size(settings)
+    return [sizes_told(str(earlier), before, "this model", now)] if before and now and before != now else []
 
 
 def runs_alone(options: EvaluateOptions) -> bool:

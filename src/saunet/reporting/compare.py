@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from saunet.errors import ConfigError, DataError
-from saunet.evaluation.files import read_rows
-from saunet.evaluation.rows import COMPARED, ERROR_COLUMNS, ImageRow, ViewRow
+from saunet.evaluation.files import image_size, read_rows
+from saunet.evaluation.rows import COMPARED, ERROR_COLUMNS, ImageRow, ViewRow, sizes_told
 from saunet.evaluation.statistics import compare as paired
 from saunet.reporting.inputs import Evaluation, Inputs, read_evaluation
 from saunet.reporting.tables import Groups, explained_table, health_tables, losses_table
@@ -22,7 +22,8 @@ from saunet.weights.locate import is_shipped
 
 _EACH_PAIR = 4
 """Up to this many runs, all pairs are compared; of more, each with the first."""
-_OF_TRAINING = ("height", "width", "offsets", "batch_size", "workers", "crop_margin", "flip_prob", "color_jitter_prob")
+_SIZE = ("height", "width")
+_OF_TRAINING = (*_SIZE, "offsets", "batch_size", "workers", "crop_margin", "flip_prob", "color_jitter_prob")
 """Data settings that an evaluation takes from the checkpoint, or ignores."""
 
 
@@ -99,7 +100,7 @@ def comparisons(runs: Mapping[str, Run]) -> tuple[list[Table], list[str], Pairs]
             try:
                 for one, two in alike or pairs:
                     comparison = paired(one.rows, two.rows, names=(first, other))
-                    sizes = _sizes(runs[first], runs[other], one)
+                    sizes = _sizes({first: (runs[first], one), other: (runs[other], two)})
                     told = _told(one.of, two.of, first, other)
                     tables.append(comparison.table(told, *_motions(one.of, two.of, first, other), *sizes))
                     compared[protocol, told] |= {first: one, other: two}
@@ -158,15 +159,17 @@ def _motions(one: Evaluation, two: Evaluation, *names: str) -> list[str]:
     return [f"{names[0]} with {ways[0]}, {names[1]} with {ways[1]}; use motion=tracked for both to compare depth alone"]
 
 
-def _sizes(first: Run, other: Run, scored: Scored) -> list[str]:
-    """Return a note if two runs use images of different sizes: photometric errors depend on them."""
-    data = [run.config.get("data") or {} for run in (first, other)]
-    sizes = [f"{each['height']}x{each['width']}" for each in data if each.get("height") and each.get("width")]
-    if len(set(sizes)) < 2 or not isinstance(scored.rows[0], ViewRow):
-        return []
-    return [
-        f"the runs use images of different sizes, {sizes[0]} and {sizes[1]}, so these errors are about different pixels"
-    ]
+def _sizes(both: Mapping[str, tuple[Run, Scored]]) -> list[str]:
+    """Return a note if two runs were scored on images of different sizes: photometric errors depend on them."""
+    found = []
+    for name, (run, scored) in both.items():
+        size = scored.of.size or image_size({"size": [(run.config.get("data") or {}).get(k) for k in _SIZE]})
+        if size is None or not isinstance(scored.rows[0], ViewRow):
+            return []
+        found.append((name, size, is_shipped(run.path)))
+    found.sort(key=lambda each: not each[2])  # the size of a shipped model cannot be changed, so it is the one advised
+    (first, one, _), (second, two, _) = found
+    return [sizes_told(first, one, second, two)] if one != two else []
 
 
 def _apart(ours: Sequence[Scored], theirs: Sequence[Scored]) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from saunet.errors import CheckpointError, DataError
+from saunet.evaluation.files import image_size
 from saunet.io.plain import read_torch
 from saunet.metrics.functional import ERROR_NAMES
 from saunet.runs.folder import Status, began, read_mapping
@@ -191,6 +192,8 @@ class Evaluation:
     """Settings that change the numbers, as on the command line; empty for none."""
     motion: str
     """``motion=tracked`` if the camera's motion came from tracked points, else empty."""
+    size: tuple[int, int] | None
+    """Height and width that images were scored at; None if not recorded, as for another system's predictions."""
     scores: tuple[Score, ...]
     explained: tuple[Explained, ...]
     details: tuple[Detail, ...]
@@ -228,6 +231,7 @@ def read_evaluation(folder: Path) -> Evaluation:
     place = f"{data}, {config.get('split') or settings.get('split') or 'test'} split"
     how, images = _how(settings), content.get("images") or {}
     motion = "motion=tracked" if settings.get("motion") == "tracked" else ""
+    size = image_size(settings)
     rows = [row for row in content.get("results", []) if all(isinstance(row.get(k), int | float) for k in ERROR_NAMES)]
 
     def common(row: Mapping[str, Any], told: str = how) -> dict[str, Any]:
@@ -239,8 +243,9 @@ def read_evaluation(folder: Path) -> Evaluation:
         for row in rows
     )
     keys = ("condition", "images", "warped", "unwarped", "explained")
+    seen_at = f"images of {size[0]}x{size[1]}" if size else ""  # photometric errors depend on it
     explained = tuple(
-        Explained(**{key: row[key] for key in keys}, **common(row, ", ".join(filter(None, (how, motion)))))
+        Explained(**{key: row[key] for key in keys}, **common(row, ", ".join(filter(None, (how, motion, seen_at)))))
         for row in content.get("views", [])
         if row.get("predictor") == "model" and all(row.get(key) is not None for key in keys)
     )
@@ -251,7 +256,7 @@ def read_evaluation(folder: Path) -> Evaluation:
         if row.get("predictor") in ("model", "predictions") and row.get("group", "edges") in ("distance", "edges")
     )
     named = str(predictions) if predictions else None
-    return Evaluation(folder, checkpoint, named, place, how, motion, scores, explained, details)
+    return Evaluation(folder, checkpoint, named, place, how, motion, size, scores, explained, details)
 
 
 def _cell(value: Any) -> str | float | int | None:
