@@ -9,7 +9,7 @@ from made_runs import make_run
 
 from saunet.reporting.inputs import collect
 from saunet.runs.run import read_run
-from saunet.runs.sweep import differing, labels, ratio, sweeps_ratio, values, write_plan
+from saunet.runs.sweep import differing, labels, ratio, sweeps_ratio, typed_names, values, write_plan
 
 
 def test_a_component_of_another_name_is_one_difference(tmp_path: Path) -> None:
@@ -61,6 +61,18 @@ def test_a_job_that_left_nothing_is_named_by_its_plan(sweep: Path) -> None:
     write_plan(sweep, planned)
     (found,) = collect([sweep]).sweeps
     assert labels([found.runs])[0][-1] == "beta = 0.01"
+
+
+def test_jobs_named_one_by_one_go_by_what_was_swept(sweep: Path) -> None:
+    jobs = [read_run(sweep / name) for name in ("0", "1")]
+    assert not any(job.swept for job in jobs)  # their Hydra does not say that it ran several
+    for name in ("0", "1"):
+        file = sweep / name / ".hydra" / "hydra.yaml"
+        file.write_text(file.read_text() + "  mode: MULTIRUN\n")
+    jobs = [read_run(sweep / name) for name in ("0", "1")]
+    whole = [run for run in collect([sweep]).sweeps[0].runs if run.path in {job.path for job in jobs}]
+    assert typed_names(jobs) == typed_names(whole) == labels([whole])[0]
+    assert typed_names(jobs[:1]) == [f"{sweep.name}/0"]
 
 
 def test_no_ratio_without_a_gradient_term(tmp_path: Path) -> None:

@@ -163,7 +163,7 @@ def _read_sweep(folder: Path, checkpoint: str) -> Sweep:
         overrides = split_overrides(planned[number]) if number < len(planned) else {}
         status: Status = "unfinished" if running and number > last else "failed"
         why = {"unfinished": "it is not started yet", "failed": "it left no folder: it failed before it began"}[status]
-        found[number] = Run(folder / str(number), status, why, str(number), overrides=overrides, job=number)
+        found[number] = Run(folder / str(number), status, why, str(number), overrides=overrides, job=number, swept=True)
     runs = tuple(found[number] for number in sorted(found))
     name = read_mapping(folder / "multirun.yaml").get("name")
     return Sweep(str(name or next((run.name for run in runs if run.config), folder.name)), runs)

@@ -100,12 +100,14 @@ class Run:
     evaluations: tuple[Path, ...] = ()
     """Folders of the evaluations that the scores come from."""
     job: int | None = None
-    """Its number in a sweep."""
+    """Its number in a sweep that was read as a whole."""
+    swept: bool = False
+    """It is a job of a sweep, even if it was read by itself."""
 
     @property
     def called(self) -> str:
         """What a person calls it: its folder's name, unless that is a date or a job's number; else its experiment's."""
-        unnamed = self.job is not None or re.match(r"\d{4}-\d\d-\d\d_", self.path.name)
+        unnamed = self.swept or re.match(r"\d{4}-\d\d-\d\d_", self.path.name)
         return self.path.name if self.config and not unnamed else self.name
 
     @property
@@ -150,6 +152,7 @@ def read_run(folder: Path, checkpoint: str = "best", job: int | None = None) -> 
         checkpoint=next((file for file in files if file.is_file()), None),
         scores=(score,) if score else (),
         job=job,
+        swept=job is not None or hydra.get("mode") == "MULTIRUN",
     )
 
 

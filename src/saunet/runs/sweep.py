@@ -83,9 +83,11 @@ def sweeps_ratio(runs: Sequence[Run]) -> bool:
 
 def typed_names(runs: Sequence[Run]) -> list[str]:
     """Return a name for every run by which whoever named its folder knows it: the folder; a sweep's job by settings."""
-    singles = [run for run in runs if run.job is None]
+    several = sum(run.swept for run in runs) > 1  # a job alone has no other that it differs from
+    jobs = [run for run in runs if run.swept and several]
+    singles = [run for run in runs if not (run.swept and several)]
     ends = dict(zip([run.path for run in singles], _ends([run.path for run in singles]), strict=True))
-    jobs = [run for run in runs if run.job is not None]
+    ends |= {run.path: "/".join(run.path.parts[-2:]) for run in singles if run.swept and ends[run.path].isdecimal()}
     settled = dict(zip([run.path for run in jobs], labels([jobs])[0], strict=True))
     return [settled[run.path] if run.path in settled else ends[run.path] if run.config else run.name for run in runs]
 
@@ -128,9 +130,9 @@ def _labels(runs: Sequence[Run]) -> list[str]:
     ratios = [ratio(run) for run in runs]
     if sweeps_ratio(runs) and None not in ratios:
         return [f"{RATIO} = {value:.4g}" for value in ratios]
-    keys = differing(runs, by_overrides=all(run.job is not None for run in runs))
+    keys = differing(runs, by_overrides=all(run.swept for run in runs))
     named = [_label(run, keys) for run in runs]
-    single = any(run.job is None for run in runs)
+    single = any(not run.swept for run in runs)
     if single and max(map(len, named), default=0) > _LONGEST_LABEL:
         return [run.called for run in runs]
     return named
