@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 import tiny
 
 from saunet.training.callbacks import Progress
+from saunet.training.loop import EpochLoop
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -43,6 +45,21 @@ def test_without_a_terminal_lines_say_where_the_training_is(
     assert any(line.startswith("epoch 1/2, step 3, loss ") and "val/abs_rel" in line for line in rows)
     assert lines[-1].startswith("epoch 2/2, step 6, loss ")
     assert lines[-1].endswith("time left 0:00:00")
+
+
+@pytest.mark.parametrize("limits", [{"max_epochs": 2}, {"max_epochs": -1, "max_steps": 5}])
+def test_every_step_has_one_line_and_the_last_of_an_epoch_the_new_validation(
+    limits: dict[str, int], tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    monkeypatch.setattr("saunet.training.callbacks.EVERY", 0.0)
+    trainer = tiny.tiny_trainer(tmp_path, **limits, callbacks=[Progress()], enable_progress_bar=True)
+    with caplog.at_level("INFO"):
+        EpochLoop.install(trainer).fit(tiny.tiny_model(), tiny.tiny_walls())
+    lines = [record.getMessage() for record in caplog.records if record.getMessage().startswith("epoch ")]
+    steps = [int(re.findall(r"step (\d+)", line)[0]) for line in lines]
+    assert steps == list(range(1, limits.get("max_steps", 6) + 1))
+    assert f"val/loss {float(trainer.callback_metrics['val/loss']):.4f}" in lines[-1]
 
 
 def test_the_time_left_ends_with_the_last_step(

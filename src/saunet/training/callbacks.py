@@ -273,7 +273,10 @@ class Progress(TQDMProgressBar):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
-        if self._lines and time.monotonic() - self._said >= EVERY:
+        stops = trainer.should_stop and trainer.fit_loop._can_stop_early
+        last = stops or trainer.is_last_batch or 0 <= trainer.max_steps <= trainer.global_step
+        # The last step of an epoch has its line afterwards, with the new validation.
+        if self._lines and not last and time.monotonic() - self._said >= EVERY:
             rank_zero_info(self._line(trainer))
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
