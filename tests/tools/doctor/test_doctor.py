@@ -17,12 +17,13 @@ from saunet.data.loading.module import DepthDataModule
 from saunet.data.loading.selecting import read_manifest, write_manifest
 from saunet.data.loading.stored import CacheSettings
 from saunet.data.loading.windows import Selection
+from saunet.data.video.focal import FocalEstimate
 from saunet.errors import ConfigError
 from saunet.io.video import VideoReader
 from saunet.registry import datamodules
 from saunet.tools.doctor.findings import diagnose, manifest_of
 from saunet.tools.doctor.sheet import draw_sheet
-from saunet.tools.doctor.survey import Survey, Timeline, survey
+from saunet.tools.doctor.survey import CameraFacts, Survey, Timeline, survey
 from saunet.tools.prepare.cache import build_cache
 from saunet.tools.prepare.tool import kitti_recordings
 
@@ -41,6 +42,27 @@ def look(data, **options):
     found = survey(data, **options)
     findings = diagnose(found)
     return found, findings, "\n".join(map(str, findings))
+
+
+@pytest.mark.parametrize(
+    ("given", "told", "agreement"),
+    [
+        ((0.9,), None, "from the turns of 1 of 1 drives; K agrees with it there"),
+        ((1.08,), "'d0': K's focal length is 20% too long: it is 108.0 pixels, and", "K contradicts it there"),
+        ((0.72,), "'d0': K's focal length is 20% too short: it is 72.0 pixels", "K contradicts it there"),
+        ((0.9, 0.9), None, "from the turns of 2 of 2 drives; K agrees with it in all of them"),
+        ((0.9, 1.08, 0.9), "'d1': K's focal length is 20% too long", "agrees with it in 2 and contradicts it in 1"),
+    ],
+)
+def test_a_focal_length_is_compared_with_that_of_the_turns(given, told, agreement):
+    estimate = FocalEstimate(0.9, 0.007, 5)
+    K = np.array([[100.0, 0, 49.5], [0, 100.0, 29.5], [0, 0, 1]])
+    cameras = [CameraFacts(f"d{i}", K, (60, 100), 10.0, None, focal, estimate) for i, focal in enumerate(given)]
+    findings = [str(each) for each in diagnose(Survey(cameras=cameras))]
+    assert any(agreement in each for each in findings), findings
+    wrong = [each for each in findings if "too long" in each or "too short" in each]
+    assert bool(wrong) == (told is not None)
+    assert all(told in each and "turns in the pictures give 90.0, known to within 0.7%" in each for each in wrong)
 
 
 def test_a_good_clip_is_described_and_drawn(tmp_path):

@@ -169,7 +169,7 @@ class FocalEstimate:
     @property
     def assumed(self) -> str:
         """The assumptions to report with the estimate."""
-        bent = f"lens: division model, {self.distortion:.3f}" if self.bend else "no distortion found"
+        bent = f"distortion {self.distortion:.3f} in the division model" if self.bend else "no distortion found"
         if self.bend is None:
             bent = "distortion was not checked, and would make it too long"
         elsewhere = f"center {self.right:+.1%} of the width to the right of and {self.down:+.1%} below the middle"

@@ -189,7 +189,8 @@ def calibrate(
     known = f"fx {K[0, 0]:.2f}, fy {K[1, 1]:.2f}, cx {K[0, 2]:.2f}, cy {K[1, 2]:.2f}"
     files = f"camera: {output}" + (f" and {exported}" if exported else "")
     if result is None:
-        return CalibrateResult(output, f"{note}: {camera.model}, {known}\n{files}")
+        model = f"{camera.model}, " if options.video is None else ""  # the note has it
+        return CalibrateResult(output, f"{note}: {model}{known}\n{files}")
     picture = output.with_name(f"{output.stem}_check.png")
     write_image(picture, check_picture(replace(result, camera=camera)))
     lines = [

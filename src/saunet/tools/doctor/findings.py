@@ -132,10 +132,8 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
     known = [camera for camera in survey.cameras if camera.estimate is not None and camera.estimate.tells]
     looked, cameras = survey.focals
     if known:
-        agree = sum(not each.estimate.contradicts(each.recorded) for each in known if each.estimate)
-        told = f"the focal length was estimated from turns for {len(known)} of {len(survey.cameras)} drives"
-        text = f"{told}, which agrees with K in {agree}"
-        yield Finding("note", text)
+        told = f"the focal length could be estimated from the turns of {len(known)} of {len(survey.cameras)} drives"
+        yield Finding("note", f"{told}; {_agreement(known)}")
     elif survey.cameras:
         unknown = (
             "the focal length cannot be estimated from any examined drive (that needs turns, and the right lens model)"
@@ -155,6 +153,17 @@ def _cameras(survey: Survey) -> Iterator[Finding]:
         yield Finding("note", f"camera height {listed} m: depth can be made metric")
 
 
+def _agreement(known: Sequence[CameraFacts]) -> str:
+    """Return in how many drives K agrees with the estimated focal length."""
+    wrong = sum(camera.estimate.contradicts(camera.recorded) for camera in known if camera.estimate)
+    everywhere = "in all of them" if len(known) > 1 else "there"
+    if wrong == 0:
+        return f"K agrees with it {everywhere}"
+    if wrong == len(known):
+        return f"K contradicts it {everywhere}"
+    return f"K agrees with it in {len(known) - wrong} and contradicts it in {wrong}"
+
+
 def _camera(camera: CameraFacts) -> Iterator[Finding]:
     (height, width), K = camera.size, camera.K
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -166,11 +175,11 @@ def _camera(camera: CameraFacts) -> Iterator[Finding]:
         yield Finding("warning", f"{told}: the focal lengths differ", "were images stretched after calibration?")
     found = camera.estimate
     if found is not None and found.contradicts(camera.recorded):
-        given = camera.recorded * width
+        given, off = camera.recorded * width, camera.recorded / found.focal - 1
         text = (
-            f"'{camera.drive}': the given focal length, {given:.1f} pixels, contradicts the pictures: their turns "
-            f"give {found.focal * width:.1f}, {found.focal / camera.recorded:.2f} times the given one, known to "
-            f"within {found.uncertainty:.1%} (both before any undistortion, as in camera.yaml)"
+            f"'{camera.drive}': K's focal length is {abs(off):.0%} too {'long' if off > 0 else 'short'}: it is "
+            f"{given:.1f} pixels, and the turns in the pictures give {found.focal * width:.1f}, known to within "
+            f"{found.uncertainty:.1%} (both before any undistortion, as in camera.yaml)"
         )
         fix = (
             "give the K and the distortion of this camera in this mode, calibrate it (saunet calibrate with a "
