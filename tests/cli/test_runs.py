@@ -176,9 +176,11 @@ def test_resume_and_warm_start_on_the_command_line(tool: Tool, smoke_run: Path, 
     assert "starting from" in outcome.out
     outcome = tool("resume", "warm", "trainer.max_epochs=2")  # whose experiment may have set init_from
     assert outcome.code == 0, outcome.err
-    outcome = tool("train", *again, f"init_from={last}", "resume=warm/checkpoints/last.ckpt", "output_dir=warm")
+    assert "init_from" not in outcome.out + outcome.err  # it is what the run started from
+    other = last.with_name("best.ckpt")
+    outcome = tool("train", *again, f"init_from={other}", "resume=warm/checkpoints/last.ckpt", "output_dir=warm")
     assert outcome.code == 0, outcome.err
-    assert f"init_from={last} is not used" in outcome.out + outcome.err
+    assert f"init_from={other} is not used" in outcome.out + outcome.err
     kept = (tmp_path / "warm" / "train.log").read_text()
     assert [kept.count(f" INFO {words}") for words in ("starting from", "resuming from", "results: ")] == [1, 2, 3]
 

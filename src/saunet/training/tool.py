@@ -27,7 +27,7 @@ from saunet.metrics.protocols import protocol
 from saunet.models.systems import ModelOptions
 from saunet.registry import Spec
 from saunet.runs.checkpoint import build_networks, read_checkpoint
-from saunet.runs.folder import Describe, locked, recording
+from saunet.runs.folder import Describe, locked, read, recording
 from saunet.runs.record import ModelRecord, Scale
 from saunet.training.callbacks import AtomicCheckpointIO, BestCheckpoint
 from saunet.training.intrinsics import focal_lengths
@@ -37,6 +37,7 @@ from saunet.training.optim import Recipe
 from saunet.training.resume import check_resume, check_unused, keep_rows, resume_path, validation_due, warm_start
 from saunet.training.speed import Speed
 from saunet.training.stopping import way_on
+from saunet.weights.locate import run_of
 
 PRECISIONS = ("32-true", "32", "16-mixed", "16", "bf16-mixed", "bf16")
 """Allowed precisions; images and losses stay in float32."""
@@ -233,7 +234,7 @@ def train(
     if not (options.resume or options.overwrite):
         check_unused(folder)
     resume = resume_path(options.resume, folder)
-    if resume and options.init_from:  # of an experiment, perhaps
+    if resume and options.init_from and options.init_from != _started_from(Path(resume)):
         rank_zero_info(f"init_from={options.init_from} is not used: a resumed training has its own weights")
     checkpoint = read_checkpoint(resume) if resume else None  # before the data are set up, which takes time
     seed_everything(options.seed, workers=True, verbose=False)
@@ -310,6 +311,12 @@ def train(
     best = next((Path(each.best_model_path) for each in kept if each.best_model_path), None)
     cost = next((each.cost for each in kept if each.cost is not None), None)
     return TrainResult(folder=folder, best=best, cost=cost, data=data, model=model)
+
+
+def _started_from(checkpoint: Path) -> str | None:
+    """Return the ``init_from`` of the run that a checkpoint belongs to; None if it had none."""
+    folder = run_of(checkpoint)
+    return (read(folder).get("config") or {}).get("init_from") if folder is not None else None
 
 
 def _ended_early(trainer: Trainer) -> str:
