@@ -78,8 +78,9 @@ def as_json(result: EvaluationResult) -> dict[str, object]:
 def image_size(settings: object) -> tuple[int, int] | None:
     """Return the height and width that an evaluation recorded in its settings; None if it did not."""
     size = settings.get("size") if isinstance(settings, Mapping) else None
-    known = isinstance(size, Sequence) and len(size) == 2 and all(isinstance(each, int) for each in size)
-    return (size[0], size[1]) if known else None
+    if isinstance(size, Sequence) and len(size) == 2 and all(isinstance(each, int) for each in size):
+        return size[0], size[1]
+    return None
 
 
 def read_rows(path: Path) -> tuple[ImageRow | ViewRow, ...]:
