@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 
 import saunet
+from saunet.cli import compose
+from saunet.cli.table import TOOLS, read
 from saunet.data.drive import Drive
 from saunet.data.loading.module import DepthDataModule
 from saunet.data.synthetic import SyntheticDataModule
+from saunet.errors import ConfigError
 from saunet.evaluation import write_results
 from saunet.evaluation.predictors import NetworkPredictor, PredictorNetwork
 from saunet.evaluation.scoring import Shapes
@@ -25,7 +28,22 @@ from saunet.training.tool import TrainOptions, train
 
 SHIPPED = "street"
 """The model that comes with saunet, shown beside the one that the demo trains."""
-PICTURES = 3
+NANO = "sau_net_nano"
+"""The paper's kind of network, trained beside it from random weights for four times the steps."""
+NANO_WORDS = (
+    f"model={NANO}",
+    "model/pose=posecnn",
+    "init_from=null",
+    "data.height=64",
+    "data.width=192",
+    "optim.lr=4e-4",
+    "optim.freeze_statistics=[]",
+    "name=demo_nano",
+)
+"""What its training changes: a size at which two minutes are enough steps, and the rate of `experiment=scratch`."""
+NANO_STEPS = 4
+"""Its optimizer steps for each one of the demo's: together they take somewhat longer."""
+PICTURES = 4
 """Frames shown in a panel: evenly spread over a single street, or one from each of several."""
 STREETS = {
     "driven": "Streets that the camera drove through: 'model' has learned from their video, not from their depth.",
@@ -44,20 +62,25 @@ def demo(
     describe: Callable[[Exception], str | None],
 ) -> None:
     """Train, evaluate, draw; print where everything is."""
-    data = train(options, choices=choices, overrides=overrides, describe=describe).data
     folder = Path(options.output_dir)
+    beside, record = nano_options(options, overrides)  # before two minutes of training, in case a word does not fit it
+    data = train(options, choices=choices, overrides=overrides, describe=describe).data
+    print(f"Now {NANO} from random weights, on the same video for four times the steps.")
+    train(beside, choices=record.choices, overrides=record.overrides, describe=describe)
     # The last weights, not those of the lowest validation loss: at the end of a falling rate they differ little, and
     # the lowest of noisy values is luck.
     checkpoint = folder / "checkpoints" / "last.ckpt"
     trained, shipped = saunet.load(checkpoint), saunet.load(SHIPPED)
-    others = {SHIPPED: NetworkPredictor(PredictorNetwork(shipped))}
+    nano = saunet.load(Path(beside.output_dir) / "checkpoints" / "last.ckpt")
+    others = {name: NetworkPredictor(PredictorNetwork(each)) for name, each in ((SHIPPED, shipped), (NANO, nano))}
     scored = {"unseen": data}
     if isinstance(data, SyntheticDataModule):
         scored = {"driven": data.driven(), **scored}
     for place, each in scored.items():
         result = evaluate_network(trained.network, each, others, Shapes(boundaries=True))
         write_results(result, folder / place)
-        draw(trained, shipped, drawn(each), folder / f"{place}.png")
+        beside_it = {"SAU-Net nano, from random weights": nano, f"{SHIPPED}, as shipped": shipped}
+        draw(trained, beside_it, drawn(each), folder / f"{place}.png")
         print(STREETS[place])
         show(result.tables())
     film(trained, data.datasets["test"].drives[0], folder)
@@ -65,6 +88,22 @@ def demo(
         print(f"{place:9} {folder / f'{place}.png'}, {folder / place}/metrics.md, metrics.json, per_image.csv")
     print(f"video     {folder / 'depth.mp4'}, of the unseen street")
     print(f"model     {checkpoint}")
+
+
+def nano_options(options: TrainOptions, overrides: Sequence[str]) -> tuple[TrainOptions, compose.Composed]:
+    """Return the training of the small SAU-Net: the demo's words about data and length, other networks."""
+    words = [
+        word for word in overrides if not word.lstrip("+~").startswith(("model", "init_from", "optim", "output_dir"))
+    ]
+    steps = options.trainer.get("max_steps", -1)
+    length = [f"trainer.max_steps={NANO_STEPS * steps}"] if steps > 0 else []
+    folder = f"hydra.run.dir='{Path(options.output_dir) / 'nano'}'"
+    table = read()
+    with compose.hydra(TOOLS["train"], table) as hydra:
+        composed = compose.single(hydra, "train", [*words, *NANO_WORDS, *length, folder])
+    if composed is None:
+        raise ConfigError("the demo is one training; a sweep is for `saunet train`")
+    return compose.options(TrainOptions, composed, table), composed
 
 
 def drawn(data: DepthDataModule) -> Sequence[Drive]:
@@ -75,15 +114,15 @@ def drawn(data: DepthDataModule) -> Sequence[Drive]:
     return [replace(drive, height=height, width=WIDTH, cache=None) for drive in data.drives("test")]
 
 
-def draw(trained: Predictor, shipped: Predictor, drives: Sequence[Drive], file: Path) -> None:
-    """Write a panel of a few frames with both predictions, truth and error."""
+def draw(trained: Predictor, beside: Mapping[str, Predictor], drives: Sequence[Drive], file: Path) -> None:
+    """Write a panel of a few frames with all predictions, truth and error."""
     several, panels = len(drives) >= PICTURES, []
     for number, share in enumerate(np.linspace(0, 1, PICTURES + 2)[1:-1]):
         drive = drives[number if several else 0]
         frame = list(drive.indices)[round((len(drive.indices) - 1) * share)]
         image, truth = drive.image(frame), drive.depth(frame)
-        others = {f"{SHIPPED}, as shipped": shipped.predict(image).disparity}
-        note, disparity = "of the model trained here", trained.predict(image).disparity
+        others = {name: each.predict(image).disparity for name, each in beside.items()}
+        note, disparity = f"of {SHIPPED}, trained on this video", trained.predict(image).disparity
         panels.append(depth_panel(image, disparity, truth, tile_width=WIDTH, note=note, others=others))
     write_image(file, np.concatenate(panels, axis=1))
 
