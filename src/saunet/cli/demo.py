@@ -37,6 +37,7 @@ NANO_WORDS = (
     "data.height=64",
     "data.width=192",
     "optim.lr=4e-4",
+    "optim.ema=0.99",
     "optim.freeze_statistics=[]",
     "name=demo_nano",
 )
