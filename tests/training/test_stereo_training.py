@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import subprocess
 import sys
@@ -10,17 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pages import commands
 
 import saunet
 from saunet.synthetic import SyntheticDrive
 
-PAGE = Path(__file__).parents[2] / "docs" / "scale.md"
-
 
 @pytest.mark.slow
 def test_stereo_training_is_metric(tmp_path: Path) -> None:
-    (command,) = re.findall(r"^saunet train (.*data\.stereo=true.*)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
-    overrides = [*shlex.split(command), f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}"]
+    (command,) = (line for page, line in commands("") if page == "scale.md" and "data.stereo=true" in line)
+    overrides = [*shlex.split(command)[2:], f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}"]
     subprocess.run(
         [sys.executable, "-m", "saunet.cli.train", *overrides], check=True, capture_output=True, timeout=1500
     )
