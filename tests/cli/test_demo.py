@@ -21,7 +21,7 @@ def test_demo_shows_the_shipped_model_and_a_small_sau_net_beside_the_trained_one
     for words in ("model", "street", "sau_net_nano", "constant depth", "completeness", "last.ckpt"):
         assert words in outcome.out
     assert "learned from their video" in outcome.out
-    assert "neither network has seen" in outcome.out
+    assert "no network has seen" in outcome.out
     run = tmp_path / "run"
     for place in ("driven", "unseen"):
         with (run / place / "per_image.csv").open() as file:

@@ -9,9 +9,10 @@ import torch
 
 from saunet.errors import DataError
 from saunet.evaluation import score as score_all
-from saunet.evaluation.predictors import ExportingPredictor, FilePredictor, file_stem
+from saunet.evaluation.predictors import ExportingPredictor, FilePredictor, PredictorNetwork, file_stem
 from saunet.io.images import read_depth
 from saunet.metrics.protocols import protocol
+from saunet.prediction.prediction import ImagePredictor
 
 DISPARITY = np.random.default_rng(0).random((5, 6, 10)).astype(np.float32) * 0.2 + 0.02
 NAMES = [f"day/drive_{i % 2} {i:010d} l" for i in range(5)]
@@ -235,3 +236,28 @@ def test_meters_as_predicted_also_without_truth(tmp_path):
     stored = read_depth(tmp_path / "day_c_2_l.png")
     assert stored.shape == (8, 16)
     assert np.unique(stored).tolist() == [10.0]
+
+
+def test_a_predictor_of_another_size_sees_images_at_its_own() -> None:
+    class OfSize(ImagePredictor):
+        def __init__(self) -> None:
+            super().__init__(32, 64)
+            self.seen: list[tuple[int, ...]] = []
+
+        def disparity(self, images):
+            self.seen.append(images.shape)
+            return images.mean(1) + 0.1
+
+        @property
+        def fingerprint(self) -> str:
+            return ""
+
+    predictor = OfSize()
+    image = torch.rand(2, 3, 64, 192, generator=torch.Generator().manual_seed(0))
+    disparity = PredictorNetwork(predictor)(image)
+    assert predictor.seen == [(2, 3, 32, 64)]
+    assert disparity.shape == (2, 1, 32, 64)
+    small = cv2.resize(image[0].permute(1, 2, 0).numpy(), (64, 32), interpolation=cv2.INTER_AREA).mean(2) + 0.1
+    assert np.abs(disparity[0, 0].numpy() - small).mean() < 0.05, "smoothed as by a mean over areas, not picked"
+    same = PredictorNetwork(predictor)(image[..., :32, :64])
+    assert torch.allclose(same[:, 0], image[..., :32, :64].mean(1) + 0.1)

@@ -48,7 +48,7 @@ PICTURES = 4
 """Frames shown in a panel: evenly spread over a single street, or one from each of several."""
 STREETS = {
     "driven": "Streets that the camera drove through: 'model' has learned from their video, not from their depth.",
-    "unseen": "A street that neither network has seen; 'model' was trained without any depth.",
+    "unseen": "A street that no network has seen; 'model' was trained without any depth.",
 }
 """The scored streets, by the name of their files."""
 WIDTH = 640

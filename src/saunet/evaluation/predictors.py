@@ -9,6 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor, nn
@@ -54,14 +55,20 @@ class NetworkPredictor:
 
 
 class PredictorNetwork(nn.Module):
-    """A predictor of single images, such as one that runs an ONNX file, as a network of disparity in its unit."""
+    """A predictor of single images, such as one that runs an ONNX file, as a network of disparity in its unit.
+
+    Images of another size are first resized to the predictor's, as when it predicts a file; disparity has that size.
+    """
 
     def __init__(self, predictor: ImagePredictor) -> None:
         super().__init__()
         self.predictor = predictor
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 _ _"]:
-        predictor, images = self.predictor, image.float().cpu().numpy()
+        predictor, size = self.predictor, self.predictor.input_size(*image.shape[-2:])
+        if image.shape[-2:] != size:
+            image = F.interpolate(image.float(), size, mode="bilinear", antialias=True)
+        images = image.float().cpu().numpy()
         raw = predictor.raw_disparity if isinstance(predictor, ForeignPredictor) else predictor.disparity
         disparity = raw(images)
         factor = predictor.scale.factor if predictor.scale else 1.0
