@@ -31,6 +31,7 @@ from saunet.prediction.scaling import apply_scale as scale_predictor
 from saunet.registry import Spec
 from saunet.runs.checkpoint import read_checkpoint
 from saunet.runs.record import Scale
+from saunet.scale.estimate import ScaleEstimate, keep_scale
 from saunet.scale.options import ScaleOptions
 from saunet.scale.storing import scale_file, store_scale
 from saunet.synthetic import SyntheticDrive
@@ -207,6 +208,14 @@ def test_predict_stores_what_it_measures(
     said = capsys.readouterr().out
     assert f"stored in {checkpoint}" in said
     assert "scale.store=true" not in said
+
+
+def test_only_who_could_keep_a_factor_is_told_how(checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    estimate = ScaleEstimate("camera_height", "camera height 1.65 m", ("frame 0",), (2.0,), 0)
+    keep_scale(estimate, checkpoint, None, None)
+    assert "scale.store=true keeps it" in capsys.readouterr().out
+    keep_scale(estimate, "street", None, None)
+    assert "scale.store=true" not in capsys.readouterr().out
 
 
 def test_an_exported_folder_keeps_a_factor(

@@ -217,6 +217,7 @@ def test_clips_are_held_out_and_tested_by_name_and_condition(tmp_path):
         "validation share 'day/0', 'day/1'",
         "validation, which chooses best.ckpt, and test are the same",
         "data.val_clips=[NAME] and data",
+        "to score more of these, raise data.val_share",
     ):
         assert words in share
     with pytest.raises(ConfigError, match=r"val_clips and test_clips both name night; name each in only one of them"):

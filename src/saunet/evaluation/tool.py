@@ -458,7 +458,7 @@ def _scaled(
         estimate = estimate_scale(method, batches, lambda image: depth(image).depth[0], pose, height)
         report = {key: value for key, value in estimate.as_json().items() if key != "per_frame"}  # scale.json has it
         folder = None if options.output_dir is None else Path(options.output_dir)
-        scale = keep_scale(estimate, store_in, folder) if first else estimate.scale()
+        scale = keep_scale(estimate, str(options.checkpoint), store_in, folder) if first else estimate.scale()
     scale = options.scale.chosen(scale)
     if scale is None:
         return depth, pose, {"method": method, "factor": None}

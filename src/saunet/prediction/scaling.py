@@ -16,7 +16,6 @@ from saunet.prediction.pointcloud import Camera
 from saunet.prediction.prediction import ImagePredictor
 from saunet.prediction.sources import Input, Recording
 from saunet.scale.options import ScaleOptions
-from saunet.weights.locate import WEIGHTS, is_shipped, locate
 
 if TYPE_CHECKING:
     from saunet.io.speeds import SpeedTable
@@ -59,10 +58,7 @@ def apply_scale(
         with _batches(options, predictor, source, camera, pose, offsets) as batches:
             height = camera_height if options.camera_height is None else options.camera_height
             estimate = estimate_scale(options.method, batches, depth, pose, height)
-        predictor.scale = keep_scale(estimate, store_in, folder)
-        path = locate(checkpoint)
-        if store_in is None and (path.suffix == ".ckpt" or ((path / WEIGHTS).is_file() and not is_shipped(path))):
-            print("it applies to this command only; scale.store=true keeps it in the model for all later ones")
+        predictor.scale = keep_scale(estimate, checkpoint, store_in, folder)
     predictor.scale = options.chosen(predictor.scale)
 
 

@@ -20,7 +20,7 @@ from saunet.geometry.ground import fit_ground
 from saunet.io.atomic import write_json
 from saunet.runs.record import Scale
 from saunet.scale.options import METHODS
-from saunet.scale.storing import store_scale
+from saunet.scale.storing import can_keep, store_scale
 from saunet.types import DepthPyramid, TrainBatch
 
 DepthOf = Callable[[Tensor], Tensor]
@@ -149,14 +149,19 @@ def estimate_scale(
     return ScaleEstimate(method, source, kept_names, kept, len(names) - len(kept))
 
 
-def keep_scale(estimate: ScaleEstimate, store_in: Path | None, folder: Path | None) -> Scale:
-    """Say what was measured, write ``scale.json`` into a folder, store the factor in a model, and return it."""
+def keep_scale(estimate: ScaleEstimate, checkpoint: str | Path, store_in: Path | None, folder: Path | None) -> Scale:
+    """Say what was measured, write ``scale.json`` into a folder, store the factor in a model, and return it.
+
+    If it is not stored, and the model that it was measured with could keep it, that is said too.
+    """
     print(estimate)
     if folder is not None:
         write_json(folder / "scale.json", estimate.as_json())
     if store_in is not None:
         store_scale(store_in, estimate.scale())
         print(f"stored in {store_in}")
+    elif can_keep(checkpoint):
+        print("it applies to this command only; scale.store=true keeps it in the model for all later ones")
     return estimate.scale()
 
 

@@ -18,6 +18,12 @@ _PROGRAMS = (".onnx", ".xml", ".pt2", ".ts", ".torchscript", ".jit")
 """Suffixes of files that run a network: what they say about themselves is fixed when they are made."""
 
 
+def can_keep(checkpoint: str | Path) -> bool:
+    """Say whether a model is the user's own and of a kind that keeps a factor."""
+    path = locate(checkpoint)
+    return path.suffix == ".ckpt" or ((path / WEIGHTS).is_file() and not is_shipped(path))
+
+
 def scale_file(checkpoint: str | Path) -> Path:
     """Return the file that will keep a model's factor: its checkpoint, or its folder's ``config.json``.
 

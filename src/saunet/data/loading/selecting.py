@@ -43,6 +43,8 @@ class Frame(NamedTuple):
         return f"{self.drive} {self.number:010d} {self.side}"
 
 
+FEW = 10
+"""With fewer validation frames, scores are mostly chance."""
 BETWEEN = "between training and validation"
 """Reason for leaving out frames that training and validation windows would share."""
 Parts = tuple[list[Frame], list[Frame]]
@@ -150,7 +152,8 @@ class Division(NamedTuple):
         if not told:
             return None
         whole = f"hold out whole recordings with {' and '.join(fix)}"
-        return f"{'; '.join(told)}: for scores that also hold on other roads, {whole}"
+        few = "; to score more of these, raise data.val_share" if shared and len(self.val) < FEW else ""
+        return f"{'; '.join(told)}: for scores that also hold on other roads, {whole}{few}"
 
 
 def divide(
