@@ -232,6 +232,15 @@ def test_the_reference_describes_what_is_public() -> None:
     assert not components - described
 
 
+def test_links_of_the_site_stay_in_it() -> None:
+    """The strict build of the site refuses others."""
+    pages = (page for page in PAGES if page.parent.name == "docs")
+    outside = [
+        (p.name, link) for p in pages for link in re.findall(r"\]\((\.\./[^)]*)\)", p.read_text(encoding="utf-8"))
+    ]
+    assert outside == []
+
+
 def test_links_to_code_lead_to_names_on_that_page() -> None:
     """The strict build of the site checks this too, but is not part of every test run."""
     links = [
