@@ -74,14 +74,14 @@ def demo(
     trained, shipped = saunet.load(checkpoint), saunet.load(SHIPPED)
     nano = saunet.load(Path(beside.output_dir) / "checkpoints" / "last.ckpt")
     others = {name: NetworkPredictor(PredictorNetwork(each)) for name, each in ((SHIPPED, shipped), (NANO, nano))}
+    drawn_beside = {"SAU-Net nano, from random weights": nano, f"{SHIPPED}, as shipped": shipped}
     scored = {"unseen": data}
     if isinstance(data, SyntheticDataModule):
         scored = {"driven": data.driven(), **scored}
     for place, each in scored.items():
         result = evaluate_network(trained.network, each, others, Shapes(boundaries=True))
         write_results(result, folder / place)
-        beside_it = {"SAU-Net nano, from random weights": nano, f"{SHIPPED}, as shipped": shipped}
-        draw(trained, beside_it, drawn(each), folder / f"{place}.png")
+        draw(trained, drawn_beside, drawn(each), folder / f"{place}.png")
         print(STREETS[place])
         show(result.tables())
     film(trained, data.datasets["test"].drives[0], folder)
